@@ -1,0 +1,153 @@
+"""How good a model is: cost, errors by horizon, and the baselines it has to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nnode.calibrate.cost import Convention, sequence_costs, squared_error
+from nnode.data.sequence import Batch
+from nnode.models import FollowTheLeader, Relaxation, System, Traffic
+from nnode.solvers.base import Solver, Trajectory
+
+Simulate = Callable[[Batch], Trajectory]
+
+
+class FreeFlow(FollowTheLeader):
+    """Every vehicle drives at v0, whoever is ahead."""
+
+    name = "free_flow"
+    formula = "v0"
+    source = "the absence of interaction"
+
+    def speed(self, gap: Tensor) -> Tensor:
+        return self.v0.expand_as(gap)
+
+
+@dataclass
+class Metrics:
+    """Errors of one model on one set of sequences.
+
+    Attributes:
+        J: mean cost of a sequence, m² s (or m² with the ``sum`` convention).
+        rmse: root mean squared distance over all samples after the first, m.
+        final_displacement: mean distance at each agent's last sample, m.
+        horizons: rows of ``t`` (s after the start), ``rmse`` (m), ``n`` (agents).
+        collisions: share of simulated samples after the first in which a vehicle's gap is
+            not positive; 0 for crowds.
+        sequences: number of sequences.
+        costs: cost of each sequence by name.
+    """
+
+    J: float
+    rmse: float
+    final_displacement: float
+    horizons: list[dict[str, float]]
+    collisions: float
+    sequences: int
+    costs: dict[str, float]
+
+    def plain(self) -> dict[str, Any]:
+        """As plain types, for JSON."""
+        return dict(vars(self))
+
+
+@torch.no_grad()
+def evaluate(
+    simulate: Simulate, batches: Iterable[Batch], convention: Convention = Convention.integral
+) -> Metrics:
+    """Errors of ``simulate`` over all sequences of ``batches``."""
+    costs: dict[str, float] = {}
+    total: dict[int, float] = {}
+    number: dict[int, int] = {}
+    final, agents, overlaps, followers = 0.0, 0, 0, 0
+    dt = 0.0
+    for batch in batches:
+        dt = batch.dt
+        trajectory = simulate(batch)
+        names = zip(batch.names, sequence_costs(trajectory, batch, convention), strict=True)
+        costs.update({name: float(cost) for name, cost in names})
+        error = squared_error(trajectory, batch)
+        for k in range(1, batch.n_samples):
+            total[k] = total.get(k, 0.0) + float(error[k].sum())
+            number[k] = number.get(k, 0) + int(batch.valid[k].sum())
+        last = batch.valid.sum(0) - 1
+        distance = error.gather(0, last.clamp(min=0)[None])[0].sqrt()
+        final += float((distance * batch.agent).sum())
+        agents += int(batch.agent.sum())
+        if batch.x.shape[-1] == 1:
+            gap = trajectory.x[1:, :, 1:, 0] - trajectory.x[1:, :, :-1, 0]
+            real = batch.valid[1:, :, 1:]
+            overlaps += int(((gap <= 0) & real).sum())
+            followers += int(real.sum())
+    horizons = [
+        {"t": round(k * dt, 9), "rmse": (total[k] / number[k]) ** 0.5, "n": number[k]}
+        for k in sorted(total)
+        if number[k]
+    ]
+    samples = sum(number.values())
+    return Metrics(
+        J=sum(costs.values()) / max(len(costs), 1),
+        rmse=(sum(total.values()) / max(samples, 1)) ** 0.5,
+        final_displacement=final / max(agents, 1),
+        horizons=horizons,
+        collisions=overlaps / max(followers, 1),
+        sequences=len(costs),
+        costs=costs,
+    )
+
+
+def best_common_speed(batches: Iterable[Batch]) -> float:
+    """The one speed (m/s) that fits all vehicles best, in closed form.
+
+    It is the calibrated v0 of a model without interaction:
+    sum t (x(t) - x(0)) / sum t² over all measured samples.
+    """
+    above = below = 0.0
+    for batch in batches:
+        t = batch.dt * torch.arange(batch.n_samples, dtype=batch.x.dtype)[:, None, None]
+        way = (batch.x - batch.x[:1])[..., 0]
+        above += float((t * way * batch.valid).sum())
+        below += float((t.square() * batch.valid).sum())
+    return above / below
+
+
+def constant_velocity(system: System) -> Simulate:
+    """Baseline: every agent keeps the velocity measured at its first sample."""
+
+    def simulate(batch: Batch) -> Trajectory:
+        t = batch.dt * torch.arange(batch.n_samples, dtype=batch.x.dtype)
+        x = batch.x[:1] + t[:, None, None, None] * batch.v[:1]
+        state = torch.cat([x, batch.v[:1].expand_as(x)][: system.order], -1)
+        return Trajectory(*system.observe(state, batch))
+
+    return simulate
+
+
+def no_interaction(system: System, solver: Solver, free_speed: float | None) -> Simulate:
+    """Baseline: the model without its interaction.
+
+    Traffic: everyone at ``free_speed`` (m/s), the leader as in the model. Crowds: relaxation
+    towards the destination alone.
+    """
+    bare: System
+    if isinstance(system, Traffic):
+        speed = 0.0 if free_speed is None else free_speed
+        bare = Traffic([FreeFlow(speed)], leader=system.leader)
+    else:
+        kept = [term for term in system.terms if isinstance(term, Relaxation)]
+        bare = type(system)(kept, system.wall_spacing)
+    bare.to(next(system.parameters()).dtype)
+    return lambda batch: solver(bare, batch)
+
+
+def baselines(system: System, solver: Solver, free_speed: float | None) -> dict[str, Simulate]:
+    """Name to simulation of the baselines a calibrated model is measured against."""
+    return {
+        "no_interaction": no_interaction(system, solver, free_speed),
+        "constant_velocity": constant_velocity(system),
+    }

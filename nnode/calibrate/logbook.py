@@ -1,0 +1,55 @@
+"""What a run writes for TensorBoard."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+
+
+def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
+    """Nested options as ``{"group.option": scalar}``; lists and nulls become words."""
+    flat: dict[str, bool | int | float | str] = {}
+    for key, value in config.items():
+        if isinstance(value, dict):
+            flat.update(flatten(value, f"{prefix}{key}."))
+        else:
+            flat[prefix + key] = value if isinstance(value, bool | int | float | str) else str(value)
+    return flat
+
+
+class Logbook:
+    """Scalars, configuration and figures of a run, under ``folder``.
+
+    Args:
+        folder: the TensorBoard run.
+        config: the composed configuration.
+        step: the step from which a resumed run writes; what an interrupted one wrote after
+            it is hidden.
+    """
+
+    def __init__(self, folder: Path, config: dict[str, Any], step: int = 0) -> None:
+        self.folder = folder
+        self._config = config
+        self._writer = SummaryWriter(str(folder), purge_step=step + 1 if step else None)
+        if not step:
+            text = json.dumps(config, indent=2, ensure_ascii=False)
+            self._writer.add_text("config", f"```\n{text}\n```", 0)
+
+    def scalars(self, row: dict[str, float], step: int) -> None:
+        """One value of every scalar in ``row``."""
+        for name, value in row.items():
+            self._writer.add_scalar(name, value, step)
+
+    def figure(self, name: str, figure: Figure, step: int) -> None:
+        """A picture."""
+        self._writer.add_figure(name, figure, step)
+
+    def close(self, result: dict[str, float] | None = None) -> None:
+        """Write the hyperparameters beside the final ``result`` and close the files."""
+        if result:
+            self._writer.add_hparams(flatten(self._config), result, run_name=".")
+        self._writer.close()

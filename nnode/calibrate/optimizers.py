@@ -1,0 +1,125 @@
+"""Optimisers by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from omegaconf import MISSING
+from torch.optim import Optimizer
+
+from nnode.calibrate.adadelta import NoisyAdadelta
+from nnode.calibrate.consensus import ConsensusBased
+from nnode.errors import ConfigError
+from nnode.models.system import System
+
+
+@dataclass
+class OptimizerOptions:
+    """What all optimisers share."""
+
+    name: str = MISSING
+
+
+@dataclass
+class AdadeltaOptions(OptimizerOptions):
+    """The paper's: ADADELTA with decaying Gaussian noise."""
+
+    name: str = "adadelta"
+    lr: float = 1.0
+    rho: float = 0.95
+    eps: float = 1e-6
+    eta1: float = 1.0  # variance of the noise: eta1 / (1 + k)^eta2
+    eta2: float = 0.55
+
+
+@dataclass
+class AdamOptions(OptimizerOptions):
+    """Adam."""
+
+    name: str = "adam"
+    lr: float = 0.05
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-8
+
+
+@dataclass
+class LbfgsOptions(OptimizerOptions):
+    """L-BFGS with a strong Wolfe line search; wants all sequences in one mini-batch."""
+
+    name: str = "lbfgs"
+    lr: float = 1.0
+    max_iter: int = 20  # per step
+    history: int = 20
+
+
+@dataclass
+class ConsensusOptions(OptimizerOptions):
+    """Consensus-based optimisation; wants all sequences in one mini-batch."""
+
+    name: str = "cbo"
+    particles: int = 30
+    spread: float = 0.5
+    alpha: float = 30.0
+    drift: float = 1.0
+    sigma: float = 1.0
+    dt: float = 0.1
+
+
+def _adadelta(model: System, o: dict[str, Any], seed: int) -> Optimizer:
+    return NoisyAdadelta(model.parameters(), **o, seed=seed)
+
+
+def _adam(model: System, o: dict[str, Any], seed: int) -> Optimizer:
+    betas = (o["beta1"], o["beta2"])
+    return torch.optim.Adam(model.parameters(), lr=o["lr"], betas=betas, eps=o["eps"])
+
+
+def _lbfgs(model: System, o: dict[str, Any], seed: int) -> Optimizer:
+    return torch.optim.LBFGS(
+        model.parameters(),
+        lr=o["lr"],
+        max_iter=o["max_iter"],
+        history_size=o["history"],
+        line_search_fn="strong_wolfe",
+    )
+
+
+def _cbo(model: System, o: dict[str, Any], seed: int) -> Optimizer:
+    return ConsensusBased(model.parameters(), **o, project=model.project_, seed=seed)
+
+
+#: name: how to build it, and whether it compares costs of different steps
+OPTIMIZERS: dict[str, tuple[Callable[[System, dict[str, Any], int], Optimizer], bool]] = {
+    "adadelta": (_adadelta, False),
+    "adam": (_adam, False),
+    "lbfgs": (_lbfgs, True),
+    "cbo": (_cbo, True),
+}
+
+
+def needs_full_batch(name: str) -> bool:
+    """Whether the optimiser compares costs of different steps, so that they must be of the
+    same sequences."""
+    return OPTIMIZERS[name][1]
+
+
+def build_optimizer(model: System, options: OptimizerOptions, seed: int = 0) -> Optimizer:
+    """The optimiser that ``options`` describe; random ones depend on ``seed`` alone.
+
+    Raises:
+        ConfigError: unknown name, or a value outside its range.
+    """
+    values = asdict(options)
+    name = values.pop("name")
+    if name not in OPTIMIZERS:
+        raise ConfigError(
+            f"optimizer.name={name} is unknown, expected one of {', '.join(OPTIMIZERS)}"
+        )
+    try:
+        return OPTIMIZERS[name][0](model, values, seed)
+    except ValueError as error:
+        raise ConfigError(f"optimizer {name}: {error}") from error

@@ -1,0 +1,56 @@
+"""Options of solving and training, as dataclasses that the configuration is checked against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from nnode.calibrate.cost import Convention
+
+
+class Gradient(str, Enum):
+    """Which gradient the solver gives."""
+
+    adjoint = "adjoint"
+    discrete = "discrete"
+
+
+class Precision(str, Enum):
+    """Floating-point type of the calculation."""
+
+    float32 = "float32"
+    float64 = "float64"
+
+
+class Monitor(str, Enum):
+    """Whose cost decides which checkpoint is best and when to stop early."""
+
+    train = "train"
+    heldout = "heldout"
+
+
+@dataclass
+class SolverOptions:
+    """See :class:`nnode.solvers.TorchdiffeqSolver`."""
+
+    method: str = "euler"
+    gradient: Gradient = Gradient.adjoint
+    dt: float | None = None  # s
+    rtol: float = 1e-6
+    atol: float = 1e-8
+
+
+@dataclass
+class TrainerOptions:
+    """How long to train, what to watch, what to keep."""
+
+    max_epochs: int = 200
+    evaluate_every: int = 1  # epochs
+    monitor: Monitor = Monitor.train  # heldout makes the held-out cost a training quantity
+    patience: int | None = None  # evaluations without progress before stopping; null never
+    min_delta: float = 0.0  # the least improvement that counts as progress
+    cost: Convention = Convention.integral
+    dtype: Precision = Precision.float64
+    threads: int | None = None  # of torch; null: one for traffic, all cores for crowds
+    save_every: float = 30.0  # s between checkpoints within an epoch
+    figure_every: int = 50  # epochs between force curves in TensorBoard; 0 draws none

@@ -1,0 +1,294 @@
+"""The training loop: stochastic descent, projection, evaluation, checkpoints."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.utils.data import DataLoader
+
+from nnode.calibrate.adadelta import NoisyAdadelta
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.evaluate import evaluate
+from nnode.calibrate.interrupt import Interrupted, InterruptGuard
+from nnode.calibrate.logbook import Logbook
+from nnode.calibrate.options import Monitor, TrainerOptions
+from nnode.calibrate.progress import Reporter
+from nnode.data.dataset import EpochSampler
+from nnode.data.sequence import Batch
+from nnode.errors import SimulationError
+from nnode.models import System
+from nnode.solvers.base import Solver
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(kw_only=True)
+class Provenance:
+    """What a checkpoint says of the run it comes from; see :class:`Checkpoint`."""
+
+    config: dict[str, Any]
+    manifest: dict[str, Any]
+    split: dict[str, list[str]]
+    free_speed: float | None = None
+
+
+class Trainer:
+    """Calibrates a model; the state of a run is its checkpoint, at any mini-batch.
+
+    Args:
+        model, solver, optimizer: what is calibrated, and how.
+        train: loader whose batch sampler is an :class:`EpochSampler`.
+        heldout: loader of the held-out sequences, or None.
+        options: see :class:`TrainerOptions`.
+        folder: ``checkpoints/`` and ``tensorboard/`` are written here.
+        provenance: goes into the checkpoints.
+        figure: draws the model for TensorBoard.
+    """
+
+    def __init__(
+        self,
+        model: System,
+        solver: Solver,
+        optimizer: Optimizer,
+        train: DataLoader[Any],
+        heldout: DataLoader[Any] | None,
+        options: TrainerOptions,
+        folder: Path,
+        provenance: Provenance,
+        figure: Callable[[System], Figure] | None = None,
+    ) -> None:
+        self.model, self.solver, self.optimizer = model, solver, optimizer
+        self.train, self.heldout, self.options = train, heldout, options
+        self.folder, self.provenance, self.figure = folder, provenance, figure
+        self.dtype = next(model.parameters()).dtype
+        self.history: list[dict[str, float]] = []
+        self.epoch = self.batch = self.step = 0
+        self.sum, self.gradient_norm = 0.0, 0.0  # over the mini-batches of this epoch
+        self.best, self.best_epoch, self.stale = float("inf"), -1, 0
+        self.seconds = 0.0
+        self._pending_best: Checkpoint | None = None
+        self._clock = self._saved = time.monotonic()
+
+    @property
+    def last_path(self) -> Path:
+        """The newest checkpoint."""
+        return self.folder / "checkpoints" / "last.pt"
+
+    @property
+    def best_path(self) -> Path:
+        """The checkpoint of least monitored cost."""
+        return self.folder / "checkpoints" / "best.pt"
+
+    # -- state ---------------------------------------------------------------------------
+
+    _COUNTERS = (
+        "epoch",
+        "batch",
+        "step",
+        "sum",
+        "gradient_norm",
+        "best",
+        "best_epoch",
+        "stale",
+        "seconds",
+    )
+
+    def checkpoint(self) -> Checkpoint:
+        """The present state, copied."""
+        now = time.monotonic()
+        self.seconds += now - self._clock
+        self._clock = now
+        return Checkpoint(
+            config=self.provenance.config,
+            manifest=self.provenance.manifest,
+            split=self.provenance.split,
+            free_speed=self.provenance.free_speed,
+            model={k: v.detach().clone() for k, v in self.model.state_dict().items()},
+            optimizer=_copy(self.optimizer.state_dict()),
+            progress={name: getattr(self, name) for name in self._COUNTERS},
+            history=list(self.history),
+        )
+
+    def restore(self, path: Path) -> None:
+        """Go on from the checkpoint at ``path``, of this run or of another folder's."""
+        checkpoint = load_checkpoint(path)
+        self.model.load_state_dict(checkpoint.model)
+        self.optimizer.load_state_dict(checkpoint.optimizer)
+        for name in self._COUNTERS:
+            setattr(self, name, checkpoint.progress[name])
+        self.history = list(checkpoint.history)
+        best = path.parent / self.best_path.name
+        if best.is_file() and best.resolve() != self.best_path.resolve():
+            self.best_path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(best, self.best_path)
+
+    def save(self) -> None:
+        """Write the best checkpoint, if there is a new one, then the last."""
+        if self._pending_best is not None:
+            save_checkpoint(self._pending_best, self.best_path)
+            self._pending_best = None
+        save_checkpoint(self.checkpoint(), self.last_path)
+        self._saved = time.monotonic()
+
+    # -- one step --------------------------------------------------------------------------
+
+    def _descend(self, batch: Batch) -> None:
+        batch = batch.to(dtype=self.dtype)
+        norms: list[float] = []
+
+        def closure() -> Tensor:
+            self.optimizer.zero_grad()
+            try:
+                cost = sequence_costs(self.solver(self.model, batch), batch, self.options.cost)
+            except SimulationError:
+                if torch.is_grad_enabled():
+                    raise
+                return torch.tensor(float("inf"))  # a particle outside the model's range
+            loss = cost.mean()
+            if loss.requires_grad:
+                loss.backward()
+                gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
+                size = float(torch.linalg.vector_norm(torch.cat([g.flatten() for g in gradients])))
+                if not size < float("inf"):
+                    raise SimulationError(
+                        f"the gradient of the cost on {', '.join(batch.names[:5])} ... is not "
+                        "finite; start from other parameters, or take a smaller solver.dt"
+                    )
+                norms.append(size)
+            return loss
+
+        loss = cast(Tensor, self.optimizer.step(closure))
+        self.model.project_()
+        self.sum += float(loss.detach())
+        self.gradient_norm = norms[0] if norms else 0.0
+
+    # -- evaluation ------------------------------------------------------------------------
+
+    def costs(self) -> dict[str, float]:
+        """Cost of the present model on the training and on the held-out sequences."""
+        found = {}
+        for name, loader in (("train", self.train), ("heldout", self.heldout)):
+            if loader is None:
+                continue
+            if name == "train":
+                sampler = cast(EpochSampler, loader.batch_sampler)
+                sampler.set_epoch(self.epoch)
+                sampler.set_start(0)
+            batches = (batch.to(dtype=self.dtype) for batch in loader)
+            metrics = evaluate(lambda b: self.solver(self.model, b), batches, self.options.cost)
+            found[f"cost/{name}"] = metrics.J
+        return found
+
+    def _evaluate(self, logbook: Logbook, minibatch: float | None = None) -> None:
+        row: dict[str, float] = {"epoch": float(self.epoch), "step": float(self.step)}
+        row.update(self.costs())
+        if minibatch is not None:
+            row["cost/minibatch"] = minibatch
+            row["gradient_norm"] = self.gradient_norm
+        if isinstance(self.optimizer, NoisyAdadelta):
+            row["noise"] = self.optimizer.noise
+        for name, (value, _) in self.model.physical().items():
+            row[f"parameters/{name}"] = float(value)
+        self.history.append(row)
+        logbook.scalars({k: v for k, v in row.items() if k not in ("epoch", "step")}, self.step)
+        monitored = row.get(f"cost/{self.options.monitor.value}", row["cost/train"])
+        if monitored < self.best - self.options.min_delta:
+            self.best, self.best_epoch, self.stale = monitored, self.epoch, 0
+            self._pending_best = self.checkpoint()
+        else:
+            self.stale += 1
+
+    def _draw(self, logbook: Logbook) -> None:
+        if self.figure is not None:
+            logbook.figure("force", self.figure(self.model), self.step)
+
+    # -- the loop --------------------------------------------------------------------------
+
+    def fit(self) -> None:
+        """Train up to ``max_epochs`` or until nothing improves any more.
+
+        Raises:
+            Interrupted: on SIGINT or SIGTERM, after saving.
+            SimulationError: the cost or its gradient is not finite; the last good state is in
+                the last checkpoint.
+        """
+        options, sampler = self.options, cast(EpochSampler, self.train.batch_sampler)
+        per_epoch = len(sampler)
+        if options.monitor is Monitor.heldout and self.heldout is None:
+            log.warning("trainer.monitor=heldout, but no sequence is held out: watching train")
+        fresh = self.step == 0 and not self.history
+        logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
+        self._clock = time.monotonic()
+        finished = False
+        reporter = Reporter(options.max_epochs * per_epoch, self.step)
+        try:
+            with InterruptGuard() as guard, reporter:
+                if fresh:
+                    self._evaluate(logbook)
+                    self._draw(logbook)
+                    self.save()
+                while self.epoch < options.max_epochs and not self._stalled():
+                    sampler.set_epoch(self.epoch)
+                    sampler.set_start(self.batch)
+                    for batch in self.train:
+                        self._descend(batch)
+                        self.batch += 1
+                        self.step += 1
+                        reporter.advance(self._note())
+                        self._save_if_due(guard)
+                    self._end_epoch(logbook, per_epoch)
+                    self._save_if_due(guard)
+                self.save()
+            finished = True
+        finally:
+            logbook.close({"cost/best": self.best} if finished else None)
+
+    def _end_epoch(self, logbook: Logbook, per_epoch: int) -> None:
+        minibatch = self.sum / per_epoch
+        # counters first: a checkpoint made below belongs to the start of the next epoch
+        self.epoch, self.batch, self.sum = self.epoch + 1, 0, 0.0
+        last = self.epoch == self.options.max_epochs
+        if self.epoch % self.options.evaluate_every == 0 or last:
+            self._evaluate(logbook, minibatch)
+        every = self.options.figure_every
+        if every and (self.epoch % every == 0 or last):
+            self._draw(logbook)
+
+    def _stalled(self) -> bool:
+        return self.options.patience is not None and self.stale >= self.options.patience
+
+    def _note(self) -> str:
+        return f"epoch {self.epoch + 1}, best {self.options.monitor.value} cost {self.best:.4g}"
+
+    def _save_if_due(self, guard: InterruptGuard) -> None:
+        if guard.requested is not None:
+            self.save()
+            raise Interrupted(
+                f"stopped at step {self.step} (epoch {self.epoch + 1}); "
+                f"everything up to here is in {self.last_path}",
+                guard.requested,
+            )
+        if time.monotonic() - self._saved >= self.options.save_every:
+            self.save()
+
+
+def _copy(value: Any) -> Any:
+    """Deep copy of nested state with detached tensors."""
+    if isinstance(value, Tensor):
+        return value.detach().clone()
+    if isinstance(value, dict):
+        return {key: _copy(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_copy(item) for item in value)
+    return value

@@ -1,0 +1,123 @@
+"""One sequence as an Arrow table, and back: the columns of the project's own tidy table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from nnode.data.sequence import Sequence
+
+_AXES = ("x", "y")
+_TEXT = ("sequence", "recording", "agent", "kind", "group")
+
+
+def schema(dims: int) -> pa.Schema:
+    """Columns of the table for ``dims`` space dimensions; units stand in the metadata."""
+    axes = _AXES[:dims]
+    units = {"time": "s"} | dict.fromkeys(axes, "m") | {f"v{a}": "m/s" for a in axes}
+    units |= {"length": "m"} | {f"dest_{a}": "m" for a in axes}
+    order = ["sequence", "recording", "time", "agent", *axes, *(f"v{a}" for a in axes)]
+    order += ["length", "kind", "group", *(f"dest_{a}" for a in axes)]
+    return pa.schema(
+        [
+            pa.field(name, pa.float64(), metadata={"unit": units[name]})
+            if name in units
+            else pa.field(name, pa.string())
+            for name in order
+        ]
+    )
+
+
+def open_writer(path: Path, dims: int) -> pq.ParquetWriter:
+    """Open a table for writing, one call of ``write_table`` per sequence."""
+    # Checksums let a reader notice a flipped bit, which the format alone does not.
+    return pq.ParquetWriter(
+        path,
+        schema(dims),
+        compression="zstd",
+        use_dictionary=list(_TEXT),
+        write_page_checksum=True,
+    )
+
+
+def to_table(item: Sequence) -> pa.Table:
+    """The rows of one sequence, agents fastest; what the sequence has not stays empty."""
+    k, n, dims = item.x.shape
+    rows = k * n
+    columns: dict[str, Any] = {
+        "sequence": [item.name] * rows,
+        "recording": [item.recording] * rows,
+        "time": np.repeat(item.time, n),
+        "agent": list(item.agents or map(str, range(n))) * k,
+        "length": None if item.length is None else np.tile(item.length, k),
+        "kind": list(item.kind) * k if item.kind else None,
+        "group": list(item.group) * k if item.group else None,
+    }
+    for d, axis in enumerate(_AXES[:dims]):
+        columns[axis] = item.x[:, :, d].ravel()
+        columns[f"v{axis}"] = None if item.v is None else item.v[:, :, d].ravel()
+        goal = item.destination
+        columns[f"dest_{axis}"] = None if goal is None else np.tile(goal[:, d], k)
+    fields = schema(dims)
+    arrays = [
+        pa.nulls(rows, field.type)
+        if columns[field.name] is None
+        else pa.array(columns[field.name], field.type, from_pandas=False)
+        for field in fields
+    ]
+    return pa.Table.from_arrays(arrays, schema=fields)
+
+
+def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None) -> Sequence:
+    """The sequence that a row group holds.
+
+    Args:
+        table: the row group.
+        entry: what the manifest's index says about the sequence.
+        walls: ``(W, 4)`` m, which the table does not hold.
+
+    Raises:
+        ValueError: the rows are not those that the index promises.
+    """
+    k, n = entry["n_samples"], entry["n_agents"]
+    if table.num_rows != k * n or table["sequence"][0].as_py() != entry["name"]:
+        raise ValueError(f"expected {k * n} rows of {entry['name']}, found {table.num_rows} rows")
+
+    def numbers(name: str) -> np.ndarray | None:
+        column = table[name]
+        if column.null_count == table.num_rows:
+            return None
+        if column.null_count:
+            raise ValueError(f"column {name} holds {column.null_count} empty cells")
+        return np.array(column.to_numpy()).reshape(k, n)
+
+    def vectors(prefix: str) -> np.ndarray | None:
+        columns = [numbers(prefix + axis) for axis in _AXES if axis in table.column_names]
+        found = [column for column in columns if column is not None]
+        return np.stack(found, axis=-1) if found else None
+
+    def names(name: str) -> tuple[str, ...] | None:
+        found = table[name].slice(0, n).to_pylist()
+        return None if None in found else tuple(found)
+
+    time, x = numbers("time"), vectors("")
+    if time is None or x is None:
+        raise ValueError("the columns of times or positions are empty")
+    length, destination = numbers("length"), vectors("dest_")
+    return Sequence(
+        name=entry["name"],
+        recording=entry["recording"],
+        time=time[:, 0].copy(),
+        x=x,
+        v=vectors("v"),
+        agents=(names("agent") or ()) if entry["agents"] else (),
+        length=None if length is None else length[0].copy(),
+        kind=names("kind"),
+        group=names("group"),
+        destination=None if destination is None else destination[0].copy(),
+        walls=walls,
+    )

@@ -1,0 +1,246 @@
+"""One measured sequence, and the padded mini-batch that models are calibrated on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.errors import DataError
+
+Domain = Literal["traffic", "crowd"]
+
+#: Distance (m) between the padding vehicles that stand in front of a shorter platoon.
+PADDING_GAP = 1e5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sequence:
+    """Trajectories of N agents, all present at each of K equally spaced times.
+
+    Attributes:
+        name: unique within a data set, by convention ``recording/number``.
+        recording: the recording (file, run) that the sequence was cut from.
+        time: ``(K,)`` s, equally spaced, as recorded (not shifted to zero).
+        x: ``(K, N, D)`` positions in m, D = 1 (traffic) or 2 (crowd). Traffic is ordered
+            along the lane: agent N - 1 leads.
+        v: ``(K, N, D)`` velocities in m/s, or None; see :meth:`velocity`.
+        agents: N identifiers, unique within the recording, or empty where the source has
+            none. They decide which sequences share an agent.
+        length: ``(N,)`` m, NaN where unknown, or None.
+        kind: N class names (``car``, ``truck``, ...), or None.
+        group: N names of social groups (empty string: walks alone), or None.
+        destination: ``(N, D)`` m, or None for the last position.
+        walls: ``(W, 4)`` segments x1, y1, x2, y2 in m with the walkable side on their
+            left, or None.
+    """
+
+    name: str
+    recording: str
+    time: np.ndarray
+    x: np.ndarray
+    v: np.ndarray | None = None
+    agents: tuple[str, ...] = ()
+    length: np.ndarray | None = None
+    kind: tuple[str, ...] | None = None
+    group: tuple[str, ...] | None = None
+    destination: np.ndarray | None = None
+    walls: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        x = np.asarray(self.x, dtype=np.float64)
+        time = np.asarray(self.time, dtype=np.float64)
+        if x.ndim != 3:
+            raise DataError(f"sequence {self.name}: x must be (K, N, D), got shape {x.shape}")
+        if time.shape != (x.shape[0],):
+            raise DataError(
+                f"sequence {self.name}: time must be ({x.shape[0]},), got shape {time.shape}"
+            )
+        n, d = x.shape[1:]
+        for field, shape in (
+            ("v", x.shape),
+            ("length", (n,)),
+            ("destination", (n, d)),
+        ):
+            value = getattr(self, field)
+            if value is not None:
+                value = np.asarray(value, dtype=np.float64)
+                if value.shape != shape:
+                    raise DataError(
+                        f"sequence {self.name}: {field} must be {shape}, got {value.shape}"
+                    )
+                object.__setattr__(self, field, value)
+        for field in ("agents", "kind", "group"):
+            value = getattr(self, field)
+            if value and len(value) != n:
+                raise DataError(
+                    f"sequence {self.name}: {field} must name {n} agents, got {len(value)}"
+                )
+        object.__setattr__(self, "x", x)
+        object.__setattr__(self, "time", time)
+
+    @property
+    def n_samples(self) -> int:
+        """K, the number of sampling times."""
+        return int(self.x.shape[0])
+
+    @property
+    def n_agents(self) -> int:
+        """N, the number of agents."""
+        return int(self.x.shape[1])
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in s; NaN for a single sample."""
+        if self.n_samples < 2:
+            return float("nan")
+        return float((self.time[-1] - self.time[0]) / (self.n_samples - 1))
+
+    def velocity(self) -> np.ndarray:
+        """``(K, N, D)`` m/s: the stored velocities, else forward differences of ``x``.
+
+        The last sample repeats the last difference.
+        """
+        if self.v is not None:
+            return self.v
+        if self.n_samples < 2:
+            return np.zeros_like(self.x)
+        step = np.diff(self.x, axis=0) / self.dt
+        return np.concatenate([step, step[-1:]])
+
+    def select(self, keep: np.ndarray) -> Sequence:
+        """The same sequence with only the agents where ``keep`` (N booleans) holds."""
+        index = np.flatnonzero(keep)
+
+        def names(value: tuple[str, ...] | None) -> tuple[str, ...] | None:
+            return tuple(value[i] for i in index) if value else value
+
+        return replace(
+            self,
+            x=self.x[:, index],
+            v=None if self.v is None else self.v[:, index],
+            agents=names(self.agents) or (),
+            length=None if self.length is None else self.length[index],
+            kind=names(self.kind),
+            group=names(self.group),
+            destination=None if self.destination is None else self.destination[index],
+        )
+
+
+@dataclass(kw_only=True)
+class Batch:
+    """Sequences padded to the same length and the same number of agents.
+
+    Tensors are (time, batch, agent, dim); B sequences, K samples, N agents, D dimensions.
+
+    Attributes:
+        dt: sampling interval in s, the same for all sequences of a batch.
+        x: ``(K, B, N, D)`` measured positions, m. Padding vehicles stand PADDING_GAP apart
+            in front of the leader, so that every gap stays finite; padding people stand
+            still, far away from everyone.
+        v: ``(K, B, N, D)`` measured velocities, m/s; 0 in the padding.
+        valid: ``(K, B, N)`` True where a sample was measured.
+        agent: ``(B, N)`` True where an agent is real. In traffic the last real one leads.
+        start: ``(B,)`` time of the first sample, s.
+        destination: ``(B, N, D)`` m.
+        length: ``(B, N)`` m, NaN where unknown.
+        walls: ``(B, W, 4)`` segments, m; NaN in the padding. W may be 0.
+        names: names of the sequences.
+        kind, group: per sequence the agents' class and group names, or None.
+    """
+
+    dt: float
+    x: Tensor
+    v: Tensor
+    valid: Tensor
+    agent: Tensor
+    start: Tensor
+    destination: Tensor
+    length: Tensor
+    walls: Tensor
+    names: tuple[str, ...]
+    kind: tuple[tuple[str, ...] | None, ...] = ()
+    group: tuple[tuple[str, ...] | None, ...] = ()
+
+    @property
+    def n_samples(self) -> int:
+        """K, the number of samples of the longest sequence."""
+        return int(self.x.shape[0])
+
+    def __len__(self) -> int:
+        return int(self.x.shape[1])
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Batch:
+        """A copy on ``device`` with floating-point tensors in ``dtype``."""
+        moved = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                value = value.to(device, dtype if value.is_floating_point() else None)
+            moved[field.name] = value
+        return Batch(**moved)
+
+
+def collate(sequences: Iterable[Sequence]) -> Batch:
+    """Pad sequences to one :class:`Batch` (float64, CPU).
+
+    Raises:
+        DataError: no sequence, or sampling intervals or dimensions that differ.
+    """
+    items = list(sequences)
+    if not items:
+        raise DataError("a batch needs at least one sequence, got none")
+    first = items[0]
+    for item in items[1:]:
+        if not np.isclose(item.dt, first.dt, rtol=1e-6):
+            raise DataError(
+                f"sequences of one batch must share their sampling interval: {first.name} has "
+                f"{first.dt:g} s, {item.name} {item.dt:g} s; prepare them as two data sets"
+            )
+        if item.x.shape[2] != first.x.shape[2]:
+            raise DataError(f"{first.name} and {item.name} differ in their number of dimensions")
+    k = max(item.n_samples for item in items)
+    n = max(item.n_agents for item in items)
+    b, d = len(items), first.x.shape[2]
+    w = max(0 if item.walls is None else len(item.walls) for item in items)
+    x = np.empty((k, b, n, d))
+    v = np.zeros((k, b, n, d))
+    valid = np.zeros((k, b, n), dtype=bool)
+    length = np.full((b, n), np.nan)
+    walls = np.full((b, w, 4), np.nan)
+    destination = np.empty((b, n, d))
+    for i, item in enumerate(items):
+        ki, ni = item.n_samples, item.n_agents
+        x[:ki, i, :ni] = item.x
+        x[ki:, i, :ni] = item.x[-1]
+        ahead = item.x.max() + PADDING_GAP * np.arange(1, n - ni + 1)
+        x[:, i, ni:] = ahead[None, :, None]
+        v[:ki, i, :ni] = item.velocity()
+        valid[:ki, i, :ni] = True
+        destination[i] = x[-1, i]
+        if item.destination is not None:
+            destination[i, :ni] = item.destination
+        if item.length is not None:
+            length[i, :ni] = item.length
+        if item.walls is not None:
+            walls[i, : len(item.walls)] = item.walls
+    return Batch(
+        dt=first.dt,
+        x=torch.from_numpy(x),
+        v=torch.from_numpy(v),
+        valid=torch.from_numpy(valid),
+        agent=torch.from_numpy(valid.any(axis=0)),
+        start=torch.tensor([item.time[0] for item in items], dtype=torch.float64),
+        destination=torch.from_numpy(destination),
+        length=torch.from_numpy(length),
+        walls=torch.from_numpy(walls),
+        names=tuple(item.name for item in items),
+        kind=tuple(item.kind for item in items),
+        group=tuple(item.group for item in items),
+    )

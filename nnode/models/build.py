@@ -1,0 +1,97 @@
+"""From options to a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from typing import Any
+
+import torch
+
+from nnode.errors import ConfigError
+from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
+from nnode.models.system import Crowd, System, Traffic
+from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
+
+Options = Mapping[str, Any]
+
+#: Start values of the social force's parameters, uniform on this interval (section 6.4).
+START = (0.0, 50.0)
+
+
+def _traffic(term: Linear | Logarithmic | NetworkSpeed, options: Options) -> Traffic:
+    return Traffic([term], leader=str(getattr(options["leader"], "value", options["leader"])))
+
+
+def _lin(options: Options, generator: torch.Generator) -> System:
+    return _traffic(Linear(options["v0"], options["L"], options["L_min"]), options)
+
+
+def _log(options: Options, generator: torch.Generator) -> System:
+    return _traffic(Logarithmic(options["v0"], options["L"], options["L_min"]), options)
+
+
+def _network_speed(options: Options, generator: torch.Generator) -> System:
+    term = NetworkSpeed(options["hidden"], options["v0"], options["box"], generator)
+    return _traffic(term, options)
+
+
+def _social_force(options: Options, generator: torch.Generator) -> System:
+    low, high = START
+    draw = low + (high - low) * torch.rand(3, generator=generator, dtype=torch.float64)
+    start = {
+        name: float(value if options[name] is None else options[name])
+        for name, value in zip(("A", "k", "kappa"), draw, strict=True)
+    }
+    term = SocialForce(
+        **start,
+        r=options["r"],
+        B=options["B"],
+        mass=options["mass"],
+        walls=options["walls"],
+        opposing_wall_friction=options["opposing_wall_friction"],
+    )
+    return Crowd([Relaxation(options["tau"]), term], options["wall_spacing"])
+
+
+def _network_force(options: Options, generator: torch.Generator) -> System:
+    term = NetworkForce(
+        options["hidden"],
+        mass=options["mass"],
+        walls=options["walls"],
+        box=options["box"],
+        generator=generator,
+    )
+    return Crowd([Relaxation(options["tau"]), term], options["wall_spacing"])
+
+
+#: Every calibrated term, by the name that ``model.term`` gives it.
+MODELS: dict[str, Callable[[Options, torch.Generator], System]] = {
+    "lin": _lin,
+    "log": _log,
+    "network_speed": _network_speed,
+    "social_force": _social_force,
+    "network_force": _network_force,
+}
+
+
+def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
+    """The model that ``options`` describe (see :mod:`nnode.models.options`).
+
+    Random start values depend on ``seed`` alone, in every precision.
+
+    Raises:
+        ConfigError: an unknown term, or a value outside what the model allows.
+    """
+    term = str(options["term"])
+    if term not in MODELS:
+        near = get_close_matches(term, MODELS, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(MODELS)}{hint}")
+    try:
+        model = MODELS[term](options, torch.Generator().manual_seed(seed))
+    except (ValueError, KeyError) as error:
+        raise ConfigError(f"model {options.get('name', term)}: {error}") from error
+    model.to(dtype)
+    model.project_()
+    return model

@@ -1,0 +1,195 @@
+"""Accelerations of pedestrians: relaxation, social force, and forces by networks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nnode.models.network import FeedForward
+from nnode.models.term import Interval, State, Term
+
+#: Distances (m) and speeds (m/s) are smoothed at this scale, so that their gradient exists at 0.
+SMOOTHING = 1e-6
+
+
+def norm(vector: Tensor) -> Tensor:
+    """``(..., 2)`` to ``(...)``: Euclidean length with a finite gradient everywhere."""
+    return torch.sqrt(vector.square().sum(-1) + SMOOTHING**2)
+
+
+def _velocity(state: State) -> Tensor:
+    if state.v is None:
+        raise ValueError("a term of a second-order model needs velocities")
+    return state.v
+
+
+class Relaxation(Term):
+    """Relaxation towards the destination at the present speed.
+
+    (v_des - v) / tau with v_des = |v| (x_D - x) / |x_D - x|; tau (s) is fixed.
+    """
+
+    name = "relaxation"
+    formula = "(|v| (x_D - x) / |x_D - x| - v) / tau"
+    source = "Göttlich & Totzeck, equation (relaxation)"
+
+    def __init__(self, tau: float = 0.5) -> None:
+        super().__init__()
+        self.tau = tau
+
+    def forward(self, state: State) -> Tensor:
+        v = _velocity(state)
+        way = state.scene.destination - state.x
+        desired = way * (norm(v) / norm(way))[..., None]
+        return (desired - v) / self.tau
+
+
+class InteractionForce(Term):
+    """Forces between people and from walls, averaged as in the paper.
+
+    (1/m) mean over the N people of the pair force + (1/m) mean over the P wall points of the
+    wall force. A person exerts no force on himself, but counts in N.
+
+    Args:
+        mass: m, kg.
+        walls: False leaves the walls out.
+    """
+
+    def __init__(self, mass: float = 1.0, walls: bool = True) -> None:
+        super().__init__()
+        self.mass = mass
+        self.walls = walls
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        """Force on i from j, ``(..., 2)`` N, of x_i - x_j (m) and v_i - v_j (m/s)."""
+        raise NotImplementedError  # pragma: no cover - every force defines its own
+
+    def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
+        """Force on i from a wall point, ``(..., 2)`` N, of x_i - x_w (m), v_i (m/s) and the
+        wall's unit normal."""
+        raise NotImplementedError  # pragma: no cover - every force defines its own
+
+    def components(self, state: State) -> dict[str, Tensor]:
+        """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
+        x, v, scene = state.x, _velocity(state), state.scene
+        force = self.pair_force(x[:, :, None] - x[:, None], v[:, :, None] - v[:, None])
+        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
+        acts = (scene.agent[:, None, :] & apart)[..., None]
+        parts = {"pair": (force * acts).sum(2) / (self.mass * scene.count)}
+        if self.walls and scene.wall.shape[1]:
+            b, n, p = *x.shape[:2], scene.wall.shape[1]
+            force = self.wall_force(
+                x[:, :, None] - scene.wall[:, None],
+                v[:, :, None].expand(b, n, p, 2),
+                scene.wall_normal[:, None].expand(b, n, p, 2),
+            )
+            acts = scene.wall_point[:, None, :, None]
+            parts["wall"] = (force * acts).sum(2) / (self.mass * scene.wall_count)
+        return parts
+
+    def forward(self, state: State) -> Tensor:
+        return sum(self.components(state).values(), torch.zeros_like(state.x))
+
+
+class SocialForce(InteractionForce):
+    """Helbing and Molnár's social force with contact and sliding friction.
+
+    With h(y) = max(y, 0), d the distance, n the unit vector from j to i, t = (-n_y, n_x):
+
+    * people: (A exp((2r - d)/B) + k h(2r - d)) n + kappa h(2r - d) ((v_j - v_i)·t) t
+    * walls: (A exp((r - d)/B) + k h(r - d)) n + kappa h(r - d) s (v_i·t) t
+
+    A (N), k (kg/s²) and kappa (kg/(m s)) are calibrated and kept >= 0; r (m), B (m) and mass
+    (kg) are fixed. The paper prints s = +1, which speeds a person up along the wall; Helbing
+    et al. (2000) have s = -1: ``opposing_wall_friction=True``.
+
+    The paper's table of six settings is reproduced with B = 0.05, not with the B = 0.1 of its
+    text, so 0.05 is the default here.
+
+    Source: Göttlich & Totzeck, equation (InteractionForceHelbing).
+    """
+
+    name = "social_force"
+    formula = "(A exp((2r - d)/B) + k h(2r - d)) n + kappa h(2r - d) (dv·t) t"
+    source = "Göttlich & Totzeck, equation (InteractionForceHelbing); Helbing & Molnár 1995"
+
+    def __init__(
+        self,
+        A: float,
+        k: float,
+        kappa: float,
+        *,
+        r: float = 0.25,
+        B: float = 0.05,
+        mass: float = 1.0,
+        walls: bool = True,
+        opposing_wall_friction: bool = False,
+    ) -> None:
+        super().__init__(mass, walls)
+        positive = Interval(low=0.0)
+        self.declare("A", A, unit="N", bounds=positive)
+        self.declare("k", k, unit="kg/s²", bounds=positive)
+        self.declare("kappa", kappa, unit="kg/(m s)", bounds=positive)
+        self.A: Tensor
+        self.k: Tensor
+        self.kappa: Tensor
+        self.r, self.B = r, B
+        self.friction_sign = -1.0 if opposing_wall_friction else 1.0
+
+    def _force(self, dx: Tensor, reach: float, slip: Tensor) -> Tensor:
+        """Force at distance |dx| of a body of radius sum ``reach``, sliding at ``slip``."""
+        d = norm(dx)
+        n = dx / d[..., None]
+        t = torch.stack([-n[..., 1], n[..., 0]], -1)
+        overlap = reach - d
+        contact = overlap.clamp(min=0)
+        push = self.A * torch.exp(overlap / self.B) + self.k * contact
+        slide = self.kappa * contact * (slip * t).sum(-1)
+        return push[..., None] * n + slide[..., None] * t
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        return self._force(dx, 2 * self.r, -dv)
+
+    def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
+        return self._force(dx, self.r, self.friction_sign * v)
+
+
+class NetworkForce(InteractionForce):
+    """Pair and wall force as two networks of relative position and relative velocity.
+
+    A wall point has no velocity of its own; the paper gives it an artificial one so that one
+    network can tell the walls apart. Here it is the wall's unit normal times 1 m/s.
+
+    Args:
+        hidden: neurons in each hidden layer, 4 in the paper.
+        box: b keeps every weight in [-b, b]; None leaves them free.
+
+    Source: Göttlich & Totzeck, equation (NNseparate) and section 6.4.
+    """
+
+    name = "network_force"
+    formula = "NN_pair(x_i - x_j, v_i - v_j), NN_wall(x_i - x_w, v_i - v_w)"
+    source = "Göttlich & Totzeck, equation (NNseparate)"
+
+    def __init__(
+        self,
+        hidden: int = 4,
+        *,
+        mass: float = 1.0,
+        walls: bool = True,
+        box: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__(mass, walls)
+        self.pair = FeedForward((4, hidden, 2), generator)
+        self.wall = FeedForward((4, hidden, 2), generator)
+        if box is not None:
+            self.bound_all("", Interval(-box, box))
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        out: Tensor = self.pair(torch.cat([dx, dv], -1))
+        return out
+
+    def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
+        out: Tensor = self.wall(torch.cat([dx, v - normal], -1))
+        return out

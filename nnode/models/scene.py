@@ -1,0 +1,114 @@
+"""What stays fixed while a batch is simulated: who leads, where walls are, who walks where."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import Batch
+
+
+@dataclass
+class Scene:
+    """The fixed surroundings of the B simulations of a batch.
+
+    Attributes:
+        agent: ``(B, N)`` True for real agents.
+        count: ``(B, 1, 1)`` number of real agents.
+        leader: ``(B, N)`` True for the last real agent.
+        follower: ``(B, N)`` True for the real agents behind it.
+        destination: ``(B, N, D)`` m.
+        length: ``(B, N)`` m, NaN where unknown.
+        measured: ``(K, B, N, D)`` measured positions, m.
+        dt: sampling interval of ``measured``, s.
+        wall: ``(B, P, 2)`` wall points, m.
+        wall_normal: ``(B, P, 2)`` unit normals into the walkable side.
+        wall_point: ``(B, P)`` True for real wall points.
+        wall_count: ``(B, 1, 1)`` number of real wall points, at least 1.
+    """
+
+    agent: Tensor
+    count: Tensor
+    leader: Tensor
+    follower: Tensor
+    destination: Tensor
+    length: Tensor
+    measured: Tensor
+    dt: float
+    wall: Tensor
+    wall_normal: Tensor
+    wall_point: Tensor
+    wall_count: Tensor
+
+    @classmethod
+    def of(cls, batch: Batch, wall_spacing: float = 0.25) -> Scene:
+        """The scene of a batch, walls cut into points ``wall_spacing`` (m) apart or closer."""
+        agent = batch.agent
+        number = agent.sum(1)
+        index = torch.arange(agent.shape[1], device=agent.device)
+        leader = index == (number - 1)[:, None]
+        wall, normal, real = wall_points(batch.walls, wall_spacing)
+        return cls(
+            agent=agent,
+            count=number.to(batch.x.dtype)[:, None, None],
+            leader=leader,
+            follower=agent & ~leader,
+            destination=batch.destination,
+            length=batch.length,
+            measured=batch.x,
+            dt=batch.dt,
+            wall=wall,
+            wall_normal=normal,
+            wall_point=real,
+            wall_count=real.sum(1).clamp(min=1).to(batch.x.dtype)[:, None, None],
+        )
+
+    def measured_at(self, t: Tensor) -> Tensor:
+        """``(B, N, D)`` measured positions at time ``t`` (s), linear between samples."""
+        position = t / self.dt
+        # a hair of tolerance keeps whole sample numbers whole in any precision
+        k = torch.floor(position + 1e-4).long().clamp(0, self.measured.shape[0] - 2)
+        before, after = self.measured[k], self.measured[k + 1]
+        return torch.lerp(before, after, (position - k).clamp(0, 1).to(before.dtype))
+
+
+def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Cut wall segments into points.
+
+    Args:
+        walls: ``(B, W, 4)`` segments x1, y1, x2, y2 in m, NaN rows are padding; the walkable
+            side is on the left of the direction from point 1 to point 2.
+        spacing: largest distance of neighbouring points, m.
+
+    Returns:
+        points ``(B, P, 2)``, unit normals into the walkable side ``(B, P, 2)`` and the mask
+        ``(B, P)`` of real points. Padding points repeat far outside.
+    """
+    rows = []
+    for segments in walls.detach().cpu().double():
+        points, normals = [], []
+        for segment in segments[~segments.isnan().any(1)]:
+            start, end = segment[:2], segment[2:]
+            length = float(torch.linalg.vector_norm(end - start))
+            n = max(1, math.ceil(length / spacing - 1e-9)) + 1
+            fraction = torch.linspace(0, 1, n, dtype=torch.float64)[:, None]
+            points.append(start + fraction * (end - start))
+            along = (end - start) / max(length, 1e-12)
+            normals.append(torch.stack([-along[1], along[0]]).expand(n, 2))
+        rows.append(
+            (torch.cat(points), torch.cat(normals)) if points else (torch.empty(0, 2),) * 2
+        )
+    most = max((len(points) for points, _ in rows), default=0)
+    shape = (len(rows), most, 2)
+    point = torch.full(shape, 1e4, dtype=torch.float64)
+    normal = torch.zeros(shape, dtype=torch.float64)
+    real = torch.zeros(shape[:2], dtype=torch.bool)
+    for b, (points, normals) in enumerate(rows):
+        point[b, : len(points)] = points
+        normal[b, : len(points)] = normals
+        real[b, : len(points)] = True
+    device, dtype = walls.device, walls.dtype
+    return point.to(device, dtype), normal.to(device, dtype), real.to(device)

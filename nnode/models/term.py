@@ -1,0 +1,99 @@
+"""What a term of a model is: a module with a name, a formula, units and a source."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from nnode.models.scene import Scene
+
+
+@dataclass
+class State:
+    """What the terms of a model see at one moment.
+
+    Attributes:
+        t: seconds since the first sample, a scalar tensor.
+        x: ``(B, N, D)`` positions, m.
+        v: ``(B, N, D)`` velocities, m/s; None in first-order models.
+        scene: everything that does not change during the simulation.
+    """
+
+    t: Tensor
+    x: Tensor
+    v: Tensor | None
+    scene: Scene
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The admissible values of a parameter, [low, high]."""
+
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.high:
+            raise ValueError(f"an interval needs low <= high, got [{self.low}, {self.high}]")
+
+
+class Term(nn.Module):
+    """One summand of a model's right-hand side.
+
+    A term returns m/s in a first-order and m/s² in a second-order model, as ``(B, N, D)``;
+    padding agents may receive any finite value. Its parameters are declared with
+    :meth:`declare`, which records unit and admissible set.
+
+    Class attributes:
+        name: the field's name of the effect.
+        formula: the formula, in the symbols of the parameters.
+        source: where the formula stands.
+    """
+
+    name: ClassVar[str]
+    formula: ClassVar[str]
+    source: ClassVar[str]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.units: dict[str, str] = {}
+        self.bounds: dict[str, Interval] = {}
+
+    def declare(self, name: str, value: float, *, unit: str, bounds: Interval | None = None) -> None:
+        """Add a scalar parameter with its unit and admissible set."""
+        self.register_parameter(name, nn.Parameter(torch.tensor(float(value))))
+        self.units[name] = unit
+        if bounds is not None:
+            self.bounds[name] = bounds
+
+    def bound_all(self, prefix: str, bounds: Interval) -> None:
+        """Give every parameter whose name starts with ``prefix`` the same admissible set."""
+        for name, _ in self.named_parameters():
+            if name.startswith(prefix):
+                self.bounds[name] = bounds
+
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Move every parameter to the nearest point of its admissible set."""
+        for name, parameter in self.named_parameters():
+            bounds = self.bounds.get(name)
+            if bounds is not None:
+                parameter.clamp_(bounds.low, bounds.high)
+
+    def forward(self, state: State) -> Tensor:
+        raise NotImplementedError  # pragma: no cover - every term defines its own
+
+
+def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
+    """Name to (value, unit) of every declared scalar parameter of the terms in ``module``."""
+    found: dict[str, tuple[Tensor, str]] = {}
+    for term in module.modules():
+        if isinstance(term, Term):
+            for name, unit in term.units.items():
+                key = name if name not in found else f"{term.name}.{name}"
+                found[key] = (getattr(term, name), unit)
+    return found

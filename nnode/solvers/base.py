@@ -1,0 +1,83 @@
+"""The interface of all solvers, and the arithmetic of their time steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError, SimulationError
+from nnode.models.system import System
+
+#: Default Euler steps, s: the paper's for traffic and for crowds at 25 frames/s; crowds
+#: recorded at 16 frames/s keep their own interval.
+DEFAULT_STEP = {"traffic": 0.002, "crowd": 0.0625}
+
+
+@dataclass
+class Trajectory:
+    """A simulation at the sampling times of its batch.
+
+    Attributes:
+        x: ``(K, B, N, D)`` m.
+        v: ``(K, B, N, D)`` m/s in second-order models, else None.
+    """
+
+    x: Tensor
+    v: Tensor | None
+
+
+class Solver(Protocol):
+    """Anything that simulates a model on a batch and can be differentiated through."""
+
+    def __call__(self, system: System, batch: Batch) -> Trajectory:
+        """Simulate from the first measured state, at the batch's sampling times."""
+
+
+def substeps(sampling: float, dt: float | None, domain: str) -> int:
+    """Number of steps in a sampling interval; a whole number, never rounded silently.
+
+    Args:
+        sampling: sampling interval, s.
+        dt: step, s; None takes the largest one that divides ``sampling`` and is at most
+            the domain's default.
+        domain: ``traffic`` or ``crowd``.
+
+    Raises:
+        ConfigError: ``dt`` is not positive or does not divide the sampling interval.
+    """
+    if dt is None:
+        return max(1, math.ceil(sampling / DEFAULT_STEP[domain] - 1e-6))
+    if not (math.isfinite(dt) and dt > 0):
+        raise ConfigError(f"solver.dt={dt} must be a positive number of seconds")
+    ratio = sampling / dt
+    number = round(ratio)
+    # sampling intervals come from recorded times, which carry rounding errors
+    if number < 1 or abs(ratio - number) > 1e-6 * max(1.0, ratio):
+        good = [sampling / n for n in (max(1, math.floor(ratio)), math.ceil(ratio)) if n]
+        near = " or ".join(dict.fromkeys(f"{value:.6g}" for value in good))
+        raise ConfigError(
+            f"solver.dt={dt:g} s does not divide the sampling interval {sampling:g} s of the "
+            f"data; use solver.dt={near}, or solver.dt=null to let it be chosen"
+        )
+    return number
+
+
+def check_finite(trajectory: Trajectory, batch: Batch) -> Trajectory:
+    """Return the trajectory, or say where its first number that is none stands.
+
+    Raises:
+        SimulationError: with sequence, agent and time.
+    """
+    bad = (~trajectory.x.isfinite()).any(-1) & batch.valid
+    if bool(bad.any()):
+        k, b, n = (int(i) for i in bad.nonzero()[0])
+        raise SimulationError(
+            f"the simulation of sequence {batch.names[b]} blew up: agent {n} at "
+            f"{k * batch.dt:g} s after the start is not a finite number; check the sequence, "
+            "start from other parameters, or take a smaller solver.dt"
+        )
+    return trajectory

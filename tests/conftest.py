@@ -1,0 +1,17 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of the real recordings, from NNODE_DATA; skips where there is none."""
+    folder = os.environ.get("NNODE_DATA")
+    if not folder or not (Path(folder) / "esimas").is_dir():
+        pytest.skip("real recordings absent: set NNODE_DATA to a folder with esimas/ and juelich/")
+    return Path(folder).resolve()
