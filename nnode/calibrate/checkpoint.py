@@ -115,5 +115,3 @@ def load(path: str | os.PathLike[str]) -> System:
         CheckpointError: see :func:`load_checkpoint`.
     """
     return load_checkpoint(path).build()
-
-

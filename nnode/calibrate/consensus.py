@@ -47,8 +47,16 @@ class ConsensusBased(Optimizer):
         project: Callable[[], None] | None = None,
         seed: int = 0,
     ) -> None:
-        if particles < 2:
-            raise ValueError(f"particles={particles} must be at least 2")
+        for name, value, good in (
+            ("particles", particles, particles >= 2),
+            ("spread", spread, spread > 0),
+            ("alpha", alpha, alpha > 0),
+            ("drift", drift, drift > 0),
+            ("sigma", sigma, sigma >= 0),
+            ("dt", dt, dt > 0),
+        ):
+            if not good:
+                raise ValueError(f"{name}={value} is outside its range")
         super().__init__(params, {"lr": dt})
         self._alpha, self._drift, self._sigma, self._dt = alpha, drift, sigma, dt
         self._project = project
@@ -87,12 +95,15 @@ class ConsensusBased(Optimizer):
                 self._project()
             self._x[i] = self._get()
         costs = np.array([self._cost(particle, closure) for particle in self._x])
+        costs = np.where(np.isfinite(costs), costs, np.inf)
         least = int(costs.argmin())
         if costs[least] < self._best_cost:
             self._best, self._best_cost = self._x[least].copy(), float(costs[least])
         finite = costs[np.isfinite(costs)]
         scale = float(np.median(finite) - finite.min()) if finite.size else 1.0
-        energy = np.where(np.isfinite(costs), costs, np.finfo(float).max / 1e6)
+        # the weights depend on differences of the costs alone; taken from the least one, they
+        # keep their digits, and a particle without a cost has no weight
+        energy = costs - finite.min() if finite.size else np.zeros_like(costs)
         dynamic = CBO(
             lambda x: energy[None],
             f_dim="3D",

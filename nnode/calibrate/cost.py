@@ -25,8 +25,9 @@ class Convention(str, Enum):
 
 def squared_error(trajectory: Trajectory, batch: Batch) -> Tensor:
     """``(K, B, N)`` squared distance between simulation and measurement, m²; 0 in the padding."""
-    error: Tensor = (trajectory.x - batch.x).square().sum(-1) * batch.valid
-    return error
+    away = trajectory.x - batch.x
+    # masked before squaring: past its last sample a simulation may leave the finite numbers
+    return away.masked_fill(~batch.valid[..., None], 0.0).square().sum(-1)
 
 
 def sequence_costs(

@@ -101,6 +101,12 @@ def evaluate(
     )
 
 
+def _times(batch: Batch) -> Tensor:
+    """``(K,)`` sampling times, s after the start."""
+    number = torch.arange(batch.n_samples, dtype=batch.x.dtype, device=batch.x.device)
+    return batch.dt * number
+
+
 def best_common_speed(batches: Iterable[Batch]) -> float:
     """The one speed (m/s) that fits all vehicles best, in closed form.
 
@@ -109,7 +115,7 @@ def best_common_speed(batches: Iterable[Batch]) -> float:
     """
     above = below = 0.0
     for batch in batches:
-        t = batch.dt * torch.arange(batch.n_samples, dtype=batch.x.dtype)[:, None, None]
+        t = _times(batch)[:, None, None]
         way = (batch.x - batch.x[:1])[..., 0]
         above += float((t * way * batch.valid).sum())
         below += float((t.square() * batch.valid).sum())
@@ -120,7 +126,7 @@ def constant_velocity(system: System) -> Simulate:
     """Baseline: every agent keeps the velocity measured at its first sample."""
 
     def simulate(batch: Batch) -> Trajectory:
-        t = batch.dt * torch.arange(batch.n_samples, dtype=batch.x.dtype)
+        t = _times(batch)
         x = batch.x[:1] + t[:, None, None, None] * batch.v[:1]
         state = torch.cat([x, batch.v[:1].expand_as(x)][: system.order], -1)
         return Trajectory(*system.observe(state, batch))
@@ -141,7 +147,7 @@ def no_interaction(system: System, solver: Solver, free_speed: float | None) -> 
     else:
         kept = [term for term in system.terms if isinstance(term, Relaxation)]
         bare = type(system)(kept, system.wall_spacing)
-    bare.to(next(system.parameters()).dtype)
+    bare.to(next(system.parameters()))
     return lambda batch: solver(bare, batch)
 
 

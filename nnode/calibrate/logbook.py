@@ -17,7 +17,9 @@ def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, bool | int | 
         if isinstance(value, dict):
             flat.update(flatten(value, f"{prefix}{key}."))
         else:
-            flat[prefix + key] = value if isinstance(value, bool | int | float | str) else str(value)
+            flat[prefix + key] = (
+                value if isinstance(value, bool | int | float | str) else str(value)
+            )
     return flat
 
 

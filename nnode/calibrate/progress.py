@@ -43,9 +43,7 @@ class Reporter:
                 TimeRemainingColumn(),
                 TextColumn("{task.fields[note]}"),
             )
-            self._task = self._bar.add_task(
-                what, total=total, completed=done, rate=0.0, note=""
-            )
+            self._task = self._bar.add_task(what, total=total, completed=done, rate=0.0, note="")
 
     def __enter__(self) -> Reporter:
         if self._bar:

@@ -168,7 +168,7 @@ class Trainer:
                 norms.append(size)
             return loss
 
-        loss = cast(Tensor, self.optimizer.step(closure))
+        loss = cast(Tensor, self.optimizer.step(cast(Any, closure)))
         self.model.project_()
         self.sum += float(loss.detach())
         self.gradient_norm = norms[0] if norms else 0.0
@@ -182,9 +182,7 @@ class Trainer:
             if loader is None:
                 continue
             if name == "train":
-                sampler = cast(EpochSampler, loader.batch_sampler)
-                sampler.set_epoch(self.epoch)
-                sampler.set_start(0)
+                cast(EpochSampler, loader.batch_sampler).set_epoch(self.epoch)
             batches = (batch.to(dtype=self.dtype) for batch in loader)
             metrics = evaluate(lambda b: self.solver(self.model, b), batches, self.options.cost)
             found[f"cost/{name}"] = metrics.J
@@ -224,7 +222,7 @@ class Trainer:
                 the last checkpoint.
         """
         options, sampler = self.options, cast(EpochSampler, self.train.batch_sampler)
-        per_epoch = len(sampler)
+        per_epoch = sampler.n_batches
         if options.monitor is Monitor.heldout and self.heldout is None:
             log.warning("trainer.monitor=heldout, but no sequence is held out: watching train")
         fresh = self.step == 0 and not self.history

@@ -191,7 +191,7 @@ def _origin(dataset: str, name: str) -> Origin | None:
     Both corridor archives are read by one reader, which need not know who publishes a file.
     """
     own = ORIGINS.get(dataset)
-    if own is None or name in own.files:
+    if own is not None and name in own.files:
         return own
     return next((o for o in ORIGINS.values() if name in o.files and dataset in o.folders), own)
 

@@ -25,6 +25,18 @@ class SplitMode(str, Enum):
     block = "block"
 
 
+class Velocity(str, Enum):
+    """Finite difference that velocities are computed with.
+
+    ``forward`` looks only at the positions of the sequence itself; ``central`` and ``backward``
+    use the neighbouring frames of the whole trajectory where there are such.
+    """
+
+    forward = "forward"
+    central = "central"
+    backward = "backward"
+
+
 @dataclass
 class SplitOptions:
     """Which sequences are held out from training."""
@@ -32,6 +44,7 @@ class SplitOptions:
     heldout: float = 0.2  # share of the sequences, 0 keeps all for training
     mode: SplitMode = SplitMode.auto
     seed: int = 0
+    gap: float = 5.0  # s; without identifiers, sequences closer in time may share an agent
 
 
 @dataclass
@@ -50,6 +63,7 @@ class DataOptions:
     name: str = MISSING
     domain: str = MISSING  # traffic | crowd
     source: str | None = None  # folder with the raw files, or a URL; null downloads
+    download: str = "data/raw"  # folder where downloaded files are kept
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop
@@ -68,18 +82,27 @@ class EsimasOptions(DataOptions):
 
 @dataclass
 class VehicleTableOptions(DataOptions):
-    """A table with one row per vehicle and time (CSV or Parquet)."""
+    """A table with one row per vehicle and time (CSV or Parquet).
+
+    ``columns`` names the table's columns by what they mean: ``vehicle``, ``time``, ``x``, and
+    where they exist ``lane``, ``speed``, ``length``, ``kind``. A column that bears the name of
+    its meaning need not be listed; null leaves an optional one out.
+    """
 
     name: str = "vehicles"
     domain: str = "traffic"
-    path: str = MISSING
-    columns: dict[str, str | None] = field(default_factory=dict)  # vehicle, time, lane, x, ...
+    path: str = MISSING  # the table; relative to data.source where that is given
+    columns: dict[str, str | None] = field(default_factory=dict)
     position_unit: str = "m"  # m | ft | cm | km
+    length_unit: str | None = None  # null: the unit of the positions
+    speed_unit: str = "m/s"  # m/s | km/h | ft/s | mph
     time_unit: str = "s"  # s | ms | frame
     frame_rate: float | None = None  # 1/s, with time_unit=frame
-    lane: Any = None  # a lane, a list of lanes; null where the table has no lane column
+    kinds: dict[str, str] = field(default_factory=dict)  # class code: name
+    lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
     direction: int = 1  # -1 where positions fall as vehicles drive on
     dt: float = 0.2  # reference time grid, s
+    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
     min_vehicles: int = 3
     min_samples: int = 3
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
@@ -93,17 +116,22 @@ class JuelichOptions(DataOptions):
     domain: str = "crowd"
     t_seq: float = 1.0  # s
     frame_rate: float | None = None  # 1/s; null reads it from the file's header
-    unit: str = "cm"  # cm | m
+    unit: str | None = None  # cm | m; null reads it from the file's header
     walking_axis: str = "x"  # x | y; walls run along it
     walls: dict[str, list[float]] = field(default_factory=dict)  # recording: [low, high], m
     view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
+    velocity: Velocity = Velocity.forward
     min_agents: int = 1
 
 
 @dataclass
 class TableOptions(DataOptions):
-    """A user's own tidy table: sequence, time, agent, x[, y][, ...], SI units."""
+    """A user's own tidy table (CSV or Parquet), one row per sequence, time and agent, SI units.
+
+    Columns: ``sequence``, ``time``, ``agent``, ``x``, and where they exist ``y``, ``length``,
+    ``kind``, ``group``, ``dest_x``, ``dest_y``, ``recording``.
+    """
 
     name: str = "table"
-    path: str = MISSING
-    walls: str | None = None  # CSV with x1, y1, x2, y2 (m)
+    path: str = MISSING  # the table; relative to data.source where that is given
+    walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left

@@ -147,7 +147,8 @@ def write_store(
         raise DataError(f"the store {folder} cannot be written: {error}") from error
     finally:
         for path in partial.values():
-            path.unlink(missing_ok=True)
+            if path.exists():
+                path.unlink()
     return Store(folder)
 
 

@@ -87,7 +87,9 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
     if term not in MODELS:
         near = get_close_matches(term, MODELS, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(MODELS)}{hint}")
+        raise ConfigError(
+            f"model.term={term} is unknown, expected one of {', '.join(MODELS)}{hint}"
+        )
     try:
         model = MODELS[term](options, torch.Generator().manual_seed(seed))
     except (ValueError, KeyError) as error:

@@ -17,6 +17,12 @@ def norm(vector: Tensor) -> Tensor:
     return torch.sqrt(vector.square().sum(-1) + SMOOTHING**2)
 
 
+def _positive(**options: float) -> None:
+    for name, value in options.items():
+        if not value > 0:
+            raise ValueError(f"{name}={value} must be positive")
+
+
 def _velocity(state: State) -> Tensor:
     if state.v is None:
         raise ValueError("a term of a second-order model needs velocities")
@@ -35,6 +41,7 @@ class Relaxation(Term):
 
     def __init__(self, tau: float = 0.5) -> None:
         super().__init__()
+        _positive(tau=tau)
         self.tau = tau
 
     def forward(self, state: State) -> Tensor:
@@ -57,6 +64,7 @@ class InteractionForce(Term):
 
     def __init__(self, mass: float = 1.0, walls: bool = True) -> None:
         super().__init__()
+        _positive(mass=mass)
         self.mass = mass
         self.walls = walls
 
@@ -126,6 +134,7 @@ class SocialForce(InteractionForce):
         opposing_wall_friction: bool = False,
     ) -> None:
         super().__init__(mass, walls)
+        _positive(r=r, B=B)
         positive = Interval(low=0.0)
         self.declare("A", A, unit="N", bounds=positive)
         self.declare("k", k, unit="kg/s²", bounds=positive)

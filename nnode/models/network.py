@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -11,7 +13,7 @@ class FeedForward(nn.Module):
 
     Input and hidden layers carry a bias unit, the output layer none: each layer of weights
     therefore has a bias. Softplus is log(1 + exp(x)). All weights start independent and
-    uniform on [-1, 1].
+    uniform on [-1, 1], in float64.
 
     Args:
         sizes: neurons per layer without bias units, input first, e.g. ``(4, 4, 2)``.
@@ -30,7 +32,7 @@ class FeedForward(nn.Module):
             raise ValueError(f"a network needs at least two layers of one neuron, got {sizes}")
         self.sizes = tuple(sizes)
         self.layers = nn.ModuleList(
-            nn.Linear(n_in, n_out) for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True)
+            nn.Linear(n_in, n_out, dtype=torch.float64) for n_in, n_out in pairwise(sizes)
         )
         self.reset_parameters(generator)
 

@@ -98,17 +98,15 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
             points.append(start + fraction * (end - start))
             along = (end - start) / max(length, 1e-12)
             normals.append(torch.stack([-along[1], along[0]]).expand(n, 2))
-        rows.append(
-            (torch.cat(points), torch.cat(normals)) if points else (torch.empty(0, 2),) * 2
-        )
+        rows.append((torch.cat(points), torch.cat(normals)) if points else (torch.empty(0, 2),) * 2)
     most = max((len(points) for points, _ in rows), default=0)
     shape = (len(rows), most, 2)
     point = torch.full(shape, 1e4, dtype=torch.float64)
     normal = torch.zeros(shape, dtype=torch.float64)
     real = torch.zeros(shape[:2], dtype=torch.bool)
-    for b, (points, normals) in enumerate(rows):
-        point[b, : len(points)] = points
-        normal[b, : len(points)] = normals
-        real[b, : len(points)] = True
+    for b, (place, direction) in enumerate(rows):
+        point[b, : len(place)] = place
+        normal[b, : len(place)] = direction
+        real[b, : len(place)] = True
     device, dtype = walls.device, walls.dtype
     return point.to(device, dtype), normal.to(device, dtype), real.to(device)

@@ -32,6 +32,8 @@ class System(nn.Module):
 
     def __init__(self, terms: Iterable[Term], wall_spacing: float = 0.25) -> None:
         super().__init__()
+        if not wall_spacing > 0:
+            raise ValueError(f"wall_spacing={wall_spacing} must be a positive number of metres")
         self.terms = nn.ModuleList(terms)
         self.wall_spacing = wall_spacing
 
@@ -88,6 +90,8 @@ class Traffic(System):
 
     def __init__(self, terms: Iterable[Term], leader: str = "constant") -> None:
         super().__init__(terms)
+        if leader not in ("constant", "measured"):
+            raise ValueError(f"leader={leader} is unknown, expected constant or measured")
         self.leader = leader
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:

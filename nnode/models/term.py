@@ -63,9 +63,12 @@ class Term(nn.Module):
         self.units: dict[str, str] = {}
         self.bounds: dict[str, Interval] = {}
 
-    def declare(self, name: str, value: float, *, unit: str, bounds: Interval | None = None) -> None:
-        """Add a scalar parameter with its unit and admissible set."""
-        self.register_parameter(name, nn.Parameter(torch.tensor(float(value))))
+    def declare(
+        self, name: str, value: float, *, unit: str, bounds: Interval | None = None
+    ) -> None:
+        """Add a scalar parameter, in float64, with its unit and admissible set."""
+        start = torch.tensor(float(value), dtype=torch.float64)
+        self.register_parameter(name, nn.Parameter(start))
         self.units[name] = unit
         if bounds is not None:
             self.bounds[name] = bounds
@@ -95,5 +98,5 @@ def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
         if isinstance(term, Term):
             for name, unit in term.units.items():
                 key = name if name not in found else f"{term.name}.{name}"
-                found[key] = (getattr(term, name), unit)
+                found[key] = (getattr(term, name).detach(), unit)
     return found

@@ -9,7 +9,7 @@ from typing import Protocol
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.errors import ConfigError, SimulationError
+from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.models.system import System
 
 #: Default Euler steps, s: the paper's for traffic and for crowds at 25 frames/s; crowds
@@ -48,7 +48,13 @@ def substeps(sampling: float, dt: float | None, domain: str) -> int:
 
     Raises:
         ConfigError: ``dt`` is not positive or does not divide the sampling interval.
+        DataError: there is no sampling interval, as in a single sample.
     """
+    if not (math.isfinite(sampling) and sampling > 0):
+        raise DataError(
+            f"the sampling interval of the data is {sampling:g} s, expected a positive number; "
+            "a sequence needs at least two samples at rising times"
+        )
     if dt is None:
         return max(1, math.ceil(sampling / DEFAULT_STEP[domain] - 1e-6))
     if not (math.isfinite(dt) and dt > 0):
@@ -57,13 +63,25 @@ def substeps(sampling: float, dt: float | None, domain: str) -> int:
     number = round(ratio)
     # sampling intervals come from recorded times, which carry rounding errors
     if number < 1 or abs(ratio - number) > 1e-6 * max(1.0, ratio):
-        good = [sampling / n for n in (max(1, math.floor(ratio)), math.ceil(ratio)) if n]
-        near = " or ".join(dict.fromkeys(f"{value:.6g}" for value in good))
+        near = " or ".join(f"{value:.6g}" for value in _dividing(sampling, dt))
         raise ConfigError(
             f"solver.dt={dt:g} s does not divide the sampling interval {sampling:g} s of the "
             f"data; use solver.dt={near}, or solver.dt=null to let it be chosen"
         )
     return number
+
+
+def _dividing(sampling: float, dt: float) -> list[float]:
+    """The nearest steps at or below and above ``dt`` that divide ``sampling``, short decimals
+    first choice."""
+
+    def short(number: int) -> bool:
+        return float(f"{sampling / number:.3g}") == float(f"{sampling / number:.9g}")
+
+    first = max(1, math.ceil(sampling / dt))
+    below = next((n for n in range(first, 4 * first) if short(n)), first)
+    above = next((n for n in range(first - 1, 0, -1) if short(n)), None)
+    return [sampling / n for n in (below, above) if n]
 
 
 def check_finite(trajectory: Trajectory, batch: Batch) -> Trajectory:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 from torchdiffeq._impl.odeint import SOLVERS
+from torchdiffeq._impl.solvers import FixedGridODESolver
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
@@ -15,7 +16,9 @@ from nnode.models.scene import Scene
 from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
 
-FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4")
+FIXED_STEP = tuple(
+    name for name, solver in SOLVERS.items() if issubclass(solver, FixedGridODESolver)
+)
 GRADIENTS = ("adjoint", "discrete")
 
 
@@ -34,9 +37,14 @@ class _Rates(nn.Module):
 def _whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
     """Time grid of one step per unit between the first and the last time, either direction."""
     n = round(float((t[-1] - t[0]).abs()))
-    return torch.linspace(0, 1, n + 1, dtype=torch.float64, device=t.device).mul_(n).round_().mul_(
-        1.0 if t[-1] >= t[0] else -1.0
-    ).to(t) + t[0]
+    return (
+        torch.linspace(0, 1, n + 1, dtype=torch.float64, device=t.device)
+        .mul_(n)
+        .round_()
+        .mul_(1.0 if t[-1] >= t[0] else -1.0)
+        .to(t)
+        + t[0]
+    )
 
 
 class TorchdiffeqSolver:
@@ -56,7 +64,8 @@ class TorchdiffeqSolver:
         rtol, atol: tolerances of adaptive methods.
 
     Raises:
-        ConfigError: unknown method or gradient, or a step that does not divide.
+        ConfigError: unknown method or gradient, two that exclude each other, or a step that
+            does not divide.
     """
 
     def __init__(
@@ -75,6 +84,11 @@ class TorchdiffeqSolver:
         if gradient not in GRADIENTS:
             raise ConfigError(
                 f"solver.gradient={gradient} is unknown, expected {' or '.join(GRADIENTS)}"
+            )
+        if gradient == "discrete" and method == "scipy_solver":
+            raise ConfigError(
+                "solver.method=scipy_solver leaves no graph to differentiate; use "
+                "solver.gradient=adjoint, or another method"
             )
         self.method, self.gradient, self.dt = method, gradient, dt
         self.rtol, self.atol = rtol, atol

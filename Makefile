@@ -1,0 +1,40 @@
+# Two commands do everything: `make demo` and `make test`. Both set up first.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+DEMO   := runs/demo
+
+.PHONY: setup demo test lint clean
+
+setup: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"
+	touch $@
+
+demo: setup
+	rm -rf $(DEMO)
+	$(BIN)/python -m nnode.data.synthetic $(DEMO)/raw
+	@echo "== traffic: cars in a lane, linear law, true v0 = 25 m/s and L = 6 m"
+	$(BIN)/python scripts/train.py experiment=demo_traffic data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/traffic
+	@echo "== crowd: people in a corridor, social force"
+	$(BIN)/python scripts/train.py experiment=demo_crowd data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/crowd
+	@echo "== results"
+	@$(BIN)/python scripts/plot_forces.py checkpoint=[$(DEMO)/traffic/checkpoints/best.pt] hydra.run.dir=$(DEMO)/traffic/forces
+	@$(BIN)/python scripts/plot_forces.py checkpoint=[$(DEMO)/crowd/checkpoints/best.pt] hydra.run.dir=$(DEMO)/crowd/forces
+	@echo "TensorBoard: $(BIN)/tensorboard --logdir $(DEMO)"
+	@echo "runs:        $(DEMO)/traffic/tensorboard $(DEMO)/crowd/tensorboard"
+	@echo "checkpoints: $(DEMO)/traffic/checkpoints/best.pt $(DEMO)/crowd/checkpoints/best.pt"
+	@echo "force plots: $(DEMO)/traffic/forces/forces.png $(DEMO)/crowd/forces/sf_force_x.png"
+
+test: setup
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) runs/demo build *.egg-info

@@ -1,0 +1,219 @@
+"""From a command line to a job: composition, checked options, errors in the toolkit's words."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nnode.app.sweep import failures, record_failure
+from nnode.calibrate.interrupt import Interrupted
+from nnode.config import register
+from nnode.errors import ConfigError, NNodeError
+
+Job = Callable[[DictConfig, Path], None]
+
+#: Hydra's own flags that take a value as the next argument.
+_FLAGS_WITH_VALUE = {"--package", "-p", "--config-path", "-cp", "--config-name", "-cn"} | {
+    "--config-dir",
+    "-cd",
+    "--experimental-rerun",
+    "--info",
+    "-i",
+}
+
+
+def run(name: str, job: Job, inject: Callable[[list[str]], list[str]] | None = None) -> None:
+    """Run ``job(config, folder)`` as ``scripts/<name>.py``; ends the process on errors.
+
+    Args:
+        name: the script, and its configuration ``conf/<name>.yaml``.
+        job: does the work; writes only into ``folder``.
+        inject: looks at the overrides given by the user and returns further ones that go
+            before them.
+    """
+    register()
+    folder = Path(sys.argv[0]).resolve().parent.parent / "conf"
+    try:
+        if not folder.is_dir():
+            raise ConfigError(f"no configuration folder {folder}; run scripts/{name}.py in place")
+        given = user_overrides(sys.argv[1:])
+        if inject is not None:
+            extra = inject(given)
+            sys.argv[1:1] = extra
+            given = extra + given
+        if "--help" not in sys.argv and "-h" not in sys.argv:
+            check_overrides(given, folder, name)
+        hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_guarded(job))()
+    except NNodeError as error:
+        _end(error)
+    except _Escape as escape:
+        _end(escape.error)
+    if failures():
+        sys.exit(1)
+
+
+def _end(error: NNodeError) -> NoReturn:
+    """Say what happened and leave with the exit status that belongs to it."""
+    if isinstance(error, Interrupted):
+        _say(str(error))
+        sys.exit(128 + error.signal)
+    _say(f"error: {error}")
+    sys.exit(2 if isinstance(error, ConfigError) else 1)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+class _Escape(BaseException):
+    """Carries the package's errors through Hydra, which would print its own words for them."""
+
+    def __init__(self, error: NNodeError) -> None:
+        self.error = error
+
+
+def _guarded(job: Job) -> Callable[[DictConfig], None]:
+    def task(config: DictConfig) -> None:
+        settings = HydraConfig.get()
+        folder = Path(settings.runtime.output_dir)
+        try:
+            job(config, folder)
+        except Interrupted as stop:
+            raise _Escape(stop) from None
+        except NNodeError as error:
+            if settings.mode != RunMode.MULTIRUN:
+                raise _Escape(error) from None
+            # the other jobs of a sweep go on
+            _say(f"error in {folder}: {error}")
+            record_failure(folder, str(error))
+
+    return task
+
+
+def user_overrides(arguments: list[str]) -> list[str]:
+    """The overrides among command-line arguments, without Hydra's flags."""
+    found, skip = [], False
+    for argument in arguments:
+        if skip or argument.startswith("-"):
+            skip = not skip and argument in _FLAGS_WITH_VALUE
+            continue
+        found.append(argument)
+    return found
+
+
+def check_overrides(overrides: list[str], folder: Path, name: str) -> None:
+    """Refuse unknown groups, options and values of the wrong type, one clear error each.
+
+    Raises:
+        ConfigError: with the nearest valid name.
+    """
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        try:
+            parsed = OverridesParser.create().parse_overrides(overrides)
+        except HydraException as error:
+            first = str(error).splitlines()[0]
+            raise ConfigError(
+                f"cannot read the command line: {first}; options are written name=value, with "
+                "quotes around values that hold commas, brackets or blanks"
+            ) from None
+        groups = [o for o in parsed if _is_group(o, loader)]
+        for override in groups:
+            _check_group(override, loader)
+        chosen = [f"{o.get_key_element()}={_first(o)}" for o in groups]
+        try:
+            config = compose(name, chosen)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigError(str(error).splitlines()[0]) from None
+        for override in parsed:
+            key = override.get_key_element()
+            if override not in groups and not key.startswith("hydra"):
+                _check_option(override, config)
+    GlobalHydra.instance().clear()
+
+
+def _is_group(override: Override, loader: ConfigLoader) -> bool:
+    return bool(loader.get_group_options(override.key_or_group)) and not override.is_delete()
+
+
+def _values(override: Override) -> Iterator[Any]:
+    if override.is_sweep_override():
+        yield from override.sweep_iterator()
+    else:
+        yield override.get_value_element_as_str()
+
+
+def _first(override: Override) -> str:
+    return str(next(_values(override)))
+
+
+def _near(word: str, valid: list[str]) -> str:
+    near = get_close_matches(word, valid, n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _check_group(override: Override, loader: ConfigLoader) -> None:
+    group = override.key_or_group
+    options = [o for o in loader.get_group_options(group) if not o.endswith("_schema")]
+    for value in _values(override):
+        if str(value) not in (*options, "null"):
+            raise ConfigError(
+                f"{group}={value} is unknown, expected one of {', '.join(options)}"
+                f"{_near(str(value), options)}"
+            )
+
+
+def _check_option(override: Override, config: DictConfig) -> None:
+    key = override.key_or_group
+    parts = key.split(".")
+    node: Any = config
+    for depth, part in enumerate(parts):
+        free = depth > 0 and OmegaConf.is_dict(node) and OmegaConf.get_type(node) is dict
+        if free or OmegaConf.is_list(node):
+            break  # a mapping such as data.columns takes any name
+        valid = [str(k) for k in node] if OmegaConf.is_dict(node) else []
+        if part not in valid:
+            if not depth:
+                valid += [g for g in ("experiment", "hydra") if g not in valid]
+            nearest = get_close_matches(part, valid, n=1, cutoff=0.5)
+            hint = f"; did you mean {'.'.join([*parts[:depth], nearest[0]])}?" if nearest else ""
+            parent = ".".join(parts[:depth]) or "the configuration"
+            raise ConfigError(
+                f"option {key} is unknown{hint} ({parent} has: {', '.join(valid) or 'no options'})"
+            )
+        node = node._get_node(part)
+    if override.is_delete():
+        return
+    values = list(override.sweep_iterator()) if override.is_sweep_override() else [override.value()]
+    for value in values:
+        try:
+            OmegaConf.update(deepcopy(config), key, _plain(value), force_add=True)
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise ConfigError(f"{key}={value} is refused: {reason}") from None
+
+
+def _plain(value: Any) -> Any:
+    """Hydra's quoted strings as strings."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return getattr(value, "text", value)

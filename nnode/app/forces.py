@@ -1,0 +1,96 @@
+"""What calibrated models have learned, as pictures: ``scripts/plot_forces.py``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.app.saved import merge_saved
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.data.options import DataOptions
+from nnode.data.prepare import open_data
+from nnode.errors import ConfigError, DownloadError
+from nnode.models import System
+from nnode.plots import (
+    curve_table,
+    force_contours,
+    measured_gaps,
+    save,
+    six_settings,
+    speed_curves,
+)
+
+
+def _label(checkpoint: Checkpoint, taken: set[str]) -> str:
+    config = checkpoint.config
+    label = str(config["model"]["name"])
+    for extra in (
+        config["data"]["recording"],
+        f"seed {config['seed']}",
+        checkpoint.progress["step"],
+    ):
+        if label not in taken:
+            break
+        label += f", {extra}"
+    while label in taken:
+        label += "'"
+    taken.add(label)
+    return label
+
+
+def plot_forces(config: DictConfig, folder: Path) -> None:
+    """Draw the checkpoints' forces into ``folder``.
+
+    Raises:
+        NNodeError: a missing or damaged checkpoint, or traffic and crowd models together.
+    """
+    paths = list(config.checkpoint)
+    if not paths:
+        raise ConfigError("checkpoint=[] names no checkpoint; give one or more paths")
+    checkpoints = [load_checkpoint(path) for path in paths]
+    taken: set[str] = set()
+    models = {_label(checkpoint, taken): checkpoint.build() for checkpoint in checkpoints}
+    domains = {model.domain for model in models.values()}
+    if len(domains) > 1:
+        raise ConfigError("checkpoint=[...] mixes traffic and crowd models; plot them one by one")
+    folder.mkdir(parents=True, exist_ok=True)
+    written = (
+        _traffic(models, config, checkpoints[0], folder)
+        if domains == {"traffic"}
+        else _crowd(models, config.extent, folder)
+    )
+    for path in written:
+        print(f"plot: {path}" if path.suffix == ".png" else f"table: {path}")
+
+
+def _traffic(
+    models: dict[str, System], config: DictConfig, first: Checkpoint, folder: Path
+) -> list[Path]:
+    merged = merge_saved(config, first.config, ("data",))
+    data: DataOptions = OmegaConf.to_object(merged.data)  # type: ignore[assignment]
+    try:
+        store = open_data(data, folder / "data")
+        gaps = measured_gaps(store[i] for i in range(len(store)))
+    except DownloadError as error:
+        print(f"no histogram of gaps: {error}")
+        gaps = None
+    save(speed_curves(models, gaps), folder / "forces.png")
+    curve_table(models, np.linspace(2, 50, 97)).to_csv(folder / "forces.csv", index=False)
+    return [folder / "forces.png", folder / "forces.csv"]
+
+
+def _crowd(models: dict[str, System], extent: float | None, folder: Path) -> list[Path]:
+    written = []
+    for label, model in models.items():
+        stem = label.replace(", ", "_").replace(" ", "")
+        for component, axis in enumerate("xy"):
+            path = folder / f"{stem}_force_{axis}.png"
+            save(force_contours(model, component, extent=extent), path)
+            written.append(path)
+        figure, table = six_settings(model)
+        save(figure, folder / f"{stem}_settings.png")
+        table.to_csv(folder / f"{stem}_settings.csv", index=False)
+        written += [folder / f"{stem}_settings.png", folder / f"{stem}_settings.csv"]
+    return written

@@ -1,0 +1,81 @@
+"""A checkpoint's configuration under what the user asks for now."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.errors import ConfigError
+
+GROUPS = ("model", "data", "optimizer")
+
+
+def plain_config(config: DictConfig) -> dict[str, Any]:
+    """The composed configuration in plain types, with the groups it was composed from."""
+    plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
+    assert isinstance(plain, dict)
+    choices = HydraConfig.get().runtime.choices
+    groups = {group: str(choices[group]) for group in GROUPS if group in choices}
+    return {**{str(k): v for k, v in plain.items() if k != "resume"}, "groups": groups}
+
+
+def _checkpoint_of(overrides: list[str], option: str) -> str | None:
+    """The first path that ``option=PATH`` or ``option=[PATH, ...]`` names."""
+    for override in reversed(overrides):
+        key, _, value = override.partition("=")
+        if key == option and value not in ("", "null"):
+            return value.strip("[]").split(",")[0].strip().strip("'\"")
+    return None
+
+
+def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GROUPS) -> list[str]:
+    """Overrides that choose a checkpoint's groups where the user chooses none."""
+    path = _checkpoint_of(overrides, option)
+    if path is None:
+        return []
+    saved = load_checkpoint(path).config["groups"]
+    given = {override.partition("=")[0] for override in overrides}
+    return [f"{g}={saved[g]}" for g in groups if g in saved and g not in given]
+
+
+def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, ...]) -> DictConfig:
+    """``config`` with ``sections`` as a checkpoint has them, and the user's options on top.
+
+    A section stays as composed where the user chose another group than the checkpoint's.
+    """
+    merged = config.copy()
+    choices = HydraConfig.get().runtime.choices
+    for name in sections:
+        if name in saved["groups"] and choices[name] != saved["groups"][name]:
+            continue
+        OmegaConf.update(merged, name, saved[name], merge=True)
+    for override in HydraConfig.get().overrides.task:
+        key = override.partition("=")[0].lstrip("+")
+        if "." in key and key.partition(".")[0] in sections:
+            OmegaConf.update(merged, key, OmegaConf.select(config, key), force_add=True)
+    return merged
+
+
+def refuse_changes(
+    now: dict[str, Any], saved: dict[str, Any], allowed: tuple[str, ...], prefix: str = ""
+) -> None:
+    """Refuse any difference outside ``allowed`` keys.
+
+    Raises:
+        ConfigError: naming the option, what the checkpoint has and what is asked for.
+    """
+    for key in now:
+        full = prefix + key
+        if full in allowed:
+            continue
+        if isinstance(now[key], dict) and isinstance(saved.get(key), dict):
+            refuse_changes(now[key], saved[key], allowed, f"{full}.")
+        elif now[key] != saved.get(key):
+            raise ConfigError(
+                f"{full} cannot change when a run is resumed: the checkpoint has "
+                f"{saved.get(key)}, asked for is {now[key]}; leave the option out, or start a "
+                "new run without resume="
+            )

@@ -1,0 +1,226 @@
+"""Calibrate a model: ``scripts/train.py``."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch.utils.data import DataLoader
+
+from nnode.app.saved import merge_saved, plain_config, refuse_changes
+from nnode.app.sweep import RESULT, write_json
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.evaluate import best_common_speed
+from nnode.calibrate.interrupt import Interrupted
+from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
+from nnode.calibrate.options import SolverOptions, TrainerOptions
+from nnode.calibrate.trainer import Provenance, Trainer
+from nnode.data.dataset import SequenceDataset, make_loader
+from nnode.data.options import DataOptions, LoaderOptions
+from nnode.data.prepare import open_data
+from nnode.data.sequence import Batch
+from nnode.data.split import split
+from nnode.data.store import Store
+from nnode.errors import ConfigError
+from nnode.models import build_model
+from nnode.plots import force_figure
+from nnode.solvers import TorchdiffeqSolver, substeps
+
+log = logging.getLogger(__name__)
+
+#: Options that may change when a run is resumed: they do not touch the numbers of a step.
+RESUMABLE = (
+    "data.source",
+    "data.prepared",
+    "data.loader.workers",
+    "trainer.max_epochs",
+    "trainer.patience",
+    "trainer.min_delta",
+    "trainer.save_every",
+    "trainer.figure_every",
+)
+SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
+
+
+def build_solver(options: SolverOptions) -> TorchdiffeqSolver:
+    """The solver that the options describe."""
+    return TorchdiffeqSolver(
+        options.method, options.gradient.value, options.dt, options.rtol, options.atol
+    )
+
+
+def stream(loader: DataLoader[Any], dtype: torch.dtype = torch.float64) -> Iterator[Batch]:
+    """The mini-batches of a loader, in the precision asked for."""
+    return (batch.to(dtype=dtype) for batch in loader)
+
+
+def straight_loader(store: Store, indices: list[int], size: int) -> DataLoader[Any]:
+    """A loader that visits sequences in order."""
+    options = LoaderOptions(batch_size=size, shuffle=False)
+    return make_loader(SequenceDataset(store, indices), options, seed=0)
+
+
+def set_threads(threads: int | None, domain: str) -> None:
+    """Torch's threads; by default one for traffic, whose tensors are too small to share."""
+    if threads is not None and threads < 1:
+        raise ConfigError(f"trainer.threads={threads} must be at least 1, or null")
+    if threads is not None or domain == "traffic":
+        torch.set_num_threads(threads or 1)
+
+
+def _check(config: DictConfig) -> None:
+    trainer = config.trainer
+    for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
+        if trainer[name] < low:
+            raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}")
+    if trainer.patience is not None and trainer.patience < 1:
+        raise ConfigError(f"trainer.patience={trainer.patience} must be at least 1, or null")
+
+
+def train(config: DictConfig, folder: Path) -> None:
+    """Run one training as configured and say where its results are.
+
+    Raises:
+        NNodeError: see the packages below; Interrupted after a signal, with all work saved.
+    """
+    checkpoint: Checkpoint | None = None
+    resume = config.resume
+    if resume is not None:
+        checkpoint = load_checkpoint(resume)
+        config = merge_saved(config, checkpoint.config, SECTIONS)
+        refuse_changes(plain_config(config), checkpoint.config, RESUMABLE)
+    _check(config)
+    plain = plain_config(config)
+    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
+    set_threads(options.threads, data.domain)
+    optimizer_options: Any = OmegaConf.to_object(config.optimizer)
+    if needs_full_batch(optimizer_options.name):
+        data.loader.batch_size = 0
+    seed = int(config.seed)
+    dtype = getattr(torch, options.dtype.value)
+
+    model = build_model(config.model, seed, dtype)
+    if data.domain in ("traffic", "crowd") and data.domain != model.domain:
+        raise ConfigError(
+            f"model={config.model.name} is a {model.domain} model, data={data.name} are "
+            f"{data.domain} data; choose both of one domain"
+        )
+    store = open_data(data, folder / "data")
+    _check_same_data(store, checkpoint)
+    parts = split(store, data.split)
+    loader = make_loader(SequenceDataset(store, parts.train), data.loader, seed=seed)
+    heldout = (
+        straight_loader(store, parts.heldout, data.loader.batch_size) if parts.heldout else None
+    )
+    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
+    solver = build_solver(solver_options)
+    n = substeps(store[0].dt, solver_options.dt, model.domain)
+    log.info(
+        "%s: %d sequences train, %d held out, %d dropped between; %d steps per sample",
+        data.name, len(parts.train), len(parts.heldout), len(parts.dropped), n,
+    )  # fmt: skip
+    free_speed = None
+    if model.domain == "traffic":
+        free_speed = best_common_speed(
+            stream(straight_loader(store, parts.train, data.loader.batch_size))
+        )
+    names = [entry["name"] for entry in store.index]
+    trainer = Trainer(
+        model,
+        solver,
+        build_optimizer(model, optimizer_options, seed),
+        loader,
+        heldout,
+        options,
+        folder,
+        Provenance(
+            config=plain,
+            manifest=brief(store.manifest),
+            split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in _PARTS},
+            free_speed=free_speed,
+        ),
+        force_figure,
+    )
+    if resume is not None:
+        trainer.restore(Path(resume))
+        log.info("resumed from %s at epoch %d, step %d", resume, trainer.epoch, trainer.step)
+    start = time.monotonic()
+    try:
+        trainer.fit()
+    except Interrupted as stop:
+        raise Interrupted(
+            f"{stop}\nresume with: python scripts/train.py resume={trainer.last_path} "
+            f"hydra.run.dir={folder}",
+            stop.signal,
+        ) from None
+    _report(trainer, plain, folder, time.monotonic() - start)
+
+
+_PARTS = ("train", "heldout", "dropped")
+
+
+def brief(manifest: dict[str, Any]) -> dict[str, Any]:
+    """A manifest without its long lists, small enough to travel in every checkpoint."""
+    return {
+        key: value
+        for key, value in manifest.items()
+        if not isinstance(value, list) or len(value) <= 50
+    }
+
+
+def source_hashes(manifest: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of every raw file that a data set was prepared from."""
+    return {name: file["sha256"] for name, file in manifest.get("files", {}).items()}
+
+
+def _check_same_data(store: Store, checkpoint: Checkpoint | None) -> None:
+    if checkpoint is None:
+        return
+    if source_hashes(store.manifest) != source_hashes(checkpoint.manifest):
+        raise ConfigError(
+            "the data are not those of the checkpoint: the hashes of the source files differ; "
+            "point data.source= at the files it was trained on"
+        )
+
+
+def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: float) -> None:
+    history = trainer.history
+    first = history[0]
+    best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
+    unit = "m² s" if config["trainer"]["cost"] == "integral" else "m²"
+    physical = trainer.model.physical()
+    summary: dict[str, Any] = {
+        "model": config["model"]["name"],
+        "data": config["data"]["name"],
+        "recording": config["data"]["recording"],
+        "seed": config["seed"],
+        "cost_start": first["cost/train"],
+        "cost_train": best["cost/train"],
+        "cost_heldout": best.get("cost/heldout"),
+        "epoch": trainer.best_epoch,
+        **{name: best[f"parameters/{name}"] for name in physical},
+        "seconds": round(seconds, 1),
+    }
+    paths = {
+        "tensorboard": str(folder / "tensorboard"),
+        "best checkpoint": str(trainer.best_path),
+        "last checkpoint": str(trainer.last_path),
+    }
+    write_json(folder / RESULT, {"summary": summary, "paths": paths, "history": history})
+    print(
+        f"cost of a training sequence: {first['cost/train']:.4g} -> {best['cost/train']:.4g} {unit}"
+    )
+    if "cost/heldout" in best:
+        before, after = first["cost/heldout"], best["cost/heldout"]
+        print(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+    for name, (_, unit) in physical.items():
+        print(f"{name} = {best[f'parameters/{name}']:.4g} {unit}")
+    for what, path in paths.items():
+        print(f"{what}: {path}")

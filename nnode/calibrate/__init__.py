@@ -1,0 +1,1 @@
+"""Calibration: cost, optimisers, the training loop, checkpoints, evaluation."""

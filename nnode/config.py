@@ -1,0 +1,100 @@
+"""The configuration's schema: dataclasses, registered with Hydra.
+
+Every group file in ``conf/`` starts from one of these, so that an unknown or wrong-typed option
+is refused before any work starts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from nnode.calibrate.options import SolverOptions, TrainerOptions
+from nnode.calibrate.optimizers import (
+    AdadeltaOptions,
+    AdamOptions,
+    ConsensusOptions,
+    LbfgsOptions,
+)
+from nnode.data.options import (
+    EsimasOptions,
+    JuelichOptions,
+    TableOptions,
+    VehicleTableOptions,
+)
+from nnode.models.options import (
+    LawOptions,
+    NetworkForceOptions,
+    NetworkSpeedOptions,
+    SocialForceOptions,
+)
+
+
+@dataclass
+class TrainConfig:
+    """``scripts/train.py``: calibrate a model to data."""
+
+    model: Any = MISSING
+    data: Any = MISSING
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    optimizer: Any = MISSING
+    trainer: TrainerOptions = field(default_factory=TrainerOptions)
+    seed: int = 0  # of start weights, order of mini-batches and noise
+    resume: str | None = None  # a checkpoint to go on from
+
+
+@dataclass
+class PrepareConfig:
+    """``scripts/prepare_data.py``: raw recordings to sequences."""
+
+    data: Any = MISSING
+
+
+@dataclass
+class EvaluateConfig:
+    """``scripts/evaluate.py``: errors of a checkpoint beside its baselines."""
+
+    checkpoint: str = MISSING
+    data: Any = MISSING
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    part: str = "auto"  # heldout | train | all; auto: heldout where there is one
+
+
+@dataclass
+class PlotForcesConfig:
+    """``scripts/plot_forces.py``: what calibrated models have learned."""
+
+    checkpoint: list[str] = MISSING
+    data: Any = MISSING
+    extent: float | None = None  # m, of contours; null suits the model
+
+
+SCHEMAS: dict[tuple[str | None, str], Any] = {
+    (None, "train_schema"): TrainConfig,
+    (None, "prepare_data_schema"): PrepareConfig,
+    (None, "evaluate_schema"): EvaluateConfig,
+    (None, "plot_forces_schema"): PlotForcesConfig,
+    ("model", "lin_schema"): LawOptions(term="lin"),
+    ("model", "log_schema"): LawOptions(term="log"),
+    ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
+    ("model", "social_force_schema"): SocialForceOptions(term="social_force"),
+    ("model", "network_force_schema"): NetworkForceOptions(term="network_force"),
+    ("data", "esimas_schema"): EsimasOptions,
+    ("data", "vehicles_schema"): VehicleTableOptions,
+    ("data", "juelich_schema"): JuelichOptions,
+    ("data", "table_schema"): TableOptions,
+    ("optimizer", "adadelta_schema"): AdadeltaOptions,
+    ("optimizer", "adam_schema"): AdamOptions,
+    ("optimizer", "lbfgs_schema"): LbfgsOptions,
+    ("optimizer", "cbo_schema"): ConsensusOptions,
+}
+
+
+def register() -> None:
+    """Make all schemas known to Hydra; harmless when repeated."""
+    store = ConfigStore.instance()
+    for (group, name), node in SCHEMAS.items():
+        store.store(group=group, name=name, node=node)

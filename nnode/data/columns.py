@@ -1,0 +1,155 @@
+"""Columns of a user's table, checked: which exist, which rows hold no number."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nnode.errors import ConfigError, DataError
+
+
+class Table:
+    """A CSV or Parquet table whose cells are asked for by meaning.
+
+    Args:
+        path: the table; ``.parquet`` or ``.pq`` is read as Parquet, all else as CSV.
+
+    Raises:
+        DataError: no such file, an empty one, or one that is not of its format.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.parquet = path.suffix.lower() in (".parquet", ".pq")
+        if not path.is_file():
+            raise DataError(f"there is no table {path}; set data.path, or data.source, to it")
+        try:
+            if self.parquet:
+                frame = pd.read_parquet(path).reset_index(drop=True)
+            else:
+                # Blank lines are kept at first, so that row numbers are those of the file.
+                frame = pd.read_csv(path, low_memory=False, skip_blank_lines=False)
+        except pd.errors.EmptyDataError as error:
+            raise DataError(f"{path} is empty; expected a line of column names and rows") from error
+        except (pd.errors.ParserError, UnicodeDecodeError, ValueError, OSError) as error:
+            kind = "Parquet" if self.parquet else "comma-separated"
+            raise DataError(f"{path} cannot be read as a {kind} table: {error}") from error
+        frame.columns = [str(name).strip() for name in frame.columns]
+        self.frame = frame.dropna(how="all")
+        if self.frame.empty:
+            raise DataError(f"{path} has no rows below its columns {self._listing()}")
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def choose(
+        self,
+        required: Iterable[str],
+        optional: Iterable[str] = (),
+        names: Mapping[str, str | None] | None = None,
+    ) -> dict[str, str]:
+        """Names of the table's columns by meaning.
+
+        Args:
+            required: meanings that must have a column.
+            optional: meanings that may have one.
+            names: the configured map of meaning to column; a meaning that is not in it is
+                looked for by its own name, None leaves an optional one out.
+
+        Raises:
+            ConfigError: the map names an unknown meaning, or leaves a required one out.
+            DataError: a column that should be there is not.
+        """
+        mapped = names is not None
+        names = dict(names or {})
+        required, optional = tuple(required), tuple(optional)
+        for key in names:
+            if key not in required + optional:
+                raise ConfigError(
+                    f"data.columns.{key} is unknown; expected {', '.join(required + optional)}"
+                )
+        found = {}
+        for key in required + optional:
+            if key in names and names[key] is None:
+                if key in required:
+                    raise ConfigError(f"data.columns.{key} is null, but {key} is needed")
+                continue
+            column = names.get(key) or key
+            if column in self.frame.columns:
+                found[key] = column
+            elif key in required or key in names:
+                raise DataError(self._missing(key, column, mapped=mapped))
+        return found
+
+    def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
+        """The column as ``(rows,)`` float64.
+
+        Args:
+            column: name in the table.
+            empty: whether cells may be empty (they become NaN).
+
+        Raises:
+            DataError: a cell without a finite number; names the row.
+        """
+        cells = self.frame[column]
+        values = np.array(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
+        bad = ~np.isfinite(values)
+        if empty:
+            bad &= ~cells.isna().to_numpy()
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            cell = cells.iloc[i]
+            shown = "nothing" if pd.isna(cell) else repr(str(cell))
+            more = f" (and {bad.sum() - 1} more rows)" if bad.sum() > 1 else ""
+            raise DataError(
+                f"{self.path}, {self.row(i)}: column {column!r} holds {shown}{more}; expected a "
+                "finite number"
+            )
+        return values
+
+    def names(self, column: str, *, empty: bool = False) -> np.ndarray:
+        """The column as ``(rows,)`` text; whole numbers are written without a decimal point.
+
+        Args:
+            column: name in the table.
+            empty: whether cells may be empty (they become empty text).
+
+        Raises:
+            DataError: an empty cell; names the row.
+        """
+        cells = self.frame[column]
+        absent = cells.isna().to_numpy()
+        if absent.any() and not empty:
+            i = int(np.flatnonzero(absent)[0])
+            raise DataError(
+                f"{self.path}, {self.row(i)}: column {column!r} is empty; expected a name or number"
+            )
+        if pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all():
+            cells = cells.astype("Int64")
+        text = cells.astype("string").fillna("").str.strip()
+        return np.asarray(text, dtype=object)
+
+    def row(self, i: int) -> str:
+        """Where the i-th row stands in the file, in words."""
+        index = int(self.frame.index[i])
+        return f"row {index + 1}" if self.parquet else f"line {index + 2}"
+
+    def _listing(self) -> str:
+        return ", ".join(self.frame.columns) or "none"
+
+    def _missing(self, key: str, column: str, mapped: bool) -> str:
+        near = difflib.get_close_matches(column, self.frame.columns, n=1, cutoff=0.5)
+        example = near[0] if near else "COLUMN"
+        text = f"{self.path} has no column {column!r}; it has: {self._listing()}"
+        if near:
+            text += f"; did you mean {near[0]!r}?"
+        only = str(self.frame.columns[0])
+        if len(self.frame.columns) == 1 and any(sign in only for sign in ";\t|"):
+            return text + "; the cells must be separated by commas"
+        if mapped:
+            return text + f"; set data.columns.{key}={example}"
+        return text + f"; rename the column that holds it to {key!r}"

@@ -1,0 +1,154 @@
+"""Streaming prepared sequences as mini-batches, in an order that can be resumed anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from collections.abc import Sequence as ListLike
+
+import numpy as np
+import torch
+import torch.utils.data
+from torch.utils.data import DataLoader
+
+from nnode.data.options import LoaderOptions
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.store import Store
+from nnode.errors import ConfigError, DataError
+
+
+class SequenceDataset(torch.utils.data.Dataset[Sequence]):
+    """Some sequences of a store, each read from the disk when it is asked for.
+
+    Nothing is kept in memory, so that a data set may be larger than it.
+
+    Args:
+        store: the prepared data.
+        indices: positions in the store, such as ``Split.train``; None takes all.
+
+    Raises:
+        DataError: a position that the store does not have.
+    """
+
+    def __init__(self, store: Store, indices: Iterable[int] | None = None) -> None:
+        self.store = store
+        self.indices = _positions(store, indices)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, i: int) -> Sequence:
+        return self.store[self.indices[i]]
+
+
+class EpochSampler(torch.utils.data.Sampler[list[int]]):
+    """Mini-batches of positions, the order of epoch e being a pure function of (seed, e).
+
+    No generator is advanced from epoch to epoch: a run that is resumed at any mini-batch of any
+    epoch sees exactly what the uninterrupted run would have seen.
+
+    Args:
+        n: number of sequences.
+        batch_size: sequences per mini-batch, the last one may be smaller; 0 takes all at once.
+        seed: of the shuffling, >= 0.
+        shuffle: False keeps the order of the data set.
+
+    Raises:
+        ConfigError: a negative batch size or seed.
+    """
+
+    def __init__(self, n: int, batch_size: int, seed: int, shuffle: bool = True) -> None:
+        if batch_size < 0:
+            raise ConfigError(
+                f"data.loader.batch_size={batch_size}: expected at least 1, or 0 for all at once"
+            )
+        if seed < 0:
+            raise ConfigError(f"seed={seed}: expected an integer of at least 0")
+        self.n = n
+        self.batch_size = batch_size or max(n, 1)
+        self.seed = seed
+        self.shuffle = shuffle
+        self.epoch = 0
+        self.start = 0
+
+    @property
+    def n_batches(self) -> int:
+        """Mini-batches of a whole epoch."""
+        return -(-self.n // self.batch_size)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, counted from 0; it starts at its first mini-batch."""
+        if epoch < 0:
+            raise ValueError(f"epoch {epoch}: epochs are counted from 0")
+        self.epoch = epoch
+        self.start = 0
+
+    def set_start(self, batch: int) -> None:
+        """Skip the mini-batches before number ``batch`` of the present epoch, unread."""
+        if not 0 <= batch <= self.n_batches:
+            raise ValueError(f"mini-batch {batch}: an epoch has mini-batches 0 to {self.n_batches}")
+        self.start = batch
+
+    def order(self) -> np.ndarray:
+        """``(n,)`` positions in the order of the present epoch."""
+        if not self.shuffle:
+            return np.arange(self.n)
+        return np.random.default_rng((self.seed, self.epoch)).permutation(self.n)
+
+    def __len__(self) -> int:
+        """Mini-batches that are left in the present epoch."""
+        return self.n_batches - self.start
+
+    def __iter__(self) -> Iterator[list[int]]:
+        order = self.order()
+        for batch in range(self.start, self.n_batches):
+            yield order[batch * self.batch_size : (batch + 1) * self.batch_size].tolist()
+
+
+def make_loader(
+    dataset: SequenceDataset, options: LoaderOptions, *, seed: int
+) -> DataLoader[Sequence]:
+    """A loader of :class:`~nnode.data.sequence.Batch` mini-batches.
+
+    ``loader.batch_sampler`` is an :class:`EpochSampler`: call its ``set_epoch`` before each
+    epoch, and ``set_start`` to resume within one. The order is the same for every number of
+    workers.
+
+    Raises:
+        ConfigError: a negative batch size, number of workers or seed.
+        DataError: an empty data set.
+    """
+    if not len(dataset):
+        raise DataError(f"{dataset.store.folder}: there is no sequence to load")
+    if options.workers < 0:
+        raise ConfigError(f"data.loader.workers={options.workers}: expected at least 0")
+    return DataLoader(
+        dataset,
+        batch_sampler=EpochSampler(len(dataset), options.batch_size, seed, options.shuffle),
+        num_workers=options.workers,
+        collate_fn=collate,
+        # Its own generator: a loader would otherwise advance the global one at every epoch.
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+def load_all(store: Store, indices: Iterable[int] | None = None) -> Batch:
+    """All sequences, or those at ``indices``, as one batch in memory.
+
+    Raises:
+        DataError: no sequence, a position that the store does not have, or sequences that do
+            not fit into one batch.
+    """
+    return collate(store[i] for i in _positions(store, indices))
+
+
+def _positions(store: Store, indices: Iterable[int] | None) -> ListLike[int]:
+    if indices is None:
+        return range(len(store))
+    positions = list(indices)
+    for i in positions:
+        if not 0 <= i < len(store):
+            raise DataError(
+                f"{store.folder} has sequences 0 to {len(store) - 1}, asked for number {i}; the "
+                "split belongs to other data"
+            )
+    return positions

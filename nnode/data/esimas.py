@@ -1,0 +1,130 @@
+"""Reader of the preprocessed ESIMAS sequences: cars on the middle lane of a motorway tunnel.
+
+A file holds a MATLAB cell array ``sequences`` of structs ``Xarr`` (cars x K positions, m) and
+``Tarr`` (K times, s). Two families are published: sequences with three or more cars
+(``sequence_data1-1_1.mat``) and with two or more (``sequence_data_1-1_1.mat``).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat
+
+from nnode.data.options import EsimasOptions
+from nnode.data.recordings import raw_files
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+#: Start of a file's name, by the least number of cars of the family's sequences.
+PREFIX = {2: "sequence_data_", 3: "sequence_data"}
+
+_NAME = {
+    2: re.compile(r"sequence_data_(.+)\.mat"),
+    3: re.compile(r"sequence_data(?!_)(.+)\.mat"),
+}
+
+
+def esimas_files(options: EsimasOptions) -> dict[str, Path]:
+    """Path of each wanted recording's file, see :func:`nnode.data.recordings.raw_files`.
+
+    Raises:
+        ConfigError: no such family, or an unknown recording.
+    """
+    family = options.min_vehicles
+    if family not in PREFIX:
+        raise ConfigError(
+            f"data.min_vehicles={family}: two families are published, expected one of "
+            f"{', '.join(map(str, PREFIX))}"
+        )
+    return raw_files(
+        options,
+        default="esimas",
+        pattern=_NAME[family],
+        file_name=lambda recording: f"{PREFIX[family]}{recording}.mat",
+    )
+
+
+def read_esimas(path: Path, options: EsimasOptions | None = None) -> list[Sequence]:
+    """Read one file.
+
+    Args:
+        path: a file whose name is ``sequence_data`` or ``sequence_data_``, the recording, and
+            ``.mat``.
+        options: not looked at; a file says all that is needed.
+
+    Returns:
+        The sequences in the order of the file, cars in the order of its rows, named
+        ``recording/000``, ``recording/001``, ... No agent identifiers: the source has none.
+
+    Raises:
+        DataError: a name of another pattern; no MATLAB file, a truncated one, or one with
+            another content; names the sequence and the field.
+
+    Source: E. Kallo, A. Fazekas, S. Lamberty, M. Oeser, "Microscopic traffic data obtained
+    from videos recorded on a German motorway", Mendeley Data V1, 2019.
+    """
+    path = Path(path)
+    match = re.fullmatch(r"sequence_data_?(.+)\.mat", path.name)
+    if match is None:
+        raise DataError(f"{path}: expected a file name like sequence_data1-1_1.mat")
+    recording = match.group(1)
+    cells = np.ravel(_load(path))
+    if cells.size == 0:
+        raise DataError(f"{path}: 'sequences' is empty; expected at least one sequence")
+    found = []
+    for number, cell in enumerate(cells):
+        where = f"{path}, sequence {number}"
+        x = _field(cell, "Xarr", where)
+        time = _field(cell, "Tarr", where).ravel()
+        if x.ndim != 2 or x.shape[1] != time.size or x.size == 0:
+            raise DataError(
+                f"{where}: expected Xarr (cars, K) and Tarr (K), found {x.shape} and ({time.size},)"
+            )
+        found.append(
+            Sequence(
+                name=f"{recording}/{number:03d}",
+                recording=recording,
+                time=time,
+                x=x.T[:, :, None],
+            )
+        )
+    return found
+
+
+def _load(path: Path) -> Any:
+    if not path.is_file():
+        raise DataError(f"there is no file {path}")
+    try:
+        content = loadmat(path)
+    except Exception as error:  # scipy raises almost anything on a damaged file
+        raise DataError(
+            f"{path} cannot be read as a MATLAB file ({type(error).__name__}: {error}); it is "
+            "truncated or of another format: fetch it again"
+        ) from error
+    if "sequences" not in content:
+        names = [name for name in content if not name.startswith("__")]
+        raise DataError(
+            f"{path}: expected a cell array 'sequences', found {', '.join(names) or 'nothing'}"
+        )
+    return content["sequences"]
+
+
+def _field(cell: Any, name: str, where: str) -> np.ndarray:
+    """A struct's field as numbers."""
+    struct = cell
+    while isinstance(struct, np.ndarray) and struct.size == 1:
+        struct = struct.item() if struct.dtype == object else struct.flat[0]
+    fields = getattr(getattr(struct, "dtype", None), "names", None) or ()
+    if name not in fields:
+        raise DataError(
+            f"{where}: expected a struct with the fields Xarr and Tarr, found "
+            f"{', '.join(fields) or type(struct).__name__}"
+        )
+    try:
+        return np.asarray(struct[name], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{where}: {name} holds no plain numbers ({error})") from error

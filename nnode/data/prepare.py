@@ -1,0 +1,320 @@
+"""From raw files to a store: locate, read, find faults, apply the policy, write, remember."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
+
+from nnode import __version__
+from nnode.data.download import sha256
+from nnode.data.esimas import esimas_files, read_esimas
+from nnode.data.juelich import juelich_files, read_juelich
+from nnode.data.options import (
+    DataOptions,
+    EsimasOptions,
+    Faults,
+    JuelichOptions,
+    TableOptions,
+    VehicleTableOptions,
+)
+from nnode.data.quality import Fault, find_faults, usable
+from nnode.data.sequence import Domain, Sequence
+from nnode.data.store import Store, write_store
+from nnode.data.table import TABLE, WALLS, read_table, table_files
+from nnode.data.vehicles import read_vehicles, vehicle_files
+from nnode.errors import ConfigError, DataError, FaultError
+
+log = logging.getLogger(__name__)
+
+#: Sub-folder of a prepared folder with one plot of the faults per recording.
+PLOTS = "faults"
+
+#: Options that say where data lie or how they are used, not what is prepared.
+NOT_PREPARATION = frozenset({"source", "download", "prepared", "split", "loader"})
+
+#: Faults that the message of a FaultError lists.
+LISTED = 5
+
+#: Least number of dimensions of a domain's positions, which is also the greatest.
+DIMENSIONS = {"traffic": 1, "crowd": 2}
+
+_Files = dict[str, Path]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A raw format: which files it needs, and how they become sequences."""
+
+    files: Callable[[Any], _Files]
+    read: Callable[[_Files, Any], list[Sequence]]
+
+
+def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
+    """Read files that do not depend on each other."""
+    return lambda files, options: [s for path in files.values() for s in read(path, options)]
+
+
+#: The format that each kind of options stands for; a new format is one more entry.
+FORMATS: dict[type[DataOptions], Format] = {
+    EsimasOptions: Format(esimas_files, _each(read_esimas)),
+    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
+    JuelichOptions: Format(juelich_files, _each(read_juelich)),
+    TableOptions: Format(
+        table_files, lambda files, options: read_table(files[TABLE], options, files.get(WALLS))
+    ),
+}
+
+
+def prepare(options: DataOptions, folder: Path | str, *, plots: bool = True) -> Store:
+    """Read raw files, sort out faults, and write the sequences and a manifest.
+
+    Args:
+        options: one of the options classes of :data:`FORMATS`.
+        folder: where the store is written; an earlier one is replaced only when all is read
+            and judged.
+        plots: whether to draw the faulty sequences of each recording into ``folder/faults``.
+
+    Returns:
+        The store. Its manifest tells the source files and their SHA-256, all options, the
+        package's version, the sampling interval (s), how many sequences were read, kept and
+        dropped (in all and by recording), every fault that was found, and every sequence and
+        agent that was dropped and why.
+
+    Raises:
+        ConfigError: options that contradict each other or the data.
+        DataError: raw files that cannot be read, or nothing left after dropping.
+        FaultError: faults, with ``faults=error``.
+    """
+    options = _as_dataclass(options)
+    folder = Path(folder)
+    layout = FORMATS[type(options)]
+    files = layout.files(options)
+    read = layout.read(files, options)
+    domain = _domain(options, read)
+    sequences, absent = _drop_absent(read) if domain == "crowd" else (read, [])
+    faults = {s.name: find_faults(s, domain) for s in sequences}
+    kept, dropped = _apply(options.faults, sequences, faults)
+    manifest = {
+        "package": {"name": "nnode", "version": __version__},
+        "options": plain(options),
+        "domain": domain,
+        "dt": _interval(kept),
+        "files": {key: {"name": path.name, "sha256": sha256(path)} for key, path in files.items()},
+        "counts": {"read": len(read), "kept": len(kept), "dropped": len(dropped)},
+        "recordings": _by_recording(read, kept, faults),
+        "dropped": dropped,
+        "dropped_agents": absent,
+        "faults": [asdict(fault) for found in faults.values() for fault in found],
+    }
+    with _drawn(folder, sequences, faults, domain, plots):
+        store = write_store(folder, kept, manifest)
+    log.info("%d of %d sequences kept in %s", len(kept), len(read), folder)
+    return store
+
+
+def open_data(options: DataOptions, folder: Path | str) -> Store:
+    """The prepared data that options ask for.
+
+    Args:
+        options: with ``prepared`` set, that folder is opened; otherwise data are prepared.
+        folder: where they are prepared, without plots.
+
+    Raises:
+        ConfigError: ``prepared`` holds data that were prepared with other options; names them.
+        DataError, FaultError: see :func:`prepare`; or ``prepared`` holds no sound store.
+    """
+    options = _as_dataclass(options)
+    if options.prepared is None:
+        return prepare(options, folder, plots=False)
+    store = Store(Path(options.prepared).expanduser())
+    before = _preparation(store.manifest.get("options", {}))
+    now = _preparation(plain(options))
+    absent = object()
+    differing = [
+        f"data.{key}={before.get(key, 'not known')} then, {now.get(key, 'not known')} now"
+        for key in sorted({*before, *now})
+        if before.get(key, absent) != now.get(key, absent)
+    ]
+    if differing:
+        raise ConfigError(
+            f"data.prepared={options.prepared} was prepared with other options: "
+            f"{'; '.join(differing)}. Set them back, prepare the data again, or set "
+            "data.prepared=null to prepare on the fly"
+        )
+    return store
+
+
+def plain(options: DataOptions) -> dict[str, Any]:
+    """Options as a dict that JSON can hold, as the manifest remembers them."""
+    container = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
+    return cast(dict[str, Any], json.loads(json.dumps(container)))
+
+
+def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
+    if isinstance(options, DictConfig):
+        try:
+            options = cast(DataOptions, OmegaConf.to_object(options))
+        except MissingMandatoryValue as error:
+            raise ConfigError(f"{error.full_key} is not set; give it a value") from error
+    if type(options) not in FORMATS:
+        known = ", ".join(kind.__name__ for kind in FORMATS)
+        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {known}")
+    return options
+
+
+def _preparation(options: dict[str, Any]) -> dict[str, Any]:
+    """The options that decide what is prepared; of a table's path only the name."""
+    chosen = {key: value for key, value in options.items() if key not in NOT_PREPARATION}
+    for key in ("path", "walls"):
+        if isinstance(chosen.get(key), str):
+            chosen[key] = Path(chosen[key]).name
+    return chosen
+
+
+def _domain(options: DataOptions, sequences: list[Sequence]) -> Domain:
+    if options.domain not in DIMENSIONS:
+        raise ConfigError(f"data.domain={options.domain}: expected traffic or crowd")
+    expected = DIMENSIONS[options.domain]
+    for s in sequences:
+        if s.x.shape[2] != expected:
+            raise ConfigError(
+                f"data.domain={options.domain} needs {expected}-dimensional positions, sequence "
+                f"{s.name} has {s.x.shape[2]}"
+            )
+    return cast(Domain, options.domain)
+
+
+def _drop_absent(sequences: list[Sequence]) -> tuple[list[Sequence], list[dict[str, Any]]]:
+    """Leave out people who are not present throughout their sequence, as the paper does."""
+    kept, absent = [], []
+    for s in sequences:
+        missing = np.isnan(s.x).all(axis=2).sum(axis=0)
+        for i in np.flatnonzero(missing):
+            why = f"absent at {missing[i]} of {s.n_samples} samples"
+            name = s.agents[i] if s.agents else str(i)
+            absent.append({"sequence": s.name, "agent": name, "why": why})
+        kept.append(s.select(missing == 0) if missing.any() else s)
+    return kept, absent
+
+
+def _apply(
+    policy: Faults, sequences: list[Sequence], faults: dict[str, list[Fault]]
+) -> tuple[list[Sequence], list[dict[str, Any]]]:
+    """Sequences to keep, and the others with the reasons."""
+    faulty = [s for s in sequences if faults[s.name]]
+    if policy is Faults.error and faulty:
+        found = [fault for s in faulty for fault in faults[s.name]]
+        lines = [f"  {f.sequence}: {f.kind}: {f.detail}" for f in found[:LISTED]]
+        more = [f"  ... and {len(found) - LISTED} more"] if len(found) > LISTED else []
+        raise FaultError(
+            f"{len(faulty)} of {len(sequences)} sequences hold faults ({_counts(faulty, faults)}); "
+            "data.faults=error refuses them, data.faults=drop leaves them out, data.faults=keep "
+            "keeps them:\n" + "\n".join(lines + more)
+        )
+    keep = policy is Faults.keep
+
+    def stays(s: Sequence) -> bool:
+        return not faults[s.name] or (keep and s.n_agents > 0 and usable(s, faults[s.name]))
+
+    kept = [s for s in sequences if stays(s)]
+    dropped = [
+        {
+            "sequence": s.name,
+            "reasons": [{"kind": f.kind, "detail": f.detail} for f in faults[s.name]],
+        }
+        for s in sequences
+        if not stays(s)
+    ]
+    if not kept:
+        raise DataError(
+            f"nothing is left of {len(sequences)} sequences: {_counts(faulty, faults)}; "
+            + ("these cannot be simulated" if keep else "data.faults=keep keeps faulty ones")
+        )
+    return kept, dropped
+
+
+def _counts(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> str:
+    counts = _by_kind(sequences, faults)
+    return ", ".join(f"{kind} in {n}" for kind, n in counts.items()) or "no sequence at all"
+
+
+def _by_kind(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> dict[str, int]:
+    """Number of sequences with each kind of fault, the most frequent first."""
+    kinds = Counter(kind for s in sequences for kind in {f.kind for f in faults[s.name]})
+    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _by_recording(
+    read: list[Sequence], kept: list[Sequence], faults: dict[str, list[Fault]]
+) -> dict[str, Any]:
+    staying = {s.name for s in kept}
+    table = {}
+    for recording in dict.fromkeys(s.recording for s in read):
+        own = [s for s in read if s.recording == recording]
+        n_kept = sum(s.name in staying for s in own)
+        table[recording] = {
+            "read": len(own),
+            "kept": n_kept,
+            "dropped": len(own) - n_kept,
+            "faulty": _by_kind(own, faults),
+        }
+    return table
+
+
+def _interval(sequences: list[Sequence]) -> float:
+    """The sampling interval that all sequences share."""
+    first = sequences[0]
+    for s in sequences:
+        if not np.isclose(s.dt, first.dt, rtol=1e-6):
+            raise DataError(
+                f"{first.name} is sampled every {first.dt:g} s, {s.name} every {s.dt:g} s; one "
+                "data set has one sampling interval: prepare them as two, choosing "
+                "data.recording"
+            )
+    return round(float(np.median([s.dt for s in sequences])), 9)
+
+
+@contextmanager
+def _drawn(
+    folder: Path,
+    sequences: list[Sequence],
+    faults: dict[str, list[Fault]],
+    domain: Domain,
+    plots: bool,
+) -> Iterator[None]:
+    """Draw beside the folder's present plots, and put them in place after the body succeeds."""
+    partial = folder / f".{PLOTS}.{os.getpid()}.partial"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for rest in folder.glob(".*.partial"):  # what an interrupted preparation left
+            shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+        partial.mkdir()
+    except OSError as error:
+        raise DataError(f"{folder} cannot be written: {error}; choose another folder") from error
+    try:
+        if plots:
+            from nnode.plots.quality import plot_faults  # matplotlib is slow to load
+
+            for recording in dict.fromkeys(s.recording for s in sequences):
+                own = [s for s in sequences if s.recording == recording]
+                if any(faults[s.name] for s in own):
+                    name = recording.replace(os.sep, "_") + ".png"
+                    plot_faults(own, faults, domain, partial / name)
+        yield
+        shutil.rmtree(folder / PLOTS, ignore_errors=True)
+        if any(partial.iterdir()):
+            os.replace(partial, folder / PLOTS)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

@@ -1,0 +1,144 @@
+"""Which recordings of a data source are asked for, and which files hold them."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+from nnode.data import download
+from nnode.data.options import DataOptions
+from nnode.errors import ConfigError, DataError
+
+
+def positive(option: str, value: float | None) -> float:
+    """``value``, if it is a positive finite number.
+
+    Raises:
+        ConfigError: it is not; names the option.
+    """
+    if value is None or not 0 < value < float("inf"):
+        raise ConfigError(f"data.{option}={value}: expected a positive number")
+    return float(value)
+
+
+def one_of(option: str, value: str | None, valid: Mapping[str, float]) -> float:
+    """What ``valid`` holds for the configured word.
+
+    Raises:
+        ConfigError: the word is not among the valid ones; lists them.
+    """
+    if value is None or value not in valid:
+        raise ConfigError(f"data.{option}={value}: expected one of {', '.join(valid)}")
+    return valid[value]
+
+
+def wanted(option: object) -> list[str] | None:
+    """Names that ``data.recording`` asks for; None for all.
+
+    Raises:
+        ConfigError: neither a name nor a list of names, or an empty list.
+    """
+    if option is None or option == "all":
+        return None
+    items = [option] if isinstance(option, str | int) else option
+    if not isinstance(items, Iterable) or isinstance(items, Mapping):
+        raise ConfigError(f"data.recording={option}: expected 'all', a name or a list of names")
+    names = list(dict.fromkeys(str(item) for item in items))
+    if not names:
+        raise ConfigError("data.recording=[]: expected 'all', a name or a list of names")
+    return names
+
+
+def check_known(asked: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse names that are not known, naming the nearest first.
+
+    Raises:
+        ConfigError: an unknown recording.
+    """
+    valid = list(dict.fromkeys(known))
+    for name in asked:
+        if name not in valid:
+            near = difflib.get_close_matches(name, valid, n=len(valid) or 1, cutoff=0.0)
+            raise ConfigError(
+                f"data.recording={name}: unknown recording; nearest first, the valid ones are: "
+                f"{', '.join(near) or 'none'}"
+            )
+
+
+def raw_files(
+    options: DataOptions,
+    *,
+    default: str,
+    pattern: re.Pattern[str],
+    file_name: Callable[[str], str],
+) -> dict[str, Path]:
+    """Locate the raw files of a public format, by recording.
+
+    Args:
+        options: ``name``, ``source``, ``download`` and ``recording`` are read.
+        default: the published data set to which a source of another name belongs.
+        pattern: matches a file name of the format; group 1 is the recording.
+        file_name: the file name of a recording.
+
+    Returns:
+        The path of each recording's file. "all" are the published recordings, or, in a local
+        folder that holds none of them, every file whose name matches.
+
+    Raises:
+        ConfigError: an unknown recording.
+        DataError, DownloadError: see :func:`nnode.data.download.locate`.
+    """
+    dataset = options.name if options.name in download.FILES else default
+    public = _matches(pattern, download.FILES[dataset])
+    local = _matches(pattern, _held(options.source, dataset))
+    asked = wanted(options.recording)
+    if asked is None:
+        asked = public if set(public) & set(local) or not local else local
+    else:
+        check_known(asked, [*public, *local])
+    files = download.locate(
+        dataset,
+        [file_name(name) for name in asked],
+        source=options.source,
+        folder=Path(options.download),
+    )
+    return dict(zip(asked, files.values(), strict=True))
+
+
+def table_path(options: DataOptions, option: str, path: str) -> Path:
+    """The path of a user's table, looked for below ``data.source`` where that is given.
+
+    Raises:
+        ConfigError: the path is not set, or ``data.source`` is an address.
+        DataError: there is no such file.
+    """
+    if not path or path == "???":
+        raise ConfigError(f"data.{option} is not set; expected the path of a table")
+    place = Path(path).expanduser()
+    if options.source is not None and not place.is_absolute():
+        if "://" in options.source:
+            raise ConfigError(
+                f"data.source={options.source}: tables are read from a folder; download the "
+                "table and set data.source to its folder"
+            )
+        place = Path(options.source).expanduser() / place
+    if not place.is_file():
+        raise DataError(f"data.{option}: there is no file {place}")
+    return place
+
+
+def _matches(pattern: re.Pattern[str], names: Iterable[str]) -> list[str]:
+    found = (pattern.fullmatch(name) for name in names)
+    return [match.group(1) for match in found if match]
+
+
+def _held(source: str | None, dataset: str) -> list[str]:
+    """Names of the files in a local source folder and in its sub-folder of the data set."""
+    source = source or os.environ.get(download.FOLDER_VARIABLE)
+    if not source or "://" in source:
+        return []
+    places = [Path(source).expanduser(), Path(source).expanduser() / dataset]
+    return sorted({p.name for place in places if place.is_dir() for p in place.iterdir()})

@@ -1,0 +1,32 @@
+"""Artificial recordings with known laws, in the raw formats of the real ones.
+
+They are simulated with right-hand sides and a solver of their own, so that what is calibrated
+on them is checked against something independent of the package's models and solvers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nnode.data.synthetic.crowd import Forces, crowd_recording, social_force
+from nnode.data.synthetic.traffic import traffic_recording
+
+__all__ = ["Forces", "crowd_recording", "demo_data", "social_force", "traffic_recording"]
+
+
+def demo_data(folder: Path | str, seed: int = 0) -> dict[str, Path]:
+    """Write a small traffic and a small crowd recording, laid out like the real data.
+
+    Args:
+        folder: receives ``esimas/sequence_datademo.mat`` and ``juelich/demo_corridor.txt``;
+            ``data.source`` may point at it.
+        seed: the same seed gives the same bytes.
+
+    Returns:
+        The two paths by data set, ``esimas`` and ``juelich``.
+    """
+    folder = Path(folder)
+    return {
+        "esimas": traffic_recording(folder / "esimas" / "sequence_datademo.mat", seed=seed),
+        "juelich": crowd_recording(folder / "juelich" / "demo_corridor.txt", seed=seed),
+    }

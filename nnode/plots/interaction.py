@@ -1,0 +1,92 @@
+"""The calibrated force of a crowd model at any relative position and velocity.
+
+Forces act on person i; relative positions are x_i - x_j and relative velocities v_i - v_j. A
+positive first component pushes i towards larger x: where i stands on the right of j that is
+repulsion, on the left attraction.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+
+from nnode.errors import ConfigError
+from nnode.models import InteractionForce, SocialForce, System
+
+Part = Literal["sum", "pair", "wall"]
+Vector = tuple[float, float]
+
+
+def interaction(system: System) -> InteractionForce:
+    """The first interaction force among the terms of ``system``.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for term in system.terms:
+        if isinstance(term, InteractionForce):
+            return term
+    raise ConfigError(
+        f"a force figure needs a crowd model with an interaction force, found a {system.domain} "
+        f"model with the terms {[getattr(t, 'name', '?') for t in system.terms]}"
+    )
+
+
+@torch.no_grad()
+def evaluate_force(
+    system: System, dx: np.ndarray, dv: np.ndarray, part: Part | None = None
+) -> np.ndarray:
+    """Interaction force of a model, not divided by mass or number of people.
+
+    Args:
+        dx: ``(..., 2)`` x_i - x_j in m.
+        dv: ``(..., 2)`` v_i - v_j in m/s. For the wall, v_i minus the velocity of the wall
+            point, which in a network is the artificial one.
+        part: ``pair``; ``wall``; or ``sum`` of both at the same dx and dv, as the paper adds
+            its two networks. Default: ``pair`` for the social force, else ``sum``. A model
+            without walls has ``sum`` = ``pair``.
+
+    Returns:
+        ``(..., 2)`` N.
+
+    Raises:
+        ConfigError: no interaction force, an unknown part, or ``wall`` of a model without walls.
+    """
+    term = interaction(system)
+    chosen = chosen_part(term, part)
+    like = next(term.parameters(), torch.zeros((), dtype=torch.float64))
+    position, velocity = (
+        torch.from_numpy(np.array(value, dtype=np.float64)).to(like) for value in (dx, dv)
+    )
+    force = torch.zeros_like(position)
+    if chosen != "wall":
+        force = force + term.pair_force(position, velocity)
+    if chosen != "pair" and term.walls:
+        force = force + term.wall_force(position, velocity, torch.zeros_like(velocity))
+    return np.asarray(force.double().cpu().numpy())
+
+
+def force_range(term: InteractionForce) -> str:
+    """``short`` for the social force, ``long`` for others: the paper draws them differently."""
+    return "short" if isinstance(term, SocialForce) else "long"
+
+
+def chosen_part(term: InteractionForce, part: str | None) -> str:
+    """``part``, or the default of ``term``; see :func:`evaluate_force` for both."""
+    if part is None:
+        return "pair" if isinstance(term, SocialForce) else "sum"
+    if part not in ("sum", "pair", "wall"):
+        raise ConfigError(f"part must be sum, pair or wall, got {part!r}")
+    if part == "wall" and not term.walls:
+        raise ConfigError("part=wall: this model was built without walls (model.walls=false)")
+    return part
+
+
+def describe(term: InteractionForce, part: str | None) -> str:
+    """What is drawn, for a title."""
+    part = chosen_part(term, part)
+    if part == "sum":
+        part = "pair + wall" if term.walls else "pair"
+    return f"{term.name.replace('_', ' ')}, {part}"

@@ -1,0 +1,180 @@
+"""Forces on two people in six settings: who stands where, walks how, and is pushed where."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from nnode.errors import ConfigError
+from nnode.models import System
+from nnode.plots.interaction import (
+    Part,
+    Vector,
+    describe,
+    evaluate_force,
+    force_range,
+    interaction,
+)
+from nnode.plots.style import FONT, GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Two people: positions in m, velocities in m/s."""
+
+    name: str
+    x_blue: Vector
+    x_red: Vector
+    v_blue: Vector
+    v_red: Vector
+
+
+def _settings(ahead: float, beside: float) -> tuple[Setting, ...]:
+    """The six settings; people are 2 ``ahead`` (m) or 2 ``beside`` (m) apart."""
+    places = (
+        ((0.0, ahead), (0.0, -ahead)),
+        ((0.01, ahead), (-0.01, -ahead)),
+        ((beside, 0.0), (-beside, 0.0)),
+    )
+    found: list[Setting] = []
+    for blue, red in places:
+        for v_blue in ((0.0, -1.0), (0.0, 1.0)):
+            found.append(Setting(f"S{len(found) + 1}", blue, red, v_blue, (0.0, 1.0)))
+    return tuple(found)
+
+
+#: Source: Göttlich & Totzeck, tables (data6settings) and (data6settingsNN).
+SETTINGS = {
+    "short": _settings(ahead=0.22, beside=0.22),
+    "long": _settings(ahead=4.0, beside=0.5),
+}
+
+
+def six_settings(
+    system: System, settings: Items[Setting] | None = None, *, part: Part | None = None
+) -> tuple[Figure, pd.DataFrame]:
+    """Forces on two people in the paper's six settings, drawn and as a table.
+
+    Left, the people face each other; right, they walk in the same direction. Arrows have one
+    scale in all panels, given by the keys above them; every panel has its own section of space.
+
+    Args:
+        settings: default are the paper's: 0.44 m apart for the social force, 8 m or 1 m apart
+            otherwise.
+        part: see :func:`evaluate_force`.
+
+    Returns:
+        The figure, and the table with the columns ``setting``, ``x_blue``, ``x_red`` (m),
+        ``v_blue``, ``v_red`` (m/s), ``force_blue``, ``force_red`` (N); each cell is (x, y).
+
+    Raises:
+        ConfigError: no settings, no interaction force, or a part that does not exist.
+
+    Source: Göttlich & Totzeck, tables (data6settings), (data6settingsNN), figures (6Helbing),
+    (6NN).
+    """
+    term = interaction(system)
+    chosen = SETTINGS[force_range(term)] if settings is None else tuple(settings)
+    if not chosen:
+        raise ConfigError("six_settings needs at least one setting, got none")
+    dx = np.array([s.x_blue for s in chosen]) - np.array([s.x_red for s in chosen])
+    dv = np.array([s.v_blue for s in chosen]) - np.array([s.v_red for s in chosen])
+    blue = evaluate_force(system, dx, dv, part)
+    red = evaluate_force(system, -dx, -dv, part)
+    table = pd.DataFrame(
+        {
+            "setting": [s.name for s in chosen],
+            **{
+                column: [getattr(s, column) for s in chosen]
+                for column in ("x_blue", "x_red", "v_blue", "v_red")
+            },
+            "force_blue": [tuple(map(float, force)) for force in blue],
+            "force_red": [tuple(map(float, force)) for force in red],
+        }
+    )
+    return _quivers(table, describe(term, part)), table
+
+
+#: Lengths (inches) of the longest velocity and of the longest force arrow.
+LONGEST = {"v": 0.40, "force": 0.60}
+WIDTH = 5.4
+#: Half width of a panel, in units of the larger coordinate of its people.
+ROOM = 2.4
+
+_ARROW: dict[str, dict[str, Any]] = {
+    "v": {"width": 0.06, "headwidth": 2.6, "headlength": 2.4, "headaxislength": 2.2, "alpha": 0.6},
+    "force": {"width": 0.02, "headwidth": 5.0, "color": "black", "zorder": 4},
+}
+_PERSON: dict[str, dict[str, Any]] = {
+    "blue": {"color": OKABE_ITO["blue"], "marker": "o"},
+    "red": {"color": OKABE_ITO["vermillion"], "marker": "s"},
+}
+
+
+def _quivers(table: pd.DataFrame, what: str) -> Figure:
+    """The figure of :func:`six_settings`."""
+    rows = (len(table) + 1) // 2
+    figure = new_figure(WIDTH, 2.45 * rows + 0.6)
+    grid = figure.add_gridspec(rows + 1, 2, height_ratios=[0.16, *[1.0] * rows])
+    longest = {kind: _longest(table, kind) for kind in LONGEST}
+    scale = {kind: longest[kind] / inches for kind, inches in LONGEST.items()}
+    for i, (_, row) in enumerate(table.iterrows()):
+        ax = figure.add_subplot(grid[1 + i // 2, i % 2])
+        half = ROOM * max(*map(abs, (*row["x_blue"], *row["x_red"])), 1e-3)
+        for person in _PERSON:
+            where = row[f"x_{person}"]
+            _arrow(ax, "v", where, row[f"v_{person}"], scale, color=_PERSON[person]["color"])
+            _arrow(ax, "force", where, row[f"force_{person}"], scale)
+            _person(ax, person, where)
+        ax.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_locator(MaxNLocator(4))
+        dress(ax, x="x (m)", y="y (m)", title=str(row["setting"]))
+    _key(figure.add_subplot(grid[0, :]), longest, scale)
+    figure.suptitle(what, fontsize=FONT)
+    return figure
+
+
+def _longest(table: pd.DataFrame, kind: str) -> float:
+    """Largest length of a vector in the table; 1 where all vanish."""
+    norms = np.hypot(*np.array([*table[f"{kind}_blue"], *table[f"{kind}_red"]]).T)
+    return float(np.max(norms[np.isfinite(norms)], initial=0.0)) or 1.0
+
+
+def _arrow(
+    ax: Axes, kind: str, where: Vector, vector: Vector, scale: dict[str, float], **style: Any
+) -> None:
+    # a length in inches reads the same in every panel, whatever space the panel shows
+    ax.quiver(
+        *where, *vector, scale=scale[kind], gid=kind, angles="uv", scale_units="inches",
+        units="inches", minlength=0, **(_ARROW[kind] | style),
+    )  # fmt: skip
+
+
+def _person(ax: Axes, person: str, where: Vector) -> None:
+    ax.plot(
+        *where, markersize=7, markeredgecolor="white", markeredgewidth=0.7, zorder=3, gid=person,
+        **_PERSON[person],
+    )  # fmt: skip
+
+
+def _key(ax: Axes, longest: dict[str, float], scale: dict[str, float]) -> None:
+    """One row that says what markers and arrows mean and how long they are."""
+    width = WIDTH * 0.9  # inches, about
+    ax.set(xlim=(0, 1), ylim=(0, 1))
+    ax.set_axis_off()
+    for x, person in ((0.03, "blue"), (0.17, "red")):
+        _person(ax, person, (x, 0.5))
+        ax.text(x + 0.03, 0.5, person, fontsize=SMALL_FONT, va="center")
+    for x, kind, name, unit in ((0.31, "v", "velocity", "m/s"), (0.61, "force", "force", "N")):
+        color = {"v": GREY, "force": "black"}[kind]
+        _arrow(ax, kind, (x, 0.5), (longest[kind], 0.0), scale, color=color)
+        says = f"{name},\nthis long: {longest[kind]:.3g} {unit}"
+        ax.text(x + LONGEST[kind] / width + 0.02, 0.5, says, fontsize=SMALL_FONT, va="center")

@@ -1,0 +1,107 @@
+"""One restrained look for all figures: colour-blind safe, readable in grey, units on the axes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from nnode.errors import ConfigError
+
+#: Okabe and Ito's palette without its yellow, which is too pale for lines on white.
+#: Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
+OKABE_ITO = {
+    "blue": "#0072B2",
+    "vermillion": "#D55E00",
+    "green": "#009E73",
+    "purple": "#CC79A7",
+    "orange": "#E69F00",
+    "sky": "#56B4E9",
+    "black": "#000000",
+}
+
+#: Line styles that go with the colours, so that curves differ in grey as well.
+LINE_STYLES: tuple[Any, ...] = (
+    "-",
+    (0, (6, 2)),
+    (0, (1.2, 1.4)),
+    (0, (7, 2, 1.2, 2)),
+    (0, (3.5, 1.2)),
+    (0, (7, 1.6, 1.2, 1.6, 1.2, 1.6)),
+    (0, (10, 3)),
+)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+#: Sequential (monotone in grey) and diverging (ColorBrewer, colour-blind safe) colour maps.
+SEQUENTIAL = "cividis"
+DIVERGING = "RdBu_r"
+
+GREY = "#666666"
+SHADE = "#EFEFEF"
+FONT = 9.0
+SMALL_FONT = 8.0
+DPI = 150
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of ``width`` by ``height`` inches that no global state keeps open."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def curve_style(index: int) -> dict[str, Any]:
+    """Colour, line style and marker of the ``index``-th curve; they repeat after seven."""
+    i = index % len(OKABE_ITO)
+    return {
+        "color": list(OKABE_ITO.values())[i],
+        "linestyle": LINE_STYLES[i],
+        "marker": MARKERS[i],
+    }
+
+
+def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = True) -> None:
+    """Give an axes its labels (with units), fonts and, behind the data, a pale grid."""
+    # set per axes: ticks are created late and would take the fonts of whoever draws
+    ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    for spine in ax.spines.values():
+        spine.set_linewidth(0.6)
+        spine.set_edgecolor(GREY)
+    if x:
+        ax.set_xlabel(x, fontsize=FONT)
+    if y:
+        ax.set_ylabel(y, fontsize=FONT)
+    if title:
+        ax.set_title(title, fontsize=FONT)
+    ax.set_axisbelow(True)
+    if grid:
+        ax.grid(True, color="#DDDDDD", linewidth=0.5)
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write ``figure`` as PNG with 150 dots per inch; a reader never sees half a file.
+
+    Missing folders are made. An existing file is replaced.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ConfigError: the path does not end in ``.png``, or its folder cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise ConfigError(f"figures are saved as PNG: expected a path ending in .png, got {path}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(temporary, format="png", dpi=DPI)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ConfigError(
+            f"figure {path} could not be written ({error}); choose a folder that can be written to"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,281 @@
+"""What a traffic model has learned: speed as a function of the gap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+from nnode.models import FollowTheLeader, System
+from nnode.plots.style import (
+    GREY,
+    OKABE_ITO,
+    SEQUENTIAL,
+    SHADE,
+    SMALL_FONT,
+    curve_style,
+    dress,
+    new_figure,
+)
+
+#: Speeds (m/s) that are shown at most; the laws have a pole at gap 0.
+SHOWN = (-20.0, 60.0)
+#: Gaps between these percentiles count as supported by the data.
+SUPPORT = (1.0, 99.0)
+KMH = 3.6
+SAMPLES = 481
+BINS = 48
+
+
+def follow_law(system: System, name: str = "model") -> FollowTheLeader:
+    """The first follow-the-leader law among the terms of ``system``.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for term in system.terms:
+        if isinstance(term, FollowTheLeader):
+            return term
+    raise ConfigError(
+        f"{name}: a speed curve needs a traffic model with a law of the gap, found a "
+        f"{system.domain} model with the terms {[getattr(t, 'name', '?') for t in system.terms]}"
+    )
+
+
+def measured_gaps(sequences: Iterable[Sequence]) -> np.ndarray:
+    """All gaps x_{i+1} - x_i in m of traffic sequences, as one vector.
+
+    Raises:
+        DataError: a sequence is not one-dimensional.
+    """
+    parts = []
+    for item in sequences:
+        if item.x.shape[2] != 1:
+            raise DataError(
+                f"sequence {item.name}: gaps exist on a lane only, got "
+                f"{item.x.shape[2]}-dimensional positions"
+            )
+        parts.append(np.diff(item.x[..., 0], axis=1).ravel())
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+@torch.no_grad()
+def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
+    """Speed W (m/s) of every model at ``gaps`` (m).
+
+    Only the follow-the-leader law is evaluated; further terms of a model are left out.
+
+    Returns:
+        One row per gap (index ``gap``, m), one column per model.
+
+    Raises:
+        ConfigError: no model, or one without a law of the gap.
+        DataError: gaps that are not a vector of finite numbers.
+    """
+    gaps = _vector(gaps)
+    if not models:
+        raise ConfigError("speed curves need at least one model, got none")
+    columns = {}
+    for name, system in models.items():
+        law = follow_law(system, name)
+        speed = law.speed(torch.as_tensor(gaps, dtype=law.v0.dtype, device=law.v0.device))
+        columns[name] = speed.double().cpu().numpy()
+    return pd.DataFrame(columns, index=pd.Index(gaps, name="gap"))
+
+
+def speed_curves(
+    models: Mapping[str, System],
+    gaps: np.ndarray | None = None,
+    span: tuple[float, float] = (2.0, 50.0),
+) -> Figure:
+    """Speed against gap for one or many models.
+
+    A marker at the right edge shows each constant leader's v0. Up to seven models have a colour,
+    line style and marker each; more, such as the checkpoints of a run, are shaded from first to
+    last. Speeds outside -20...60 m/s are cut, and the figure says so.
+
+    Args:
+        models: name to traffic model.
+        gaps: measured gaps in m, for a histogram below. Curves fade outside the 1st to 99th
+            percentile, where no data support them.
+        span: the gaps shown, m.
+
+    Raises:
+        ConfigError: no model, one without a law of the gap, or a span without 0 < low < high.
+        DataError: gaps that are not a vector of finite numbers.
+
+    Source: Göttlich & Totzeck, figure (interactionForce).
+    """
+    low, high = map(float, span)
+    if not 0 < low < high < np.inf:
+        raise ConfigError(f"span must be two gaps in m with 0 < low < high, got {span}")
+    table = curve_table(models, np.linspace(low, high, SAMPLES))
+    leaders = {
+        name: float(follow_law(system).v0.detach())
+        for name, system in models.items()
+        if getattr(system, "leader", "constant") == "constant"
+    }
+    if gaps is None:
+        figure = new_figure(6.4, 4.0)
+        ax = figure.subplots()
+        support = None
+    else:
+        gaps = _vector(gaps)
+        figure = new_figure(6.4, 5.0)
+        ax, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.4, 1))
+        support = _histogram(below, gaps, (low, high))
+        for panel in (ax, below):
+            for edge in ((low, support[0]), (support[1], high)):
+                if edge[0] < edge[1]:
+                    panel.axvspan(*edge, color=SHADE, linewidth=0, zorder=0)
+    dress(ax, x="gap (m)" if gaps is None else "", y="speed W (m/s)")
+    names = [str(name) for name in table]
+    many = len(names) > len(OKABE_ITO)
+    styles, handles = (_many if many else _few)(names)
+    for i, (name, style) in enumerate(zip(names, styles, strict=True)):
+        # side by side, since calibrated leaders often drive at nearly the same speed
+        place = 0.985 - (0 if many else 0.022 * i)
+        _curve(ax, name, table[name], support, leaders.get(name), place, style)
+    if leaders:
+        marker, label = (
+            styles[0]["marker"] if many else "",
+            "at the edge: leader's v0" if many else "markers: leader's v0",
+        )
+        handles.append(Line2D([], [], color=GREY, marker=marker, linestyle="", label=label))
+    ax.set_xlim(low, high)
+    _limit(ax, table, list(leaders.values()))
+    right = ax.secondary_yaxis("right", functions=(_to_kmh, _from_kmh))
+    right.set_ylabel("speed W (km/h)", fontsize=ax.yaxis.label.get_fontsize())
+    right.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    right.spines["right"].set(linewidth=0.6, edgecolor=GREY)
+    ax.legend(
+        handles=handles,
+        handlelength=3.4,
+        fontsize=SMALL_FONT,
+        loc="best",
+        framealpha=0.9,
+        edgecolor="none",
+    )
+    return figure
+
+
+def traffic_figures(
+    models: Mapping[str, System], gaps: np.ndarray | None = None
+) -> dict[str, Figure]:
+    """Every figure of traffic models: ``speed``, see :func:`speed_curves`."""
+    return {"speed": speed_curves(models, gaps)}
+
+
+def _to_kmh(speed: Any) -> Any:
+    return speed * KMH
+
+
+def _from_kmh(speed: Any) -> Any:
+    return speed / KMH
+
+
+def _vector(gaps: np.ndarray) -> np.ndarray:
+    gaps = np.asarray(gaps, dtype=np.float64)
+    if gaps.ndim != 1 or not gaps.size or not np.isfinite(gaps).all():
+        raise DataError(
+            f"gaps must be a vector of finite numbers in m, got shape {gaps.shape} with "
+            f"{int((~np.isfinite(gaps)).sum())} entries that are not finite"
+        )
+    return gaps
+
+
+def _few(names: list[str]) -> tuple[list[dict[str, Any]], list[Line2D]]:
+    """A colour, line style and marker for each model, and a legend that names all."""
+    styles = [curve_style(i) | {"linewidth": 1.8} for i in range(len(names))]
+    handles = [
+        Line2D([], [], markersize=4.5, label=name, **style)
+        for name, style in zip(names, styles, strict=True)
+    ]
+    return styles, handles
+
+
+def _many(names: list[str]) -> tuple[list[dict[str, Any]], list[Line2D]]:
+    """Shades from the first to the last model, and a legend that names three of them."""
+    # the palest end of the map would vanish on white
+    colours = matplotlib.colormaps[SEQUENTIAL](np.linspace(0.85, 0.0, len(names)))
+    styles: list[dict[str, Any]] = [
+        {"color": colour, "linewidth": 0.9, "linestyle": "-", "marker": "<"} for colour in colours
+    ]
+    handles = [
+        Line2D([], [], color=colours[i], linewidth=1.8, label=names[i])
+        for i in (0, (len(names) - 1) // 2, len(names) - 1)
+    ]
+    return styles, [Line2D([], [], linestyle="", label=f"{len(names)} models:"), *handles]
+
+
+def _curve(
+    ax: Axes,
+    name: str,
+    speeds: pd.Series,
+    support: tuple[float, float] | None,
+    v0: float | None,
+    place: float,
+    style: dict[str, Any],
+) -> None:
+    """One curve, pale where no data support it, and its leader's speed at the right edge."""
+    gap, speed = speeds.index.to_numpy(), speeds.to_numpy()
+    line = {key: value for key, value in style.items() if key != "marker"}
+    held = np.full(gap.shape, True)
+    if support is not None:
+        held = (gap >= support[0]) & (gap <= support[1])
+        ax.plot(gap, np.where(held, np.nan, speed), gid=f"unsupported:{name}", alpha=0.3, **line)
+    ax.plot(gap, np.where(held, speed, np.nan), gid=f"curve:{name}", **line)
+    if v0 is not None:
+        ax.plot(
+            place, v0, gid=f"v0:{name}", transform=ax.get_yaxis_transform(), linestyle="",
+            marker=style["marker"], color=style["color"], markersize=5, zorder=4,
+            markeredgecolor="white", markeredgewidth=0.4,
+        )  # fmt: skip
+
+
+def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float]) -> None:
+    """Keep the speed axis legible, and say what it cuts."""
+    values = np.concatenate([table.to_numpy().ravel(), leaders, [0.0]])
+    values = values[np.isfinite(values)]
+    bottom, top = max(values.min(), SHOWN[0]), min(values.max(), SHOWN[1])
+    pad = 0.05 * (top - bottom) or 1.0
+    ax.set_ylim(
+        bottom if values.min() < SHOWN[0] else bottom - pad,
+        top if values.max() > SHOWN[1] else top + pad,
+    )
+    cut = []
+    if values.min() < SHOWN[0]:
+        cut.append(f"below −{-SHOWN[0]:g} m/s")
+    if values.max() > SHOWN[1]:
+        cut.append(f"above {SHOWN[1]:g} m/s")
+    unfinished = [str(name) for name in table if not np.isfinite(table[name]).all()]
+    notes = [f"curves {' and '.join(cut)} are cut"] if cut else []
+    if unfinished:
+        notes.append(f"not finite everywhere: {', '.join(unfinished[:3])}")
+    if bottom < 0:
+        ax.axhline(0.0, color=GREY, linewidth=0.6, zorder=1)
+    if notes:
+        ax.set_title("; ".join(notes), fontsize=SMALL_FONT, color=GREY, loc="left")
+
+
+def _histogram(ax: Axes, gaps: np.ndarray, span: tuple[float, float]) -> tuple[float, float]:
+    """Histogram of the gaps within ``span``; returns the percentiles that bound the support."""
+    low, high = (float(value) for value in np.percentile(gaps, SUPPORT))
+    inside = gaps[(gaps >= span[0]) & (gaps <= span[1])]
+    ax.hist(inside, bins=BINS, range=span, color=OKABE_ITO["sky"], edgecolor="white", linewidth=0.3)
+    outside = 1 - len(inside) / len(gaps)
+    note = f"percentiles {SUPPORT[0]:g} and {SUPPORT[1]:g}: {low:.3g} m and {high:.3g} m"
+    if outside:
+        note += f"; {outside:.1%} of the gaps lie outside the figure"
+    dress(ax, x="gap (m)", y="measured\nsamples")
+    ax.set_title(note, fontsize=SMALL_FONT, color=GREY, loc="left")
+    return low, high

@@ -1,0 +1,78 @@
+"""A small calibration problem: a few platoons obeying a linear law."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nnode.calibrate.options import TrainerOptions
+from nnode.calibrate.optimizers import AdadeltaOptions, OptimizerOptions, build_optimizer
+from nnode.calibrate.trainer import Provenance, Trainer
+from nnode.data.dataset import SequenceDataset, make_loader
+from nnode.data.options import LoaderOptions
+from nnode.data.sequence import Sequence
+from nnode.data.store import Store, write_store
+from nnode.models import build_model
+from nnode.solvers import TorchdiffeqSolver
+
+LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
+
+
+@pytest.fixture()
+def store(tmp_path: Path) -> Store:
+    """Seven platoons of two to four cars over 1 s, v0 = 22 m/s and L = 4 m."""
+    rng = np.random.default_rng(1)
+    sequences = []
+    for i in range(7):
+        x = np.cumsum(rng.uniform(8, 30, rng.integers(2, 5)))
+        rows = [x]
+        for _ in range(500):
+            speed = np.append(22 * (1 - 4 / np.diff(x)), 22)
+            x = x + 0.002 * speed
+            rows.append(x)
+        time = 10.0 * i + 0.2 * np.arange(6)
+        sequences.append(
+            Sequence(
+                name=f"r/{i:03d}", recording="r", time=time, x=np.array(rows)[::100, :, None]
+            )
+        )
+    return write_store(tmp_path / "store", sequences, {"dt": 0.2, "files": {}})
+
+
+@pytest.fixture()
+def make_trainer(store: Store) -> Callable[..., Trainer]:
+    """Build a trainer in a folder; all randomness from its seed."""
+
+    def make(
+        folder: Path,
+        optimizer: OptimizerOptions | None = None,
+        seed: int = 0,
+        batch_size: int = 2,
+        **options: object,
+    ) -> Trainer:
+        model = build_model(LIN, seed)
+        chosen = optimizer or AdadeltaOptions()
+        train = make_loader(
+            SequenceDataset(store, range(5)), LoaderOptions(batch_size=batch_size), seed=seed
+        )
+        heldout = make_loader(
+            SequenceDataset(store, [5, 6]), LoaderOptions(shuffle=False), seed=seed
+        )
+        defaults: dict[str, object] = {"max_epochs": 6, "figure_every": 0, "save_every": 1e9}
+        settings = TrainerOptions(**{**defaults, **options})  # type: ignore[arg-type]
+        config = {"model": LIN, "seed": seed, "trainer": {"dtype": "float64"}}
+        return Trainer(
+            model,
+            TorchdiffeqSolver(dt=0.02),
+            build_optimizer(model, chosen, seed),
+            train,
+            heldout,
+            settings,
+            folder,
+            Provenance(config=config, manifest=store.manifest, split={"train": [], "heldout": []}),
+        )
+
+    return make

@@ -1,0 +1,147 @@
+"""Sequences and their padding to batches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import PADDING_GAP, Sequence, collate
+from nnode.errors import DataError
+
+
+def platoon(name: str, k: int, n: int, dt: float = 0.2, **more: object) -> Sequence:
+    time = 3.0 + dt * np.arange(k)
+    x = 10.0 * np.arange(n)[None, :, None] + 20.0 * (time - 3.0)[:, None, None]
+    return Sequence(name=name, recording="r", time=time, x=x, **more)  # type: ignore[arg-type]
+
+
+def test_sequence_knows_its_sizes_and_interval() -> None:
+    item = platoon("a", 6, 3)
+    assert (item.n_samples, item.n_agents) == (6, 3)
+    assert item.dt == pytest.approx(0.2)
+    assert np.isnan(platoon("one", 1, 2).dt)
+
+
+def test_velocity_is_the_stored_one_or_forward_differences() -> None:
+    item = platoon("a", 6, 3)
+    np.testing.assert_allclose(item.velocity(), 20.0)
+    assert item.velocity().shape == item.x.shape
+    stored = platoon("b", 6, 3, v=np.full((6, 3, 1), 7.0))
+    np.testing.assert_array_equal(stored.velocity(), 7.0)
+    np.testing.assert_array_equal(platoon("one", 1, 2).velocity(), 0.0)
+
+
+def test_select_keeps_everything_of_the_chosen_agents() -> None:
+    item = platoon(
+        "a",
+        4,
+        3,
+        agents=("p", "q", "r"),
+        kind=("car", "truck", "car"),
+        length=np.array([4.0, 12.0, 5.0]),
+        destination=np.array([[1.0], [2.0], [3.0]]),
+    )
+    kept = item.select(np.array([True, False, True]))
+    assert kept.agents == ("p", "r")
+    assert kept.kind == ("car", "car")
+    assert kept.group is None
+    assert kept.length is not None
+    assert kept.destination is not None
+    np.testing.assert_array_equal(kept.length, [4.0, 5.0])
+    np.testing.assert_array_equal(kept.destination, [[1.0], [3.0]])
+    np.testing.assert_array_equal(kept.x, item.x[:, [0, 2]])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x": np.zeros((4, 3))}, r"x must be \(K, N, D\)"),
+        ({"time": np.zeros(5)}, r"time must be \(4,\)"),
+        ({"v": np.zeros((4, 2, 1))}, r"v must be \(4, 3, 1\)"),
+        ({"length": np.zeros(2)}, r"length must be \(3,\)"),
+        ({"destination": np.zeros((3, 2))}, r"destination must be \(3, 1\)"),
+        ({"agents": ("a", "b")}, "agents must name 3 agents, got 2"),
+        ({"kind": ("car",)}, "kind must name 3 agents, got 1"),
+    ],
+)
+def test_wrong_shapes_are_refused_by_name(change: dict[str, object], message: str) -> None:
+    fields: dict[str, object] = {
+        "name": "rec/7",
+        "recording": "rec",
+        "time": np.arange(4.0),
+        "x": np.zeros((4, 3, 1)),
+    }
+    with pytest.raises(DataError, match=f"rec/7: {message}"):
+        Sequence(**{**fields, **change})  # type: ignore[arg-type]
+
+
+def test_collate_pads_platoons_in_front_of_their_leader() -> None:
+    batch = collate([platoon("long", 5, 2), platoon("wide", 3, 4)])
+    assert batch.x.shape == (5, 2, 4, 1)
+    assert len(batch) == 2
+    assert batch.n_samples == 5
+    assert batch.names == ("long", "wide")
+    assert batch.dt == pytest.approx(0.2)
+    assert batch.agent.tolist() == [[True, True, False, False], [True] * 4]
+    assert batch.valid.sum((0, 2)).tolist() == [5 * 2, 3 * 4]
+    assert batch.valid[3:, 1].sum() == 0
+    # every vehicle, padding included, has a finite, positive gap in front of it, at every time
+    gaps = batch.x[:, :, 1:, 0] - batch.x[:, :, :-1, 0]
+    assert torch.isfinite(batch.x).all()
+    assert (gaps > 0).all()
+    padding = gaps[:, 0, 1:]
+    assert (padding >= PADDING_GAP - 1e-9).all()
+    assert (batch.v[~batch.valid] == 0).all()
+    # a sequence that has ended stands at its last position, which is its destination
+    assert torch.equal(batch.x[3, 1], batch.x[2, 1])
+    assert torch.equal(batch.destination, batch.x[-1])
+    assert batch.start.tolist() == [3.0, 3.0]
+
+
+def test_collate_pads_people_far_from_everyone() -> None:
+    rng = np.random.default_rng(0)
+    walls = np.array([[5.0, 4.0, -5.0, 4.0]])
+    items = [
+        Sequence(
+            name=str(n),
+            recording="r",
+            time=0.04 * np.arange(4),
+            x=rng.uniform(-5, 5, (4, n, 2)),
+            destination=np.full((n, 2), 9.0),
+            walls=walls if n == 3 else None,
+        )
+        for n in (1, 3)
+    ]
+    batch = collate(items)
+    apart = torch.cdist(batch.x[:, 0], batch.x[:, 0])[:, 0, 1:]
+    assert (apart >= PADDING_GAP).all()
+    assert batch.walls.shape == (2, 1, 4)
+    assert batch.walls[0].isnan().all()
+    np.testing.assert_array_equal(batch.walls[1], walls)
+    assert (batch.destination[0, 0] == 9.0).all()
+    assert torch.isfinite(batch.destination).all()
+
+
+def test_collate_keeps_unknown_lengths_unknown() -> None:
+    batch = collate([platoon("a", 3, 2, length=np.array([4.0, 5.0])), platoon("b", 3, 3)])
+    assert batch.length[0, :2].tolist() == [4.0, 5.0]
+    assert batch.length[0, 2:].isnan().all()
+    assert batch.length[1].isnan().all()
+
+
+def test_batch_moves_to_another_precision() -> None:
+    batch = collate([platoon("a", 3, 2)]).to(dtype=torch.float32)
+    assert batch.x.dtype == batch.start.dtype == torch.float32
+    assert batch.valid.dtype == torch.bool
+    assert batch.names == ("a",)
+
+
+def test_collate_refuses_what_does_not_fit_together() -> None:
+    with pytest.raises(DataError, match="at least one sequence"):
+        collate([])
+    with pytest.raises(DataError, match=r"a has 0\.2 s, b 0\.1 s"):
+        collate([platoon("a", 3, 2), platoon("b", 3, 2, dt=0.1)])
+    flat = Sequence(name="c", recording="r", time=0.2 * np.arange(3), x=np.zeros((3, 2, 2)))
+    with pytest.raises(DataError, match="a and c differ in their number of dimensions"):
+        collate([platoon("a", 3, 2), flat])

@@ -1,0 +1,293 @@
+"""The prepared data set on disk: exact round trips, streaming, and refusal of damage."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import pickle
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nnode.data.sequence import Sequence
+from nnode.data.store import MANIFEST, TABLE, Store, write_store
+from nnode.errors import DataError
+
+
+def crowd(name: str, k: int = 5, n: int = 3, seed: int = 0) -> Sequence:
+    rng = np.random.default_rng(seed)
+    return Sequence(
+        name=name,
+        recording="corridor",
+        time=seed + 0.04 * np.arange(k),
+        x=rng.normal(size=(k, n, 2)),
+        v=rng.normal(size=(k, n, 2)),
+        agents=tuple(f"p{i}" for i in range(n)),
+        length=np.where(np.arange(n) % 2, np.nan, 4.5),
+        kind=("adult",) * n,
+        group=("",) * n,
+        destination=rng.normal(size=(n, 2)),
+        walls=np.array([[-5.0, 0.0, 5.0, 0.0], [5.0, 4.0, -5.0, 4.0]]),
+    )
+
+
+def bare(name: str, k: int = 4, n: int = 2) -> Sequence:
+    time = 7.04 + 0.2 * np.arange(k)
+    x = np.cumsum(np.full((k, n, 1), 1 / 3), axis=0) + 10.0 * np.arange(n)[None, :, None]
+    return Sequence(name=name, recording="tunnel", time=time, x=x)
+
+
+def assert_same(a: Sequence, b: Sequence) -> None:
+    """Equal to the last bit, None and () included."""
+    for field in fields(Sequence):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(left, np.ndarray):
+            assert left.shape == right.shape, field.name
+            assert left.dtype == right.dtype == np.float64
+            assert np.ascontiguousarray(left).tobytes() == np.ascontiguousarray(right).tobytes()
+        else:
+            assert left == right, field.name
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    items = [crowd("corridor/1", seed=1), crowd("corridor/2", k=7, n=4, seed=2)]
+    write_store(tmp_path / "set", items, {"name": "demo"})
+    return tmp_path / "set"
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    items = [crowd(f"corridor/{i}", k=i, n=1 + i % 3, seed=i) for i in range(1, 8)]
+    store = write_store(tmp_path / "a" / "b", iter(items), {"domain": "crowd", "n": 7})
+    assert len(store) == 7
+    assert store.manifest == {"domain": "crowd", "n": 7}
+    for item, found in zip(items, store, strict=True):
+        assert_same(item, found)
+    assert_same(store[-1], items[-1])
+    with pytest.raises(IndexError):
+        store[7]
+
+
+def test_what_a_sequence_has_not_it_has_not_after_the_round_trip(tmp_path: Path) -> None:
+    store = write_store(tmp_path, [bare("tunnel/1")], {})
+    found = store[0]
+    assert_same(found, bare("tunnel/1"))
+    assert found.agents == ()
+    assert found.v is found.length is found.kind is found.group is None
+    assert found.destination is found.walls is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    values=st.lists(
+        st.floats(allow_nan=True, allow_infinity=True, width=64), min_size=6, max_size=6
+    ),
+    name=st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=8),
+)
+def test_any_float_and_any_name_survives(
+    tmp_path_factory: pytest.TempPathFactory, values: list[float], name: str
+) -> None:
+    x = np.array(values).reshape(3, 2, 1)
+    item = Sequence(name=name, recording=name, time=np.arange(3.0), x=x, kind=(name, ""))
+    store = write_store(tmp_path_factory.mktemp("s"), [item], {})
+    assert_same(store[0], item)
+
+
+def test_the_table_is_tidy_and_has_one_row_group_per_sequence(folder: Path) -> None:
+    table = pd.read_parquet(folder / TABLE)
+    assert list(table.columns) == (
+        "sequence recording time agent x y vx vy length kind group dest_x dest_y".split()
+    )
+    assert len(table) == 5 * 3 + 7 * 4
+    rows = table[(table.sequence == "corridor/2") & (table.agent == "p3")]
+    np.testing.assert_array_equal(rows.x, crowd("", k=7, n=4, seed=2).x[:, 3, 0])
+    import pyarrow.parquet as pq
+
+    assert pq.ParquetFile(folder / TABLE).num_row_groups == 2
+
+
+def test_the_index_describes_every_sequence(folder: Path) -> None:
+    entry = Store(folder).index[1]
+    assert entry["name"] == "corridor/2"
+    assert entry["recording"] == "corridor"
+    assert (entry["n_samples"], entry["n_agents"]) == (7, 4)
+    assert entry["start"] == 2.0
+    assert entry["end"] == pytest.approx(2.24)
+    assert entry["agents"] == ["p0", "p1", "p2", "p3"]
+
+
+def test_a_store_without_sequences_is_a_store(tmp_path: Path) -> None:
+    store = write_store(tmp_path, [], {"why": "all faulty"})
+    assert len(store) == 0
+    assert list(store) == []
+
+
+def test_the_same_sequences_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_store(tmp_path / name, [crowd("c/1"), crowd("c/2", seed=3)], {"seed": 1})
+    for file in (TABLE, MANIFEST):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_numpy_and_paths_in_a_manifest_become_plain(tmp_path: Path) -> None:
+    manifest = {"n": np.int64(3), "x": np.array([1.0, 2.0]), "file": Path("a") / "b"}
+    store = write_store(tmp_path, [bare("a")], manifest)
+    assert store.manifest == {"n": 3, "x": [1.0, 2.0], "file": str(Path("a") / "b")}
+
+
+@pytest.mark.parametrize("value", [math.nan, object()])
+def test_a_manifest_that_json_cannot_hold_is_refused(tmp_path: Path, value: object) -> None:
+    with pytest.raises(DataError, match="JSON"):
+        write_store(tmp_path, [bare("a")], {"value": value})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failing_preparation_leaves_the_old_store_as_it_was(folder: Path) -> None:
+    def broken() -> Iterator[Sequence]:
+        yield crowd("new/1")
+        raise RuntimeError("reader stopped")
+
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    with pytest.raises(RuntimeError, match="reader stopped"):
+        write_store(folder, broken(), {})
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+    assert len(Store(folder)) == 2
+
+
+def test_rewriting_replaces_the_store(folder: Path) -> None:
+    write_store(folder, [bare("tunnel/1")], {"name": "other"})
+    store = Store(folder)
+    assert (len(store), store.dims, store.manifest) == (1, 1, {"name": "other"})
+    assert sorted(p.name for p in folder.iterdir()) == [MANIFEST, TABLE]
+
+
+@pytest.mark.parametrize(
+    ("items", "message"),
+    [
+        ([bare("a"), bare("a")], "a cannot be stored: its name is used twice"),
+        ([bare("a"), crowd("b")], "b cannot be stored: it has 2 dimensions, .* before it 1"),
+        ([bare("a", n=0)], "0 agents"),
+        ([bare("a", k=0)], "0 samples"),
+        ([Sequence(name="a", recording="r", time=np.zeros(1), x=np.zeros((1, 1, 3)))], "3 dim"),
+        (
+            [
+                Sequence(
+                    name="a",
+                    recording="r",
+                    time=np.zeros(1),
+                    x=np.zeros((1, 1, 2)),
+                    walls=np.zeros((2, 3)),
+                )
+            ],
+            r"\(W, 4\)",
+        ),
+    ],
+)
+def test_sequences_that_make_no_data_set_are_refused(
+    tmp_path: Path, items: list[Sequence], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        write_store(tmp_path, items, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(DataError, match="cannot be written"):
+        write_store(tmp_path / "file" / "set", [bare("a")], {})
+
+
+def test_a_folder_without_a_store_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="holds no prepared data"):
+        Store(tmp_path)
+    with pytest.raises(DataError, match="holds no prepared data"):
+        Store(tmp_path / "nowhere")
+
+
+def test_a_half_written_store_is_recognised(folder: Path) -> None:
+    (folder / MANIFEST).unlink()
+    with pytest.raises(DataError, match="half-written"):
+        Store(folder)
+
+
+def test_a_table_that_is_missing_or_cut_is_recognised(folder: Path) -> None:
+    data = (folder / TABLE).read_bytes()
+    (folder / TABLE).write_bytes(data[:-100])
+    with pytest.raises(DataError, match=rf"promises {len(data)} bytes, found {len(data) - 100}"):
+        Store(folder)
+    (folder / TABLE).unlink()
+    with pytest.raises(DataError, match="no such file"):
+        Store(folder)
+
+
+def test_a_table_of_another_data_set_is_recognised(folder: Path) -> None:
+    write_store(folder.parent / "other", [crowd("c/1"), crowd("c/2")], {})
+    other = (folder.parent / "other" / TABLE).read_bytes()
+    (folder / TABLE).write_bytes(other)
+    content = json.loads((folder / MANIFEST).read_text())
+    content["table"]["bytes"] = len(other)
+    (folder / MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(DataError, match="damaged"):
+        Store(folder)[0]
+
+
+def test_flipped_bits_are_noticed(folder: Path) -> None:
+    data = bytearray((folder / TABLE).read_bytes())
+    reference = list(Store(folder))
+    noticed = 0
+    for position in range(4, len(data) // 2, 97):
+        damaged = data.copy()
+        damaged[position] ^= 0x10
+        (folder / TABLE).write_bytes(damaged)
+        try:
+            found = list(Store(folder))
+        except DataError as error:
+            assert str(folder / TABLE) in str(error)  # noqa: PT017
+            noticed += 1
+        else:  # a byte that carries no data
+            for a, b in zip(reference, found, strict=True):
+                assert_same(a, b)
+    assert noticed > 5
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "damaged"),
+        ("[]", "no manifest"),
+        ('{"format": "something"}', "no manifest"),
+        ('{"format": "nnode sequences", "version": 99}', "format version 99"),
+        ('{"format": "nnode sequences", "version": 1}', "damaged"),
+    ],
+)
+def test_a_manifest_that_cannot_be_understood_is_refused(
+    folder: Path, content: str, message: str
+) -> None:
+    (folder / MANIFEST).write_text(content)
+    with pytest.raises(DataError, match=message):
+        Store(folder)
+
+
+def _read_first(store: Store, out: multiprocessing.SimpleQueue) -> None:
+    out.put(store[0].x.tobytes())
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_store_may_cross_into_another_process(folder: Path, method: str) -> None:
+    store = Store(folder)
+    expected = store[0].x.tobytes()  # opened here, before the other process starts
+    context = multiprocessing.get_context(method)
+    out = context.SimpleQueue()
+    process = context.Process(target=_read_first, args=(store, out))
+    process.start()
+    assert out.get() == expected
+    process.join()
+    assert process.exitcode == 0
+    assert_same(store[1], pickle.loads(pickle.dumps(store))[1])

@@ -1,0 +1,234 @@
+"""Artificial recordings: the laws they claim, the formats they copy, the same bytes again."""
+
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+
+import nnode.data.synthetic
+from nnode.data.synthetic import (
+    Forces,
+    crowd_recording,
+    demo_data,
+    social_force,
+    traffic_recording,
+)
+from nnode.errors import ConfigError
+
+
+def platoons(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+    cell = scipy.io.loadmat(path)["sequences"]
+    return [(item["Xarr"][0, 0], item["Tarr"][0, 0]) for item in cell.ravel()]
+
+
+def test_the_last_gap_of_the_linear_law_follows_its_solution(tmp_path: Path) -> None:
+    # behind a leader at v0: g' = v0 L / g, so that g² = g0² + 2 v0 L t
+    path = traffic_recording(tmp_path / "a.mat", seed=0, v0=22.0, L=7.0, sequences=10)
+    for x, t in platoons(path):
+        gap = x[-1] - x[-2]
+        np.testing.assert_allclose(gap**2, gap[0] ** 2 + 2 * 22.0 * 7.0 * (t - t[0, 0])[0])
+        np.testing.assert_allclose(x[-1], x[-1, 0] + 22.0 * (t - t[0, 0])[0])
+
+
+def test_every_car_drives_at_the_speed_of_its_gap(tmp_path: Path) -> None:
+    dt = 0.01
+    for law, speed in (
+        ("linear", lambda gap: 20.0 * (1 - 5.0 / gap)),
+        ("log", lambda gap: 20.0 * np.log(gap / 5.0)),
+    ):
+        path = traffic_recording(
+            tmp_path / f"{law}.mat", seed=1, law=law, v0=20.0, L=5.0, dt=dt, sequences=3
+        )
+        for x, _ in platoons(path):
+            measured = (x[:-1, 2:] - x[:-1, :-2]) / (2 * dt)
+            np.testing.assert_allclose(measured, speed(np.diff(x, axis=0)[:, 1:-1]), atol=5e-3)
+
+
+def test_the_logarithmic_law_rests_at_a_gap_of_e_lengths(tmp_path: Path) -> None:
+    rest = math.e * 6.0
+    path = traffic_recording(tmp_path / "a.mat", seed=0, law="log", gap=(rest, rest), sequences=4)
+    for x, _ in platoons(path):
+        np.testing.assert_allclose(np.diff(x, axis=0), rest, rtol=1e-9)
+
+
+def test_platoons_have_the_shape_of_the_published_ones(tmp_path: Path) -> None:
+    found = platoons(traffic_recording(tmp_path / "a.mat", seed=3, cars=(3, 6), sequences=30))
+    assert len(found) == 30
+    assert {x.shape[0] for x, _ in found} == {3, 4, 5, 6}
+    for x, t in found:
+        assert x.dtype == t.dtype == np.float64
+        assert t.shape == (1, x.shape[1])
+        np.testing.assert_allclose(np.diff(t), 0.2)
+        assert 3.0 - 0.11 <= t[0, -1] - t[0, 0] <= 8.0 + 0.11
+        assert (np.diff(x[:, 0]) >= 10.0).all()
+        assert (np.diff(x[:, 0]) <= 40.0).all()
+        assert (np.diff(x, axis=0) > 0).all()
+        assert (x > 0).all()
+    pauses = [b[1][0, 0] - a[1][0, -1] for a, b in zip(found, found[1:], strict=False)]
+    assert min(pauses) == pytest.approx(10.0)
+
+
+def test_noise_is_as_strong_as_asked_for(tmp_path: Path) -> None:
+    clean = platoons(traffic_recording(tmp_path / "a.mat", seed=5, sequences=1))
+    noisy = platoons(traffic_recording(tmp_path / "b.mat", seed=5, sequences=1, noise=0.5))
+    error = noisy[0][0] - clean[0][0]
+    # 5 standard deviations of the sample's own standard deviation
+    assert error.std() == pytest.approx(0.5, abs=5 * 0.5 / math.sqrt(2 * error.size))
+
+
+def test_laws_and_gaps_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="expected one of linear, log"):
+        traffic_recording(tmp_path / "a.mat", seed=0, law="cubic")
+    with pytest.raises(ConfigError, match="from L=12 m or more"):
+        traffic_recording(tmp_path / "a.mat", seed=0, L=12.0)
+
+
+# the paper's table of six settings: x_blue, x_red, v_blue, v_red, force on blue
+SETTINGS = [
+    ((0, 0.22), (0, -0.22), (0, -1), (0, 1), (0, 2.1118)),
+    ((0, 0.22), (0, -0.22), (0, 1), (0, 1), (0, 2.1118)),
+    ((0.01, 0.22), (-0.01, -0.22), (0, -1), (0, 1), (0.0417, 2.0961)),
+    ((0.01, 0.22), (-0.01, -0.22), (0, 1), (0, 1), (0.0952, 2.0936)),
+    ((0.22, 0), (-0.22, 0), (0, -1), (0, 1), (2.1118, 1.1867)),
+    ((0.22, 0), (-0.22, 0), (0, 1), (0, 1), (2.1118, 0)),
+]
+
+
+@pytest.mark.parametrize(("x_blue", "x_red", "v_blue", "v_red", "force"), SETTINGS)
+def test_the_pair_force_is_that_of_the_paper(
+    x_blue: Any, x_red: Any, v_blue: Any, v_red: Any, force: Any
+) -> None:
+    forces = Forces(A=0.0044, k=34.9539, kappa=9.8894)
+    offset, slip = np.subtract(x_blue, x_red), np.subtract(v_red, v_blue)
+    on_blue = social_force(offset.astype(float), slip.astype(float), 0.5, forces)
+    on_red = social_force(-offset.astype(float), -slip.astype(float), 0.5, forces)
+    np.testing.assert_allclose(on_blue, force, atol=1e-4)
+    np.testing.assert_allclose(on_red, np.negative(force), atol=1e-4)
+
+
+def plain_acceleration(
+    x: np.ndarray, v: np.ndarray, goal: np.ndarray, wall: np.ndarray, p: Forces
+) -> np.ndarray:
+    """The paper's equations written out person by person, wall point by wall point."""
+    result = np.zeros_like(x)
+    for i in range(len(x)):
+        way = goal[i] - x[i]
+        desired = way / math.hypot(*way) * math.hypot(*v[i])
+        result[i] = (desired - v[i]) / p.tau
+        pairs = [(x[j], v[j] - v[i], 2 * p.r, len(x)) for j in range(len(x)) if j != i]
+        for other, slip, reach, count in pairs + [(w, v[i], p.r, len(wall)) for w in wall]:
+            d = math.dist(x[i], other)
+            n = (x[i] - other) / d
+            t = np.array([-n[1], n[0]])
+            h = max(reach - d, 0.0)
+            force = (p.A * math.exp((reach - d) / p.B) + p.k * h) * n + p.kappa * h * (slip @ t) * t
+            result[i] += force / (p.mass * count)
+    return result
+
+
+def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
+    rate, width = 400.0, 1.2
+    p = Forces(A=4.0)
+    path = crowd_recording(
+        tmp_path / "c.txt",
+        seed=1,
+        forces=p,
+        people=2,
+        duration=7.0,
+        length=6.0,
+        width=width,
+        frame_rate=rate,
+        mixing=1.0,
+        noise=0.0,
+    )
+    table = np.loadtxt(path)
+    one, two = (table[table[:, 0] == i] for i in (1, 2))
+    shared = np.intersect1d(one[:, 1], two[:, 1])
+    x = np.stack([s[np.isin(s[:, 1], shared)][:, 2:4] / 100 for s in (one, two)], axis=1)
+    lane = np.stack([one[0, 3], two[0, 3]]) / 100  # straight ahead from where each came in
+    heading = np.sign(x[-1, :, 0] - x[0, :, 0])
+    goal = np.column_stack([heading * (3.0 + 1.0 + 5.0), lane])
+    along = np.linspace(-4.0, 4.0, 33)
+    wall = np.array([(a, b) for b in (0.0, width) for a in along])
+    step = 8  # positions have a resolution of 10 µm
+    h = step / rate
+    k = np.argmin(np.linalg.norm(x[:, 0] - x[:, 1], axis=1))
+    assert math.dist(*x[k]) < 0.6
+    strongest = 0.0
+    for i in range(k - 60, k + 60, 15):
+        v = (x[i + step] - x[i - step]) / (2 * h)
+        a = (x[i + step] - 2 * x[i] + x[i - step]) / h**2
+        expected = plain_acceleration(x[i], v, goal, wall, p)
+        np.testing.assert_allclose(a, expected, atol=0.15)
+        strongest = max(strongest, float(np.abs(expected).max()))
+    assert strongest > 1.0
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return demo_data(tmp_path_factory.mktemp("demo"))
+
+
+def test_the_demo_is_laid_out_like_the_real_data(demo: dict[str, Path]) -> None:
+    assert demo["esimas"].parts[-2:] == ("esimas", "sequence_datademo.mat")
+    assert demo["juelich"].parts[-2:] == ("juelich", "demo_corridor.txt")
+    header = demo["juelich"].read_text().splitlines()[:3]
+    assert all(line.startswith("#") for line in header)
+    assert "# framerate: 25 fps" in header
+
+
+def test_people_cross_the_corridor_in_both_directions(demo: dict[str, Path]) -> None:
+    table = np.loadtxt(demo["juelich"])
+    x, y = table[:, 2] / 100, table[:, 3] / 100
+    assert np.abs(x).max() <= 5.01
+    assert y.min() > 0
+    assert y.max() < 4
+    crossed = []
+    for person in np.unique(table[:, 0]):
+        frames = table[table[:, 0] == person, 1]
+        assert (np.diff(frames) == 1).all()
+        mine = x[table[:, 0] == person]
+        crossed.append(mine[-1] - mine[0])
+    assert len(crossed) == 30
+    assert sum(c > 9 for c in crossed) >= 10
+    assert sum(c < -9 for c in crossed) >= 10
+    seen = np.bincount(table[:, 1].astype(int))
+    assert seen.max() >= 10
+    assert 12 <= (table[:, 1].max() - table[:, 1].min()) / 25 <= 20
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, demo: dict[str, Path]) -> None:
+    again, other = demo_data(tmp_path / "a", seed=0), demo_data(tmp_path / "b", seed=1)
+    for name, path in demo.items():
+        assert again[name].read_bytes() == path.read_bytes()
+        assert other[name].read_bytes() != path.read_bytes()
+
+
+def test_a_header_holds_no_date(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import time
+
+    monkeypatch.setattr(time, "asctime", lambda *_: "Thu Jan  1 00:00:00 1970")
+    first = traffic_recording(tmp_path / "a.mat", seed=0, sequences=2).read_bytes()
+    monkeypatch.setattr(time, "asctime", lambda *_: "Fri Dec 31 23:59:59 1999")
+    assert traffic_recording(tmp_path / "b.mat", seed=0, sequences=2).read_bytes() == first
+
+
+def test_the_generators_are_independent_of_models_and_solvers() -> None:
+    folder = Path(nnode.data.synthetic.__file__).parent
+    imported = set()
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add(str(node.module))
+    assert "nnode.errors" in imported
+    ours = {name for name in imported if name.startswith("nnode")}
+    assert all(name.startswith(("nnode.errors", "nnode.data.synthetic")) for name in ours)
+    assert not {name for name in imported if name.split(".")[0] in ("torch", "torchdiffeq")}
