@@ -58,7 +58,9 @@ def run(name: str, job: Job, inject: Callable[[list[str]], list[str]] | None = N
             sys.argv[1:1] = extra
             given = extra + given
         if "--help" not in sys.argv and "-h" not in sys.argv:
-            check_overrides(given, folder, name)
+            free = check_overrides(given, folder, name)
+            # what goes into a mapping that takes any name is added, not only replaced
+            sys.argv[1:] = [f"++{a}" if a in free else a for a in sys.argv[1:]]
         hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_guarded(job))()
     except NNodeError as error:
         _end(error)
@@ -117,8 +119,11 @@ def user_overrides(arguments: list[str]) -> list[str]:
     return found
 
 
-def check_overrides(overrides: list[str], folder: Path, name: str) -> None:
+def check_overrides(overrides: list[str], folder: Path, name: str) -> list[str]:
     """Refuse unknown groups, options and values of the wrong type, one clear error each.
+
+    Returns:
+        Those overrides that address a mapping which takes any name, such as ``data.columns``.
 
     Raises:
         ConfigError: with the nearest valid name.
@@ -142,11 +147,16 @@ def check_overrides(overrides: list[str], folder: Path, name: str) -> None:
             config = compose(name, chosen)
         except (HydraException, OmegaConfBaseException) as error:
             raise ConfigError(str(error).splitlines()[0]) from None
-        for override in parsed:
-            key = override.get_key_element()
-            if override not in groups and not key.startswith("hydra"):
-                _check_option(override, config)
+        free = [
+            text
+            for text, override in zip(overrides, parsed, strict=True)
+            if override not in groups
+            and not override.get_key_element().startswith("hydra")
+            and _check_option(override, config)
+            and text[0] not in "+~"
+        ]
     GlobalHydra.instance().clear()
+    return free
 
 
 def _is_group(override: Override, loader: ConfigLoader) -> bool:
@@ -180,14 +190,14 @@ def _check_group(override: Override, loader: ConfigLoader) -> None:
             )
 
 
-def _check_option(override: Override, config: DictConfig) -> None:
+def _check_option(override: Override, config: DictConfig) -> bool:
+    """Whether the option addresses a mapping that takes any name; refuses unknown ones."""
     key = override.key_or_group
     parts = key.split(".")
     node: Any = config
     for depth, part in enumerate(parts):
-        free = depth > 0 and OmegaConf.is_dict(node) and OmegaConf.get_type(node) is dict
-        if free or OmegaConf.is_list(node):
-            break  # a mapping such as data.columns takes any name
+        if _free(node) or OmegaConf.is_list(node):
+            break
         valid = [str(k) for k in node] if OmegaConf.is_dict(node) else []
         if part not in valid:
             if not depth:
@@ -200,7 +210,7 @@ def _check_option(override: Override, config: DictConfig) -> None:
             )
         node = node._get_node(part)
     if override.is_delete():
-        return
+        return False
     values = list(override.sweep_iterator()) if override.is_sweep_override() else [override.value()]
     for value in values:
         try:
@@ -208,6 +218,13 @@ def _check_option(override: Override, config: DictConfig) -> None:
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"{key}={value} is refused: {reason}") from None
+    return _free(node)
+
+
+def _free(node: Any) -> bool:
+    """Whether a node is a mapping that takes any name; the whole configuration is none."""
+    typed = not OmegaConf.is_dict(node) or OmegaConf.get_type(node) is not dict
+    return not typed and node._get_parent() is not None
 
 
 def _plain(value: Any) -> Any:

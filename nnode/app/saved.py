@@ -54,7 +54,8 @@ def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, 
         OmegaConf.update(merged, name, saved[name], merge=True)
     for override in HydraConfig.get().overrides.task:
         key = override.partition("=")[0].lstrip("+")
-        if "." in key and key.partition(".")[0] in sections:
+        option = "." in key or key not in saved["groups"]
+        if option and key.partition(".")[0] in sections:
             OmegaConf.update(merged, key, OmegaConf.select(config, key), force_add=True)
     return merged
 

@@ -42,7 +42,7 @@ class ConsensusBased(Optimizer):
         spread: float = 0.5,
         alpha: float = 30.0,
         drift: float = 1.0,
-        sigma: float = 1.0,
+        sigma: float = 2.0,
         dt: float = 0.1,
         project: Callable[[], None] | None = None,
         seed: int = 0,
@@ -120,7 +120,7 @@ class ConsensusBased(Optimizer):
         dynamic.step()
         self._x = np.asarray(dynamic.x[0])
         self._set(self._best)
-        return torch.tensor(self._best_cost)
+        return torch.tensor(self._best_cost, dtype=torch.float64)
 
     def _cost(self, particle: np.ndarray, closure: Callable[[], Tensor]) -> float:
         self._set(particle)

@@ -65,7 +65,7 @@ class ConsensusOptions(OptimizerOptions):
     spread: float = 0.5
     alpha: float = 30.0
     drift: float = 1.0
-    sigma: float = 1.0
+    sigma: float = 2.0
     dt: float = 0.1
 
 

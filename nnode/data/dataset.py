@@ -48,7 +48,7 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
 
     Args:
         n: number of sequences.
-        batch_size: sequences per mini-batch, the last one may be smaller; 0 takes all at once.
+        batch_size: most sequences per mini-batch, shared out evenly; 0 takes all at once.
         seed: of the shuffling, >= 0.
         shuffle: False keeps the order of the data set.
 
@@ -99,9 +99,10 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
         return self.n_batches - self.start
 
     def __iter__(self) -> Iterator[list[int]]:
-        order = self.order()
-        for batch in range(self.start, self.n_batches):
-            yield order[batch * self.batch_size : (batch + 1) * self.batch_size].tolist()
+        # shared out evenly: a last mini-batch of one or two sequences would give a wild gradient
+        batches = np.array_split(self.order(), self.n_batches)
+        for batch in batches[self.start :]:
+            yield batch.tolist()
 
 
 def make_loader(

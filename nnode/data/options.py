@@ -51,7 +51,7 @@ class SplitOptions:
 class LoaderOptions:
     """How prepared sequences are streamed as mini-batches."""
 
-    batch_size: int = 32  # sequences per mini-batch; 0 takes all at once
+    batch_size: int = 32  # at most so many sequences per mini-batch; 0 takes all at once
     workers: int = 0
     shuffle: bool = True
 
@@ -63,7 +63,7 @@ class DataOptions:
     name: str = MISSING
     domain: str = MISSING  # traffic | crowd
     source: str | None = None  # folder with the raw files, or a URL; null downloads
-    download: str = "data/raw"  # folder where downloaded files are kept
+    download: str | None = None  # folder for downloaded files; null: raw/ in the run's folder
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop

@@ -6,10 +6,9 @@ import json
 import logging
 import os
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,17 +23,17 @@ from nnode.data.juelich import juelich_files, read_juelich
 from nnode.data.options import (
     DataOptions,
     EsimasOptions,
-    Faults,
     JuelichOptions,
     TableOptions,
     VehicleTableOptions,
 )
-from nnode.data.quality import Fault, find_faults, usable
+from nnode.data.policy import apply_policy, by_recording, drop_absent
+from nnode.data.quality import Fault, find_faults
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.store import Store, write_store
 from nnode.data.table import TABLE, WALLS, read_table, table_files
 from nnode.data.vehicles import read_vehicles, vehicle_files
-from nnode.errors import ConfigError, DataError, FaultError
+from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
 
@@ -43,9 +42,6 @@ PLOTS = "faults"
 
 #: Options that say where data lie or how they are used, not what is prepared.
 NOT_PREPARATION = frozenset({"source", "download", "prepared", "split", "loader"})
-
-#: Faults that the message of a FaultError lists.
-LISTED = 5
 
 #: Least number of dimensions of a domain's positions, which is also the greatest.
 DIMENSIONS = {"traffic": 1, "crowd": 2}
@@ -100,12 +96,13 @@ def prepare(options: DataOptions, folder: Path | str, *, plots: bool = True) -> 
     options = _as_dataclass(options)
     folder = Path(folder)
     layout = FORMATS[type(options)]
-    files = layout.files(options)
+    downloads = options.download or str(folder / "raw")
+    files = layout.files(replace(options, download=downloads))
     read = layout.read(files, options)
     domain = _domain(options, read)
-    sequences, absent = _drop_absent(read) if domain == "crowd" else (read, [])
+    sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
     faults = {s.name: find_faults(s, domain) for s in sequences}
-    kept, dropped = _apply(options.faults, sequences, faults)
+    kept, dropped = apply_policy(options.faults, sequences, faults)
     manifest = {
         "package": {"name": "nnode", "version": __version__},
         "options": plain(options),
@@ -113,7 +110,7 @@ def prepare(options: DataOptions, folder: Path | str, *, plots: bool = True) -> 
         "dt": _interval(kept),
         "files": {key: {"name": path.name, "sha256": sha256(path)} for key, path in files.items()},
         "counts": {"read": len(read), "kept": len(kept), "dropped": len(dropped)},
-        "recordings": _by_recording(read, kept, faults),
+        "recordings": by_recording(read, kept, faults),
         "dropped": dropped,
         "dropped_agents": absent,
         "faults": [asdict(fault) for found in faults.values() for fault in found],
@@ -194,83 +191,6 @@ def _domain(options: DataOptions, sequences: list[Sequence]) -> Domain:
                 f"{s.name} has {s.x.shape[2]}"
             )
     return cast(Domain, options.domain)
-
-
-def _drop_absent(sequences: list[Sequence]) -> tuple[list[Sequence], list[dict[str, Any]]]:
-    """Leave out people who are not present throughout their sequence, as the paper does."""
-    kept, absent = [], []
-    for s in sequences:
-        missing = np.isnan(s.x).all(axis=2).sum(axis=0)
-        for i in np.flatnonzero(missing):
-            why = f"absent at {missing[i]} of {s.n_samples} samples"
-            name = s.agents[i] if s.agents else str(i)
-            absent.append({"sequence": s.name, "agent": name, "why": why})
-        kept.append(s.select(missing == 0) if missing.any() else s)
-    return kept, absent
-
-
-def _apply(
-    policy: Faults, sequences: list[Sequence], faults: dict[str, list[Fault]]
-) -> tuple[list[Sequence], list[dict[str, Any]]]:
-    """Sequences to keep, and the others with the reasons."""
-    faulty = [s for s in sequences if faults[s.name]]
-    if policy is Faults.error and faulty:
-        found = [fault for s in faulty for fault in faults[s.name]]
-        lines = [f"  {f.sequence}: {f.kind}: {f.detail}" for f in found[:LISTED]]
-        more = [f"  ... and {len(found) - LISTED} more"] if len(found) > LISTED else []
-        raise FaultError(
-            f"{len(faulty)} of {len(sequences)} sequences hold faults ({_counts(faulty, faults)}); "
-            "data.faults=error refuses them, data.faults=drop leaves them out, data.faults=keep "
-            "keeps them:\n" + "\n".join(lines + more)
-        )
-    keep = policy is Faults.keep
-
-    def stays(s: Sequence) -> bool:
-        return not faults[s.name] or (keep and s.n_agents > 0 and usable(s, faults[s.name]))
-
-    kept = [s for s in sequences if stays(s)]
-    dropped = [
-        {
-            "sequence": s.name,
-            "reasons": [{"kind": f.kind, "detail": f.detail} for f in faults[s.name]],
-        }
-        for s in sequences
-        if not stays(s)
-    ]
-    if not kept:
-        raise DataError(
-            f"nothing is left of {len(sequences)} sequences: {_counts(faulty, faults)}; "
-            + ("these cannot be simulated" if keep else "data.faults=keep keeps faulty ones")
-        )
-    return kept, dropped
-
-
-def _counts(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> str:
-    counts = _by_kind(sequences, faults)
-    return ", ".join(f"{kind} in {n}" for kind, n in counts.items()) or "no sequence at all"
-
-
-def _by_kind(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> dict[str, int]:
-    """Number of sequences with each kind of fault, the most frequent first."""
-    kinds = Counter(kind for s in sequences for kind in {f.kind for f in faults[s.name]})
-    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
-
-
-def _by_recording(
-    read: list[Sequence], kept: list[Sequence], faults: dict[str, list[Fault]]
-) -> dict[str, Any]:
-    staying = {s.name for s in kept}
-    table = {}
-    for recording in dict.fromkeys(s.recording for s in read):
-        own = [s for s in read if s.recording == recording]
-        n_kept = sum(s.name in staying for s in own)
-        table[recording] = {
-            "read": len(own),
-            "kept": n_kept,
-            "dropped": len(own) - n_kept,
-            "faulty": _by_kind(own, faults),
-        }
-    return table
 
 
 def _interval(sequences: list[Sequence]) -> float:

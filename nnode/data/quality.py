@@ -261,9 +261,7 @@ def _continuations(expected: np.ndarray, then: np.ndarray, reach: float) -> dict
     cost = np.minimum(np.nan_to_num(cdist(expected, then), nan=reach), reach)
     rows, columns = linear_sum_assignment(cost)
     return {
-        int(i): int(j)
-        for i, j in zip(rows, columns, strict=True)
-        if i != j and cost[i, j] < reach
+        int(i): int(j) for i, j in zip(rows, columns, strict=True) if i != j and cost[i, j] < reach
     }
 
 

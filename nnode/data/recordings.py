@@ -103,13 +103,13 @@ def raw_files(
         dataset,
         [file_name(name) for name in asked],
         source=options.source,
-        folder=Path(options.download),
+        folder=Path(options.download or "raw"),
     )
     return dict(zip(asked, files.values(), strict=True))
 
 
 def table_path(options: DataOptions, option: str, path: str) -> Path:
-    """The path of a user's table, looked for below ``data.source`` where that is given.
+    """The path of a user's table: as given, or else below ``data.source``.
 
     Raises:
         ConfigError: the path is not set, or ``data.source`` is an address.
@@ -118,7 +118,7 @@ def table_path(options: DataOptions, option: str, path: str) -> Path:
     if not path or path == "???":
         raise ConfigError(f"data.{option} is not set; expected the path of a table")
     place = Path(path).expanduser()
-    if options.source is not None and not place.is_absolute():
+    if options.source is not None and not place.is_absolute() and not place.is_file():
         if "://" in options.source:
             raise ConfigError(
                 f"data.source={options.source}: tables are read from a folder; download the "

@@ -42,7 +42,7 @@ HEAD_ON = (2.0, 0.0)
 #: Half widths (m) of the contour panels in the paper: short and long ranged forces.
 EXTENT = {"short": 0.5, "long": 4.0}
 #: An even number keeps the grid off the origin, where a repulsion has no direction.
-GRID = 200
+GRID = 160
 #: The colour scale ends at this percentile of |F| where a peak is far above it.
 SCALE_PERCENTILE = 98.0
 #: ... and a peak counts as far above from this ratio on.
@@ -57,7 +57,8 @@ def force_contours(
     The panels differ in the relative velocity: (0, 0), (2, 0), (0, 2) and (1, 1) m/s, see
     ``ENCOUNTERS``. All share one symmetric scale; lines are solid where the force is positive
     and dashed where it is negative, and a circle marks contact of two social-force bodies.
-    Where a narrow peak towers over the rest, the scale ends below it and the bar says where.
+    Where a narrow peak towers over the rest, the scale ends below it; the
+    title gives its height.
 
     Args:
         component: 0 for F_x, 1 for F_y.
@@ -157,8 +158,6 @@ def _contours(
     assert filled is not None
     letters = sorted({"xy"[c] for _, _, c in panels})
     name = f"force on i, {' and '.join(f'$F_{letter}$' for letter in letters)} (N)"
-    if extend != "neither":
-        name += f"; the scale ends below the peak of {peak:.3g} N"
     bar = figure.colorbar(
         filled, ax=[ax for ax, _, _ in panels], label=name, shrink=0.85, pad=0.02, aspect=30
     )
@@ -170,6 +169,8 @@ def _contours(
     title = describe(term, part)
     if contact is not None:
         title += f"; circle: contact at {contact:g} m"
+    if extend != "neither":
+        title += f"; the scale ends below the peak of {peak:.3g} N"
     broken = 1 - float(np.isfinite(fields).mean())
     if broken:
         title += f" ({broken:.0%} of the field is not finite)"

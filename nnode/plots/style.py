@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -103,5 +104,6 @@ def save(figure: Figure, path: str | Path) -> Path:
             f"figure {path} could not be written ({error}); choose a folder that can be written to"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
     return path

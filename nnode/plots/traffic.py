@@ -87,7 +87,7 @@ def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
     columns = {}
     for name, system in models.items():
         law = follow_law(system, name)
-        speed = law.speed(torch.as_tensor(gaps, dtype=law.v0.dtype, device=law.v0.device))
+        speed = law.speed(torch.tensor(gaps, dtype=law.v0.dtype, device=law.v0.device))
         columns[name] = speed.double().cpu().numpy()
     return pd.DataFrame(columns, index=pd.Index(gaps, name="gap"))
 
@@ -146,10 +146,8 @@ def speed_curves(
         place = 0.985 - (0 if many else 0.022 * i)
         _curve(ax, name, table[name], support, leaders.get(name), place, style)
     if leaders:
-        marker, label = (
-            styles[0]["marker"] if many else "",
-            "at the edge: leader's v0" if many else "markers: leader's v0",
-        )
+        marker = styles[0]["marker"] if many else ""
+        label = "markers: leader's v0"
         handles.append(Line2D([], [], color=GREY, marker=marker, linestyle="", label=label))
     ax.set_xlim(low, high)
     _limit(ax, table, list(leaders.values()))
@@ -157,11 +155,14 @@ def speed_curves(
     right.set_ylabel("speed W (km/h)", fontsize=ax.yaxis.label.get_fontsize())
     right.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
     right.spines["right"].set(linewidth=0.6, edgecolor=GREY)
+    right_half = table.to_numpy()[SAMPLES // 2 :]
+    bottom, top = ax.get_ylim()
+    free = bool((right_half > bottom + 0.45 * (top - bottom)).all())
     ax.legend(
         handles=handles,
         handlelength=3.4,
         fontsize=SMALL_FONT,
-        loc="best",
+        loc="lower right" if free else "best",
         framealpha=0.9,
         edgecolor="none",
     )
@@ -184,7 +185,7 @@ def _from_kmh(speed: Any) -> Any:
 
 
 def _vector(gaps: np.ndarray) -> np.ndarray:
-    gaps = np.asarray(gaps, dtype=np.float64)
+    gaps = np.array(gaps, dtype=np.float64)
     if gaps.ndim != 1 or not gaps.size or not np.isfinite(gaps).all():
         raise DataError(
             f"gaps must be a vector of finite numbers in m, got shape {gaps.shape} with "

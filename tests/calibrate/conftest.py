@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nnode.calibrate.options import TrainerOptions
 from nnode.calibrate.optimizers import AdadeltaOptions, OptimizerOptions, build_optimizer
+from nnode.calibrate.options import TrainerOptions
 from nnode.calibrate.trainer import Provenance, Trainer
 from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import LoaderOptions
@@ -21,7 +21,7 @@ from nnode.solvers import TorchdiffeqSolver
 LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 
 
-@pytest.fixture()
+@pytest.fixture
 def store(tmp_path: Path) -> Store:
     """Seven platoons of two to four cars over 1 s, v0 = 22 m/s and L = 4 m."""
     rng = np.random.default_rng(1)
@@ -35,14 +35,12 @@ def store(tmp_path: Path) -> Store:
             rows.append(x)
         time = 10.0 * i + 0.2 * np.arange(6)
         sequences.append(
-            Sequence(
-                name=f"r/{i:03d}", recording="r", time=time, x=np.array(rows)[::100, :, None]
-            )
+            Sequence(name=f"r/{i:03d}", recording="r", time=time, x=np.array(rows)[::100, :, None])
         )
     return write_store(tmp_path / "store", sequences, {"dt": 0.2, "files": {}})
 
 
-@pytest.fixture()
+@pytest.fixture
 def make_trainer(store: Store) -> Callable[..., Trainer]:
     """Build a trainer in a folder; all randomness from its seed."""
 

@@ -18,7 +18,7 @@ from nnode.errors import CheckpointError
 Make = Callable[..., Trainer]
 
 
-@pytest.fixture()
+@pytest.fixture
 def saved(make_trainer: Make, tmp_path: Path) -> Path:
     trainer = make_trainer(tmp_path, max_epochs=2)
     trainer.fit()
@@ -76,7 +76,7 @@ def test_code_in_a_checkpoint_is_not_executed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("keep", [0, 1, 100, 2000])
 def test_a_truncated_file_is_refused(saved: Path, keep: int) -> None:
     saved.write_bytes(saved.read_bytes()[:keep])
-    with pytest.raises(CheckpointError, match="last.pt"):
+    with pytest.raises(CheckpointError, match=r"last\.pt"):
         load_checkpoint(saved)
 
 

@@ -102,9 +102,8 @@ def test_any_float_and_any_name_survives(
 
 def test_the_table_is_tidy_and_has_one_row_group_per_sequence(folder: Path) -> None:
     table = pd.read_parquet(folder / TABLE)
-    assert list(table.columns) == (
-        "sequence recording time agent x y vx vy length kind group dest_x dest_y".split()
-    )
+    columns = "sequence, recording, time, agent, x, y, vx, vy, length, kind, group, dest_x, dest_y"
+    assert ", ".join(table.columns) == columns
     assert len(table) == 5 * 3 + 7 * 4
     rows = table[(table.sequence == "corridor/2") & (table.agent == "p3")]
     np.testing.assert_array_equal(rows.x, crowd("", k=7, n=4, seed=2).x[:, 3, 0])

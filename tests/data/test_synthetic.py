@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def test_platoons_have_the_shape_of_the_published_ones(tmp_path: Path) -> None:
         assert (np.diff(x[:, 0]) <= 40.0).all()
         assert (np.diff(x, axis=0) > 0).all()
         assert (x > 0).all()
-    pauses = [b[1][0, 0] - a[1][0, -1] for a, b in zip(found, found[1:], strict=False)]
+    pauses = [b[1][0, 0] - a[1][0, -1] for a, b in pairwise(found)]
     assert min(pauses) == pytest.approx(10.0)
 
 
@@ -133,11 +134,11 @@ def plain_acceleration(
 
 
 def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
-    rate, width = 400.0, 1.2
-    p = Forces(A=4.0)
+    rate, width = 200.0, 1.2
+    p = Forces(A=3.0, B=0.2)  # forces that change little between two frames
     path = crowd_recording(
         tmp_path / "c.txt",
-        seed=1,
+        seed=3,
         forces=p,
         people=2,
         duration=7.0,
@@ -156,18 +157,18 @@ def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
     goal = np.column_stack([heading * (3.0 + 1.0 + 5.0), lane])
     along = np.linspace(-4.0, 4.0, 33)
     wall = np.array([(a, b) for b in (0.0, width) for a in along])
-    step = 8  # positions have a resolution of 10 µm
+    step = 4  # positions have a resolution of 10 µm
     h = step / rate
     k = np.argmin(np.linalg.norm(x[:, 0] - x[:, 1], axis=1))
     assert math.dist(*x[k]) < 0.6
     strongest = 0.0
-    for i in range(k - 60, k + 60, 15):
+    for i in range(k - 30, k + 30, 6):
         v = (x[i + step] - x[i - step]) / (2 * h)
         a = (x[i + step] - 2 * x[i] + x[i - step]) / h**2
         expected = plain_acceleration(x[i], v, goal, wall, p)
-        np.testing.assert_allclose(a, expected, atol=0.15)
+        np.testing.assert_allclose(a, expected, atol=0.08)
         strongest = max(strongest, float(np.abs(expected).max()))
-    assert strongest > 1.0
+    assert strongest > 5.0
 
 
 @pytest.fixture(scope="module")
@@ -195,12 +196,12 @@ def test_people_cross_the_corridor_in_both_directions(demo: dict[str, Path]) -> 
         assert (np.diff(frames) == 1).all()
         mine = x[table[:, 0] == person]
         crossed.append(mine[-1] - mine[0])
-    assert len(crossed) == 30
-    assert sum(c > 9 for c in crossed) >= 10
-    assert sum(c < -9 for c in crossed) >= 10
+    assert len(crossed) == 45
+    assert sum(c > 9 for c in crossed) >= 15
+    assert sum(c < -9 for c in crossed) >= 15
     seen = np.bincount(table[:, 1].astype(int))
     assert seen.max() >= 10
-    assert 12 <= (table[:, 1].max() - table[:, 1].min()) / 25 <= 20
+    assert 25 <= (table[:, 1].max() - table[:, 1].min()) / 25 <= 36
 
 
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, demo: dict[str, Path]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import collate
 from nnode.errors import SimulationError
 from nnode.models import (
@@ -149,11 +150,14 @@ def test_a_blow_up_is_dated(platoon) -> None:  # type: ignore[no-untyped-def]
         TorchdiffeqSolver(dt=0.2)(model, batch)
 
 
-def test_a_blow_up_after_the_end_of_its_sequence_is_none(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_sequence_stands_still_after_its_end(platoon) -> None:  # type: ignore[no-untyped-def]
     model = runaway().to(torch.float32)
     short, long = platoon([30.0], samples=3, noise=0.0), platoon([], samples=9)
     batch = collate([short, long]).to(dtype=torch.float32)
-    with torch.no_grad():
-        x = TorchdiffeqSolver(dt=0.2)(model, batch).x
-    assert not x.isfinite().all()
-    assert x[batch.valid].isfinite().all()
+    trajectory = TorchdiffeqSolver(gradient="discrete", dt=0.2)(model, batch)
+    x = trajectory.x.detach()
+    assert x.isfinite().all()
+    assert torch.equal(x[4:, 0], x[-1:, 0].expand_as(x[4:, 0]))
+    # what overflows behind the end would turn into NaN here, masked or not
+    (trajectory.x[..., 0] * batch.valid).sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())

@@ -34,7 +34,7 @@ def rates(x: np.ndarray) -> np.ndarray:
 
 
 def transposed_jacobian(x: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """(df/dx)ᵀ p: x_i appears in its own gap with minus, in that of the vehicle behind with plus."""
+    """(df/dx)ᵀ p: x_i lessens its own gap and widens that of the vehicle behind."""
     slope = V0 * LENGTH / np.diff(x) ** 2 * p[:-1]
     out = np.zeros_like(p)
     out[:-1] -= slope

@@ -7,6 +7,7 @@ cancellation: h = 1e-30 gives every digit.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -122,13 +123,8 @@ def test_discrete_gradient_in_traffic(platoon, name: str) -> None:  # type: igno
 
 def test_discrete_gradient_in_crowds(crowd) -> None:  # type: ignore[no-untyped-def]
     item = crowd(4, samples=4)
-    item = Sequence(
-        **{
-            **vars(item),
-            "walls": None,
-            "x": item.x + 0.05 * np.cos(9 * np.arange(4))[:, None, None],
-        }
-    )
+    shaken = item.x + 0.05 * np.cos(9 * np.arange(4))[:, None, None]
+    item = replace(item, walls=None, x=shaken)
     model = Crowd([Relaxation(TAU), SocialForce(1.5, 30.0, 9.0, r=R, B=B)])
     expected = complex_gradient(lambda u: social_force_loop(item, u, 5), flat(model))
     found = gradient(model, collate([item]), "discrete", 0.04)

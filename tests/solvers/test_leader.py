@@ -7,24 +7,24 @@ import pytest
 import torch
 
 from nnode.calibrate.cost import sequence_costs, squared_error
-from nnode.data.sequence import collate
+from nnode.data.sequence import Sequence, collate
 from nnode.models import Linear, NetworkSpeed, Traffic
 from nnode.solvers import TorchdiffeqSolver
 
 V0, LENGTH, DT, STEPS = 21.0, 4.0, 0.02, 10
 
 
-def followers_loop(item) -> np.ndarray:  # type: ignore[no-untyped-def]
+def followers_loop(item: Sequence, v0: complex = V0, length: complex = LENGTH) -> np.ndarray:
     """Euler for the followers behind a leader on straight lines between its samples."""
     time = item.time - item.time[0]
-    x = item.x[0, :-1, 0].copy()
-    states = [x.copy()]
+    x = item.x[0, :-1, 0]
+    states = [x]
     for step in range(STEPS * (item.n_samples - 1)):
         lead = np.interp(step * DT, time, item.x[:, -1, 0])
         gap = np.diff(np.append(x, lead))
-        x = x + DT * V0 * (1 - LENGTH / gap)
+        x = x + DT * v0 * (1 - length / gap)
         if (step + 1) % STEPS == 0:
-            states.append(x.copy())
+            states.append(x)
     return np.array(states)
 
 
@@ -62,3 +62,18 @@ def test_a_speed_that_nobody_drives_at_has_no_gradient(platoon, gradient: str) -
     assert term.v0.grad is not None
     assert term.v0.grad.item() == 0.0
     assert all(p.grad.abs().max() > 0 for p in term.network.parameters())
+
+
+def test_gradient_behind_the_record(platoon) -> None:  # type: ignore[no-untyped-def]
+    item = platoon([12.0, 18.0, 9.0], samples=6, noise=1.0)
+    batch, term = collate([item]), Linear(V0, LENGTH)
+    solver = TorchdiffeqSolver("euler", "discrete", DT)
+    sequence_costs(solver(Traffic([term], leader="measured"), batch), batch).sum().backward()
+
+    def cost(v0: complex, length: complex) -> complex:
+        away = followers_loop(item, v0, length) - item.x[:, :-1, 0]
+        return 0.5 * item.dt * (away**2).sum()
+
+    h = 1e-30  # differentiation along the imaginary axis loses no digits
+    expected = [cost(V0 + 1j * h, LENGTH).imag / h, cost(V0, LENGTH + 1j * h).imag / h]
+    np.testing.assert_allclose([term.v0.grad.item(), term.L.grad.item()], expected, rtol=1e-10)

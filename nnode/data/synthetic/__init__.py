@@ -26,7 +26,10 @@ def demo_data(folder: Path | str, seed: int = 0) -> dict[str, Path]:
         The two paths by data set, ``esimas`` and ``juelich``.
     """
     folder = Path(folder)
+    traffic = folder / "esimas" / "sequence_datademo.mat"
+    crowd = folder / "juelich" / "demo_corridor.txt"
     return {
-        "esimas": traffic_recording(folder / "esimas" / "sequence_datademo.mat", seed=seed),
-        "juelich": crowd_recording(folder / "juelich" / "demo_corridor.txt", seed=seed),
+        "esimas": traffic_recording(traffic, seed=seed),
+        # several times longer than anyone stays, so that a block of it can be held out
+        "juelich": crowd_recording(crowd, seed=seed, people=45, duration=36.0),
     }

@@ -1,0 +1,48 @@
+"""Running the scripts as a user does."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from nnode.data.synthetic import demo_data
+
+ROOT = Path(__file__).resolve().parents[2]
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the demonstration's recordings."""
+    folder = tmp_path_factory.mktemp("raw")
+    demo_data(folder)
+    return folder
+
+
+def environment() -> dict[str, str]:
+    """The process's own, with one torch thread and without a data folder."""
+    return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
+
+
+@pytest.fixture(scope="session")
+def script() -> Script:
+    """Run ``scripts/<name>.py`` with overrides; returns the finished process."""
+
+    def run(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, f"scripts/{name}.py", *overrides],
+            cwd=ROOT,
+            env={**environment(), **env},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+
+    return run

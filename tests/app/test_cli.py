@@ -1,0 +1,72 @@
+"""Every option is checked before work starts, and errors name the nearest valid one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from nnode.app.cli import check_overrides, user_overrides
+from nnode.config import register
+from nnode.errors import ConfigError
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _schemas() -> None:
+    register()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["trainer.max_epoch=3"], "did you mean trainer.max_epochs"),
+        (["modle=lin"], "did you mean model"),
+        (["model=n5"], "expected one of lin, log, n10, n2, n4, nn, sf"),
+        (["model=lin_schema"], "model=lin_schema is unknown"),
+        (["model.hidden=3"], "option model.hidden is unknown"),
+        (["model=n4", "model.hiden=3"], "did you mean model.hidden"),
+        (["trainer.max_epochs=three"], "could not be converted to Integer"),
+        (["data.faults=kep"], r"expected one of \[drop, keep, error\]"),
+        (["data.split.heldout=abc"], "could not be converted to Float"),
+        (["+trainer.extra=1"], "option trainer.extra is unknown"),
+        (["solver.gradient=exact"], r"expected one of \[adjoint, discrete\]"),
+        (["model=lin,n5"], "model=n5 is unknown"),
+        (["seed=1,two"], "seed=two is refused"),
+        (["data.recording=[1-1_1"], "cannot read the command line"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_overrides(overrides, CONF, "train")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["model=n4", "model.hidden=7", "model.box=1.0", "model.leader=measured"],
+        ["data.recording=1-1_1"],
+        ["data.recording=[1-1_1,1-1_2]", "hydra.run.dir=/tmp/x"],
+        ["model=lin,log,n2", "seed=1,2,3"],
+        ["model=sf", "data=hermes", "optimizer=adam", "optimizer.lr=0.1", "seed=range(3)"],
+        ["data=vehicles", "data.path='a, b.csv'", "data.columns={vehicle: id, x: pos}"],
+        ["experiment=paper_traffic", "solver.dt=null"],
+    ],
+)
+def test_right_options_pass(overrides: list[str]) -> None:
+    check_overrides(overrides, CONF, "train")
+
+
+@pytest.mark.parametrize("name", ["train", "prepare_data", "evaluate", "plot_forces"])
+def test_every_group_of_every_script_composes(name: str) -> None:
+    for group in ("model", "data", "optimizer", "experiment"):
+        for file in sorted((CONF / group).glob("*.yaml")):
+            if name == "train" or group == "data":
+                check_overrides([f"{group}={file.stem}"], CONF, name)
+
+
+def test_flags_are_told_from_overrides() -> None:
+    arguments = ["-m", "model=lin,log", "--config-name", "other", "seed=1", "--cfg=job"]
+    assert user_overrides(arguments) == ["model=lin,log", "seed=1"]

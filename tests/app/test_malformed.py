@@ -1,0 +1,79 @@
+"""Malformed inputs: one clear error each, no traceback, and an exit status that says so."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+
+HEAD = "vehicle,time,x\n"
+ROWS = "".join(f"{v},{0.2 * k:.1f},{30 * v + 5 * k}\n" for v in range(4) for k in range(6))
+TABLE = "sequence,time,agent,x\n"
+
+
+def _csv(text: str) -> Callable[[Path, Path], list[str]]:
+    def make(folder: Path, raw: Path) -> list[str]:
+        path = folder / "cars.csv"
+        path.write_text(text)
+        columns = "data.columns={vehicle: vehicle, time: time, x: x}"
+        return ["data=vehicles", f"data.path={path}", columns]
+
+    return make
+
+
+def _tidy(text: str) -> Callable[[Path, Path], list[str]]:
+    def make(folder: Path, raw: Path) -> list[str]:
+        path = folder / "own.csv"
+        path.write_text(text)
+        return ["data=table", f"data.path={path}", "data.domain=traffic"]
+
+    return make
+
+
+def _truncated(folder: Path, raw: Path) -> list[str]:
+    (folder / "esimas").mkdir()
+    whole = (raw / "esimas" / "sequence_datademo.mat").read_bytes()
+    (folder / "esimas" / "sequence_datademo.mat").write_bytes(whole[: len(whole) // 2])
+    return ["data=demo_traffic", f"data.source={folder}"]
+
+
+def _unknown(folder: Path, raw: Path) -> list[str]:
+    return ["data=demo_traffic", f"data.source={raw}", "data.recording=demo2"]
+
+
+def _step(folder: Path, raw: Path) -> list[str]:
+    return ["data=demo_traffic", f"data.source={raw}", "solver.dt=0.003"]
+
+
+CASES = {
+    "wrong columns": (_csv("car,when,where\n1,0,0\n"), ["cars.csv", "vehicle"]),
+    "text in a number": (_csv(HEAD + ROWS + "3,1.2,far\n"), ["cars.csv", "26", "far"]),
+    "empty file": (_csv(""), ["cars.csv", "empty"]),
+    "truncated mat": (_truncated, ["sequence_datademo.mat"]),
+    "one vehicle": (_csv(HEAD + "".join(f"1,{0.2 * k:.1f},{k}\n" for k in range(9))), ["vehicle"]),
+    "non-uniform time": (
+        _tidy(TABLE + "".join(f"a,{t},{n},{20 * n + 5 * t}\n" for t in (0, 1, 3) for n in (1, 2))),
+        ["own.csv", "line 4", "equal steps"],
+    ),
+    "NaN": (_tidy(TABLE + "a,0,1,0\na,0,2,9\na,1,1,nan\na,1,2,19\na,2,1,9\na,2,2,29\n"), []),
+    "unknown recording": (_unknown, ["demo2"]),
+    "dt that does not divide": (_step, ["solver.dt", "0.2 s"]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_clear_error(script: Script, raw: Path, tmp_path: Path, case: str) -> None:
+    make, words = CASES[case]
+    run = tmp_path / "run"
+    done = script("train", *make(tmp_path, raw), f"hydra.run.dir={run}")
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    for word in words:
+        assert word in errors[0]
+    assert not (run / "checkpoints").exists()

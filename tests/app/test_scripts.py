@@ -1,0 +1,228 @@
+"""The scripts from end to end, on synthetic recordings in the raw formats."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+import nnode
+from nnode.calibrate.checkpoint import load_checkpoint
+from tests.app.conftest import ROOT, environment
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def files_outside(folder: Path) -> set[Path]:
+    """Files of the repository that a script might have written."""
+    return {p for name in ("runs", "data") for p in (ROOT / name).rglob("*") if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def traffic(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished training on synthetic traffic."""
+    folder = tmp_path_factory.mktemp("run") / "traffic"
+    before = files_outside(folder)
+    done = script(
+        "train",
+        "experiment=demo_traffic",
+        "optimizer=lbfgs",
+        "trainer.max_epochs=4",
+        f"data.source={raw}",
+        f"hydra.run.dir={folder}",
+    )
+    assert done.returncode == 0, done.stderr
+    assert files_outside(folder) == before
+    for name in ("tensorboard", "checkpoints/best.pt", "checkpoints/last.pt"):
+        assert str(folder / name) in done.stdout
+        assert (folder / name).exists()
+    return folder
+
+
+def test_training_recovers_the_generator_s_parameters(traffic: Path) -> None:
+    result = json.loads((traffic / "result.json").read_text())["summary"]
+    # the generator's: v0 = 25 m/s, L = 6 m, noise 0.05 m; Euler with 0.02 s
+    assert result["v0"] == pytest.approx(25, abs=0.1)
+    assert result["L"] == pytest.approx(6, abs=0.1)
+    assert result["cost_train"] < 0.01 * result["cost_start"]
+    assert result["cost_heldout"] < 0.01 * result["cost_start"]
+
+
+def test_load_gives_the_model_of_the_best_checkpoint(traffic: Path) -> None:
+    model = nnode.load(traffic / "checkpoints" / "best.pt")
+    result = json.loads((traffic / "result.json").read_text())["summary"]
+    assert {k: float(v) for k, (v, _) in model.physical().items()} == {
+        k: result[k] for k in ("v0", "L")
+    }
+
+
+def test_evaluate_beats_the_baselines_and_agrees_with_training(
+    script: Script, traffic: Path, raw: Path, tmp_path: Path
+) -> None:
+    best = traffic / "checkpoints" / "best.pt"
+    done = script("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    result = json.loads((traffic / "result.json").read_text())["summary"]
+    assert metrics["part"] == "heldout"
+    assert metrics["J"] == pytest.approx(result["cost_heldout"], rel=1e-12)
+    for baseline in metrics["baselines"].values():
+        assert metrics["J"] < baseline["J"]
+        assert metrics["rmse"] < baseline["rmse"]
+    other = script(
+        "evaluate",
+        f"checkpoint={best}",
+        "data=demo_traffic",
+        f"data.source={raw}",
+        "data.faults=keep",
+        f"hydra.run.dir={tmp_path / 'all'}",
+    )
+    assert other.returncode == 0, other.stderr
+    everything = json.loads((tmp_path / "all" / "metrics.json").read_text())
+    assert everything["part"] == "heldout"  # the same files: the checkpoint's held-out part
+    assert everything["J"] == metrics["J"]  # and there is no fault to keep in them
+
+
+def test_plot_forces_draws_one_and_many(script: Script, traffic: Path, tmp_path: Path) -> None:
+    paths = ",".join(str(traffic / "checkpoints" / name) for name in ("best.pt", "last.pt"))
+    done = script("plot_forces", f"checkpoint=[{paths}]", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "forces.png").stat().st_size > 10_000
+    assert len(pd.read_csv(tmp_path / "forces.csv")) > 10
+
+
+def test_crowd_from_raw_file_to_plots(script: Script, raw: Path, tmp_path: Path) -> None:
+    run = tmp_path / "crowd"
+    done = script(
+        "train",
+        "experiment=demo_crowd",
+        "trainer.max_epochs=2",
+        f"data.source={raw}",
+        f"hydra.run.dir={run}",
+    )
+    assert done.returncode == 0, done.stderr
+    done = script(
+        "plot_forces",
+        f"checkpoint=[{run / 'checkpoints' / 'best.pt'}]",
+        f"hydra.run.dir={tmp_path / 'plots'}",
+    )
+    assert done.returncode == 0, done.stderr
+    names = {p.name for p in (tmp_path / "plots").glob("sf_*")}
+    assert names == {"sf_force_x.png", "sf_force_y.png", "sf_settings.png", "sf_settings.csv"}
+
+
+def test_prepared_data_are_taken_and_other_options_refused(
+    script: Script, raw: Path, tmp_path: Path
+) -> None:
+    prepared = tmp_path / "prepared"
+    source = f"data.source={raw}"
+    done = script("prepare_data", "data=demo_traffic", source, f"hydra.run.dir={prepared}")
+    assert done.returncode == 0, done.stderr
+    arguments = ["experiment=demo_traffic", "trainer.max_epochs=1", f"data.prepared={prepared}"]
+    run = tmp_path / "run"
+    done = script("train", *arguments, f"hydra.run.dir={run}")
+    assert done.returncode == 0, done.stderr
+    assert not (run / "data").exists()
+    done = script("train", *arguments, "data.faults=keep", f"hydra.run.dir={run}")
+    assert done.returncode != 0
+    assert "data.faults=drop then, keep now" in done.stderr
+
+
+def test_sweep_ends_with_one_table_and_survives_a_failing_run(
+    script: Script, raw: Path, tmp_path: Path
+) -> None:
+    done = script(
+        "train",
+        "-m",
+        "experiment=demo_traffic",
+        "model=lin,n2",
+        "solver.dt=0.02,0.03",
+        "trainer.max_epochs=1",
+        f"data.source={raw}",
+        f"hydra.sweep.dir={tmp_path}",
+    )
+    assert done.returncode == 1  # two of the four runs cannot work
+    table = pd.read_csv(tmp_path / "sweep.csv")
+    assert len(table) == 4
+    assert list(table["model"].dropna()) == ["lin", "n2"]
+    assert table["error"].dropna().str.contains("does not divide").all()
+    assert "sweep.csv" in done.stdout
+
+
+def start(*overrides: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "scripts/train.py", *overrides],
+        cwd=ROOT,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def interrupted(raw: Path, folder: Path, stops: int) -> None:
+    """Break a run ``stops`` times, alternately by SIGTERM and SIGKILL; compare the end."""
+    common = [
+        "experiment=demo_traffic",
+        "model=n2",
+        "trainer.max_epochs=40",
+        "trainer.save_every=0.1",
+        f"data.source={raw}",
+    ]
+    straight, broken = folder / "straight", folder / "broken"
+    done = start(*common, f"hydra.run.dir={straight}")
+    _, errors = done.communicate(timeout=300)
+    assert done.returncode == 0, errors
+    draw, arguments = random.Random(0), [*common, f"hydra.run.dir={broken}"]
+    last = broken / "checkpoints" / "last.pt"
+    for stop in range(stops):
+        process = start(*arguments)
+        # wait for the first checkpoint of this start, then a random moment longer
+        before = last.stat().st_mtime_ns if last.exists() else 0
+        while process.poll() is None and (not last.exists() or last.stat().st_mtime_ns == before):
+            time.sleep(0.005)
+        time.sleep(draw.uniform(0, 0.15))
+        kill = stop % 2 == 1
+        process.send_signal(signal.SIGKILL if kill else signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == (-signal.SIGKILL if kill else 128 + signal.SIGTERM), errors
+        arguments = [f"resume={last}", f"data.source={raw}", f"hydra.run.dir={broken}"]
+        if not kill:
+            assert f"resume={last} hydra.run.dir={broken}" in errors
+    done = start(*arguments)
+    _, errors = done.communicate(timeout=300)
+    assert done.returncode == 0, errors
+    for name in ("last.pt", "best.pt"):
+        a = load_checkpoint(straight / "checkpoints" / name)
+        b = load_checkpoint(broken / "checkpoints" / name)
+        assert a.model.keys() == b.model.keys()
+        assert all(torch.equal(a.model[key], b.model[key]) for key in a.model)
+        assert a.history == b.history
+
+
+def test_two_signals_at_random_moments_change_no_bit(raw: Path, tmp_path: Path) -> None:
+    interrupted(raw, tmp_path, 2)
+
+
+@pytest.mark.slow
+def test_ten_signals_at_random_moments_change_no_bit(raw: Path, tmp_path: Path) -> None:
+    interrupted(raw, tmp_path, 10)
+
+
+def test_resume_refuses_another_problem(script: Script, traffic: Path, tmp_path: Path) -> None:
+    last = traffic / "checkpoints" / "last.pt"
+    for change in ("model=n4", "seed=5"):
+        done = script("train", f"resume={last}", change, f"hydra.run.dir={tmp_path}")
+        assert done.returncode == 2
+        assert "cannot change when a run is resumed" in done.stderr
+    assert os.path.exists(last)

@@ -1,0 +1,107 @@
+"""The trajectory cost by hand, and on a real recording against a plain loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.io import loadmat
+
+from nnode.calibrate.cost import Convention, sequence_costs, squared_error
+from nnode.calibrate.evaluate import evaluate
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.models import Linear, Traffic
+from nnode.solvers import TorchdiffeqSolver, Trajectory
+
+
+def two_sequences() -> Batch:
+    """K = 3 samples of two vehicles, and K = 2 of one."""
+    long = Sequence(
+        name="long",
+        recording="r",
+        time=np.array([0.0, 0.5, 1.0]),
+        x=np.array([[0.0, 10.0], [5.0, 16.0], [9.0, 21.0]])[..., None],
+    )
+    short = Sequence(
+        name="short",
+        recording="r",
+        time=np.array([7.0, 7.5]),
+        x=np.array([[1.0], [4.0]])[..., None],
+    )
+    return collate([long, short])
+
+
+def shifted(batch: Batch) -> Trajectory:
+    """A simulation whose errors are 0, (1, -2), (3, 4) in the first and 0, 5 in the second."""
+    x = batch.x.clone()
+    x[1, 0, :, 0] += torch.tensor([1.0, -2.0])
+    x[2, 0, :, 0] += torch.tensor([3.0, 4.0])
+    x[1, 1, 0, 0] += 5.0
+    # the padding may hold anything
+    x[2, 1, 0, 0] = float("nan")
+    x[:, 1, 1, 0] = float("inf")
+    return Trajectory(x, None)
+
+
+def test_squared_error() -> None:
+    batch = two_sequences()
+    expected = [[[0, 0], [0, 0]], [[1, 4], [25, 0]], [[9, 16], [0, 0]]]
+    assert squared_error(shifted(batch), batch).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("convention", "costs"),
+    [(Convention.integral, [7.5, 6.25]), (Convention.sum, [15.0, 12.5])],
+)
+def test_both_conventions(convention: Convention, costs: list[float]) -> None:
+    batch = two_sequences()
+    found = sequence_costs(shifted(batch), batch, convention)
+    np.testing.assert_allclose(found, costs, rtol=1e-14)
+
+
+def test_two_dimensions_count_together() -> None:
+    x = np.zeros((2, 1, 2))
+    batch = collate([Sequence(name="p", recording="r", time=np.array([0.0, 0.04]), x=x)])
+    moved = batch.x.clone()
+    moved[1] += torch.tensor([3.0, 4.0])
+    cost = sequence_costs(Trajectory(moved, None), batch)
+    np.testing.assert_allclose(cost, [0.5 * 0.04 * 25.0])
+
+
+def test_the_padding_has_no_gradient() -> None:
+    batch = two_sequences()
+    x = shifted(batch).x.requires_grad_()
+    sequence_costs(Trajectory(x, None), batch).sum().backward()
+    assert x.grad is not None
+    # d/dx of 1/2 dt e² is dt e
+    expected = [[[0, 0], [0, 0]], [[0.5, -1], [2.5, 0]], [[1.5, 2], [0, 0]]]
+    assert x.grad[..., 0].tolist() == expected
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("recording", ["1-1_1", "2-1_1"])
+def test_cost_of_a_recording(real_data: Path, recording: str) -> None:
+    """Every sequence, faults kept, behind a leader at v0."""
+    v0, length, dt = 22.0, 4.0, 0.02
+    cells = loadmat(real_data / "esimas" / f"sequence_data{recording}.mat")["sequences"].ravel()
+    items, costs = [], []
+    for number, cell in enumerate(cells):
+        z = np.asarray(cell["Xarr"][0, 0], dtype=float)
+        time = np.asarray(cell["Tarr"][0, 0], dtype=float).ravel()
+        name = f"{recording}/{number}"
+        items.append(Sequence(name=name, recording=recording, time=time, x=z.T[:, :, None]))
+        x, cost = z[:, 0].copy(), 0.0
+        for k in range(1, z.shape[1]):
+            for _ in range(10):
+                speed = [v0 * (1 - length / (x[i + 1] - x[i])) for i in range(len(x) - 1)]
+                x = x + dt * np.array([*speed, v0])
+            cost += 0.5 * 0.2 * ((x - z[:, k]) ** 2).sum()
+        costs.append(cost)
+    batches = [collate(items[i : i + 8]) for i in range(0, len(items), 8)]
+    model, solver = Traffic([Linear(v0, length)]), TorchdiffeqSolver("euler", dt=dt)
+    metrics = evaluate(lambda batch: solver(model, batch), batches)
+    assert metrics.sequences == len(items) > 20
+    np.testing.assert_allclose(list(metrics.costs.values()), costs, rtol=1e-6)
+    assert pytest.approx(np.mean(costs), rel=1e-6) == metrics.J

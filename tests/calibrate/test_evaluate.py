@@ -1,0 +1,224 @@
+"""Error measures by hand, and baselines on data where they are exact."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize_scalar
+
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.evaluate import (
+    baselines,
+    best_common_speed,
+    constant_velocity,
+    evaluate,
+    no_interaction,
+)
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.models import Crowd, Linear, Relaxation, SocialForce, Traffic
+from nnode.solvers import TorchdiffeqSolver, Trajectory
+
+
+def traffic(name: str, x: list[list[float]], dt: float = 0.5) -> Sequence:
+    """A sequence from one row of positions (m) per sample."""
+    return Sequence(
+        name=name, recording="r", time=dt * np.arange(len(x)), x=np.asarray(x)[:, :, None]
+    )
+
+
+BATCHES = [
+    collate(
+        [
+            traffic("a", [[0, 10], [5, 16], [9, 21]]),
+            traffic("b", [[1], [4]]),
+        ]
+    ),
+    collate([traffic("c", [[0, 8, 30], [4, 12, 33]])]),
+]
+ERRORS = {"a": [[0, 0], [1, -2], [3, 4]], "b": [[0], [5]], "c": [[0, 0, 0], [0, 0, -2]]}
+
+
+def with_errors(batch: Batch) -> Trajectory:
+    x = batch.x.clone()
+    for b, name in enumerate(batch.names):
+        error = torch.tensor(ERRORS[name], dtype=x.dtype)
+        x[: len(error), b, : error.shape[1], 0] += error
+    return Trajectory(x, None)
+
+
+def test_by_hand() -> None:
+    metrics = evaluate(with_errors, BATCHES)
+    # squared errors: a 1, 4 then 9, 16; b 25; c 0, 0, 4
+    assert metrics.costs == pytest.approx({"a": 7.5, "b": 6.25, "c": 1.0})
+    assert pytest.approx((7.5 + 6.25 + 1.0) / 3) == metrics.J
+    assert metrics.sequences == 3
+    assert metrics.rmse == pytest.approx((59 / 8) ** 0.5)
+    # distances at the last samples: a 3, 4; b 5; c 0, 0, 2
+    assert metrics.final_displacement == pytest.approx(14 / 6)
+    assert metrics.collisions == 0.0
+    assert metrics.horizons == [
+        {"t": 0.5, "rmse": pytest.approx((34 / 6) ** 0.5), "n": 6},
+        {"t": 1.0, "rmse": pytest.approx((25 / 2) ** 0.5), "n": 2},
+    ]
+
+
+def test_the_sum_convention() -> None:
+    metrics = evaluate(with_errors, BATCHES, Convention.sum)
+    assert pytest.approx((15 + 12.5 + 2) / 3) == metrics.J
+    assert metrics.rmse == pytest.approx((59 / 8) ** 0.5)
+
+
+def test_collisions_by_hand() -> None:
+    def colliding(batch: Batch) -> Trajectory:
+        x = batch.x.clone()
+        if "c" in batch.names:
+            x[1, 0, 0, 0] = 12.0  # in c the first vehicle stands where the second does
+        else:
+            x[2, 0, 0, 0] = 22.0  # in a the follower is ahead of its leader
+            x[0, 0, 0, 0] = 99.0  # the start is measured, not simulated
+        return Trajectory(x, None)
+
+    # simulated samples behind a leader: a 2, b none, c 2 followers at 1 sample
+    assert evaluate(colliding, BATCHES).collisions == pytest.approx(2 / 4)
+
+
+def test_crowds_have_no_collisions_and_distances_in_the_plane() -> None:
+    x = np.zeros((2, 2, 2))
+    batch = collate([Sequence(name="p", recording="r", time=np.array([0.0, 0.04]), x=x)])
+
+    def away(batch: Batch) -> Trajectory:
+        moved = batch.x.clone()
+        moved[1, 0, 0] += torch.tensor([3.0, 4.0])
+        return Trajectory(moved, moved)
+
+    metrics = evaluate(away, [batch])
+    assert metrics.final_displacement == pytest.approx(2.5)
+    assert metrics.rmse == pytest.approx((25 / 2) ** 0.5)
+    assert metrics.collisions == 0.0
+
+
+def test_batches_do_not_matter() -> None:
+    items = [
+        traffic("a", [[0, 10], [5, 16], [9, 21]]),
+        traffic("b", [[1], [4]]),
+        traffic("c", [[0, 8, 30], [4, 12, 33]]),
+    ]
+    together, apart = (evaluate(with_errors, b).plain() for b in ([collate(items)], BATCHES))
+    for name in ("costs", "horizons"):
+        first, second = together.pop(name), apart.pop(name)
+        assert json.dumps(first) == json.dumps(second)
+    assert together == pytest.approx(apart)
+
+
+def test_metrics_are_plain_enough_for_json() -> None:
+    plain = evaluate(with_errors, BATCHES).plain()
+    assert json.loads(json.dumps(plain)) == plain
+
+
+def test_best_common_speed_is_the_least_cost() -> None:
+    draw = np.random.default_rng(0)
+    items = [
+        traffic(str(n), np.cumsum(draw.uniform(1, 9, (k, n)), axis=0) + 20.0 * np.arange(n))
+        for n, k in ((3, 6), (1, 4), (2, 9))
+    ]
+
+    def cost(speed: float) -> float:
+        return sum(
+            ((item.x[0, i, 0] + speed * item.time[k] - item.x[k, i, 0]) ** 2)
+            for item in items
+            for i in range(item.n_agents)
+            for k in range(item.n_samples)
+        )
+
+    expected = minimize_scalar(cost, bracket=(0.0, 40.0), tol=1e-12).x
+    for batches in ([collate(items)], [collate(items[:1]), collate(items[1:])]):
+        assert best_common_speed(batches) == pytest.approx(expected, rel=1e-6)
+
+
+def steady(n: int, speeds: list[float], samples: int) -> Sequence:
+    t = 0.2 * np.arange(samples)
+    x = 7.0 + 15.0 * np.arange(n) + t[:, None] * np.asarray(speeds)
+    return Sequence(name=f"{n}", recording="r", time=t, x=x[:, :, None])
+
+
+@pytest.mark.parametrize("leader", ["constant", "measured"])
+def test_constant_velocity_is_exact_on_steady_traffic(leader: str) -> None:
+    batch = collate([steady(3, [11.0, 14.0, 12.5], 5), steady(1, [9.0], 3)])
+    metrics = evaluate(constant_velocity(Traffic([Linear()], leader)), [batch])
+    assert metrics.rmse < 1e-12
+
+
+@pytest.mark.parametrize("leader", ["constant", "measured"])
+def test_no_interaction_is_exact_where_all_share_a_speed(leader: str) -> None:
+    batch = collate([steady(3, [12.5] * 3, 5), steady(1, [12.5], 3)])
+    solver = TorchdiffeqSolver("euler", dt=0.02)
+    speed = best_common_speed([batch])
+    assert speed == pytest.approx(12.5)
+    simulate = no_interaction(Traffic([Linear()], leader), solver, speed)
+    assert evaluate(simulate, [batch]).rmse < 1e-11
+
+
+def test_no_interaction_lets_everyone_but_a_measured_leader_drive_at_free_speed() -> None:
+    item = steady(2, [9.0, 14.0], 4)
+    simulate = no_interaction(
+        Traffic([Linear()], "measured"), TorchdiffeqSolver("euler", dt=0.02), 12.0
+    )
+    x = simulate(collate([item])).x[:, 0, :, 0].detach()
+    np.testing.assert_allclose(x[:, 0], 7.0 + 12.0 * item.time, rtol=1e-12)
+    np.testing.assert_array_equal(x[:, 1], item.x[:, 1, 0])
+
+
+def walkers() -> Sequence:
+    """Three people on straight lines, each walking towards the last position."""
+    t = 0.1 * np.arange(6)[:, None, None]
+    start = np.array([[0.0, 0.0], [0.3, 0.2], [2.0, 1.0]])
+    v = np.array([[1.2, 0.1], [-0.8, 0.5], [0.0, 1.4]])
+    x = start + t * v
+    return Sequence(
+        name="w",
+        recording="r",
+        time=t[:, 0, 0],
+        x=x,
+        v=np.broadcast_to(v, x.shape),
+        walls=np.array([[-2.0, -1.0, 4.0, -1.0]]),
+    )
+
+
+def touchy() -> Crowd:
+    return Crowd([Relaxation(0.5), SocialForce(1.0, 40.0, 9.0)])
+
+
+def test_both_baselines_are_exact_on_people_walking_straight() -> None:
+    batch = collate([walkers()])
+    solver = TorchdiffeqSolver("euler", dt=0.05)
+    for simulate in baselines(touchy(), solver, None).values():
+        assert evaluate(simulate, [batch]).rmse < 1e-9
+    # the people are close enough for the interaction to matter
+    assert evaluate(lambda b: solver(touchy(), b), [batch]).rmse > 0.01
+
+
+def test_no_interaction_in_crowds_is_relaxation_alone() -> None:
+    item = walkers()
+    batch = collate([item])
+    batch.destination = batch.destination + torch.tensor([0.5, -2.0])
+    simulate = no_interaction(touchy(), TorchdiffeqSolver("euler", dt=0.05), None)
+    found = simulate(batch)
+    destination = batch.destination[0].numpy()
+    x, v = item.x[0].copy(), item.velocity()[0].copy()
+    for k in range(6):
+        np.testing.assert_allclose(found.x[k, 0], x, rtol=1e-9, atol=1e-9)
+        for _ in range(2):
+            way = destination - x
+            desired = np.linalg.norm(v, axis=1, keepdims=True) * way
+            desired /= np.linalg.norm(way, axis=1, keepdims=True)
+            x, v = x + 0.05 * v, v + 0.05 * (desired - v) / 0.5
+
+
+def test_baselines_follow_the_model_s_precision() -> None:
+    model = Traffic([Linear()]).to(torch.float32)
+    batch = collate([steady(2, [12.5] * 2, 4)]).to(dtype=torch.float32)
+    for simulate in baselines(model, TorchdiffeqSolver("euler", dt=0.02), 12.5).values():
+        assert simulate(batch).x.dtype == torch.float32

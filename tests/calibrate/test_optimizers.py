@@ -1,0 +1,155 @@
+"""Optimisers by name: what is built from the options, and whether it calibrates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nnode.calibrate.adadelta import NoisyAdadelta
+from nnode.calibrate.consensus import ConsensusBased
+from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.optimizers import (
+    AdadeltaOptions,
+    AdamOptions,
+    ConsensusOptions,
+    LbfgsOptions,
+    OptimizerOptions,
+    build_optimizer,
+    needs_full_batch,
+)
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError
+from nnode.models import Linear, Traffic
+from nnode.solvers import TorchdiffeqSolver
+
+#: v0 (m/s) and L (m) that the data are made with.
+TRUTH = (24.0, 6.0)
+SOLVER = TorchdiffeqSolver("euler", "discrete", 0.1)
+
+
+def made_with_lin() -> Batch:
+    """Platoons by a plain Euler loop with TRUTH, four steps of 0.05 s between two samples."""
+    items = []
+    for number, gaps in enumerate([[9.0, 14.0], [20.0, 8.0], [30.0, 11.0]]):
+        x = np.concatenate([[0.0], np.cumsum(gaps)])
+        states = [x]
+        for _ in range(7):
+            for _ in range(2):
+                v0, length = TRUTH
+                x = x + 0.1 * np.append(v0 * (1 - length / np.diff(x)), v0)
+            states.append(x)
+        items.append(
+            Sequence(
+                name=str(number),
+                recording="r",
+                time=0.2 * np.arange(8),
+                x=np.array(states)[:, :, None],
+            )
+        )
+    return collate(items)
+
+
+@pytest.mark.parametrize(
+    ("options", "steps", "share"),
+    [
+        (AdadeltaOptions(eps=1e-3), 400, 1e-2),
+        (AdamOptions(lr=0.2), 200, 1e-3),
+        (LbfgsOptions(), 5, 1e-9),
+        (ConsensusOptions(), 80, 1e-3),
+    ],
+    ids=lambda o: getattr(o, "name", ""),
+)
+def test_each_optimiser_calibrates(options: OptimizerOptions, steps: int, share: float) -> None:
+    batch, model = made_with_lin(), Traffic([Linear()])
+    optimizer = build_optimizer(model, options, seed=1)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        cost = sequence_costs(SOLVER(model, batch), batch).mean()
+        if cost.requires_grad:
+            cost.backward()
+        return cost.detach()
+
+    first = float(closure())
+    for _ in range(steps):
+        optimizer.step(closure)
+        model.project_()
+    assert float(closure()) < share * first
+    if share < 1e-5:
+        found = [model.terms[0].v0.item(), model.terms[0].L.item()]
+        np.testing.assert_allclose(found, TRUTH, rtol=1e-4)
+
+
+def test_options_reach_the_optimiser() -> None:
+    model = Traffic([Linear()])
+    adam = build_optimizer(model, AdamOptions(lr=0.3, beta1=0.7, beta2=0.8, eps=1e-5))
+    assert isinstance(adam, torch.optim.Adam)
+    group = adam.param_groups[0]
+    assert (group["lr"], group["betas"], group["eps"]) == (0.3, (0.7, 0.8), 1e-5)
+    lbfgs = build_optimizer(model, LbfgsOptions(lr=0.5, max_iter=7, history=3)).param_groups[0]
+    assert (lbfgs["lr"], lbfgs["max_iter"], lbfgs["history_size"]) == (0.5, 7, 3)
+    assert lbfgs["line_search_fn"] == "strong_wolfe"
+    adadelta = build_optimizer(
+        model, AdadeltaOptions(lr=0.5, rho=0.9, eps=1e-3, eta1=2.0, eta2=0.1)
+    )
+    assert isinstance(adadelta, NoisyAdadelta)
+    expected = {"lr": 0.5, "rho": 0.9, "eps": 1e-3, "eta1": 2.0, "eta2": 0.1}
+    assert {key: adadelta.param_groups[0][key] for key in expected} == expected
+    consensus = build_optimizer(model, ConsensusOptions(particles=13))
+    assert isinstance(consensus, ConsensusBased)
+    assert consensus.state_dict()["x"].shape == (13, 2)
+
+
+def test_the_paper_s_constants_are_the_defaults() -> None:
+    group = build_optimizer(Traffic([Linear()]), AdadeltaOptions()).param_groups[0]
+    expected = {"lr": 1.0, "rho": 0.95, "eps": 1e-6, "eta1": 1.0, "eta2": 0.55}
+    assert {key: group[key] for key in expected} == expected
+
+
+@pytest.mark.parametrize("options", [AdadeltaOptions(), ConsensusOptions()], ids=lambda o: o.name)
+def test_the_seed_reaches_the_optimiser(options: OptimizerOptions) -> None:
+    states = [
+        build_optimizer(Traffic([Linear()]), options, seed=s).state_dict()["generator"]
+        for s in (4, 4, 5)
+    ]
+    assert torch.equal(states[0], states[1])
+    assert not torch.equal(states[0], states[2])
+
+
+def test_consensus_projects_with_the_model() -> None:
+    model = Traffic([Linear(v0=20.0, L=2.0)])
+    optimizer = build_optimizer(model, ConsensusOptions())
+    lengths = []
+
+    def closure() -> Tensor:
+        lengths.append(model.terms[0].L.item())
+        return torch.tensor(1.0)
+
+    optimizer.step(closure)
+    assert min(lengths) == 2.0
+    assert max(lengths) > 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "full"), [("adadelta", False), ("adam", False), ("lbfgs", True), ("cbo", True)]
+)
+def test_who_compares_costs_of_different_steps(name: str, full: bool) -> None:
+    assert needs_full_batch(name) is full
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (OptimizerOptions(name="adadlta"), r"optimizer\.name=adadlta.*adadelta, adam, lbfgs, cbo"),
+        (AdadeltaOptions(rho=1.5), "adadelta: rho=1.5"),
+        (AdamOptions(lr=-1.0), "adam: .*learning rate"),
+        (ConsensusOptions(particles=1), "cbo: particles=1"),
+        (ConsensusOptions(dt=-0.1), "cbo: dt=-0.1"),
+    ],
+    ids=lambda v: v if isinstance(v, str) else "",
+)
+def test_errors_name_the_option(options: OptimizerOptions, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        build_optimizer(Traffic([Linear()]), options)

@@ -1,0 +1,264 @@
+"""Preparation: policy, manifest, interruption, and opening what was prepared."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from scipy.io import savemat
+
+import nnode.data.prepare as module
+from nnode.data.options import (
+    DataOptions,
+    EsimasOptions,
+    Faults,
+    JuelichOptions,
+    SplitOptions,
+    TableOptions,
+    VehicleTableOptions,
+)
+from nnode.data.policy import LISTED
+from nnode.data.prepare import open_data, plain, prepare
+from nnode.data.store import Store
+from nnode.errors import ConfigError, DataError, FaultError
+
+TIME = 0.2 * np.arange(6)
+CLEAN = np.array([[0.0], [30.0], [60.0]]) + 25 * TIME
+JUMP = CLEAN + np.where(TIME > 0.5, [[0], [0], [40]], 0)
+INFINITE = np.where(CLEAN[1, 2] == CLEAN, np.inf, CLEAN)
+
+
+def raw(folder: Path, *positions: np.ndarray, recording: str = "demo") -> EsimasOptions:
+    folder.mkdir(exist_ok=True)
+    cells = np.empty((len(positions), 1), dtype=object)
+    for i, x in enumerate(positions):
+        cells[i, 0] = {"Xarr": x, "Tarr": TIME[: x.shape[1]]}
+    savemat(folder / f"sequence_data{recording}.mat", {"sequences": cells})
+    return EsimasOptions(source=str(folder))
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> EsimasOptions:
+    return raw(tmp_path / "raw", CLEAN, JUMP, INFINITE, CLEAN[:, :4])
+
+
+def test_drop(tmp_path: Path, options: EsimasOptions) -> None:
+    store = prepare(options, tmp_path / "out")
+    assert [s.name for s in store] == ["demo/000", "demo/003"]
+    np.testing.assert_array_equal(store[0].x[:, :, 0].T, CLEAN)
+    m = store.manifest
+    assert m["counts"] == {"read": 4, "kept": 2, "dropped": 2}
+    assert m["recordings"]["demo"] == {
+        "read": 4,
+        "kept": 2,
+        "dropped": 2,
+        "faulty": {"jump": 1, "non_finite": 1},
+    }
+    reasons = {d["sequence"]: [r["kind"] for r in d["reasons"]] for d in m["dropped"]}
+    assert reasons == {"demo/001": ["jump"], "demo/002": ["non_finite"]}
+    assert m["dt"] == 0.2
+    assert m["domain"] == "traffic"
+    file = Path(options.source or "") / "sequence_datademo.mat"
+    assert m["files"]["demo"] == {
+        "name": file.name,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+    }
+    assert m["options"]["faults"] == "drop"
+    assert m["options"]["split"]["heldout"] == SplitOptions().heldout
+    assert (tmp_path / "out" / "faults" / "demo.png").is_file()
+
+
+def test_keep_keeps_what_can_be_simulated(tmp_path: Path, options: EsimasOptions) -> None:
+    options.faults = Faults.keep
+    store = prepare(options, tmp_path / "out", plots=False)
+    assert [s.name for s in store] == ["demo/000", "demo/001", "demo/003"]
+    assert {f["kind"] for f in store.manifest["faults"]} == {"jump", "non_finite"}
+    assert not (tmp_path / "out" / "faults").exists()
+
+
+def test_error_refuses_and_leaves_the_folder_alone(tmp_path: Path, options: EsimasOptions) -> None:
+    prepare(options, tmp_path / "out")
+    before = {p: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
+    options.faults = Faults.error
+    with pytest.raises(FaultError, match=r"2 of 4 sequences hold faults \(jump in 1, non_fin"):
+        prepare(options, tmp_path / "out")
+    assert before == {p: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
+    options = raw(tmp_path / "sound", CLEAN)
+    options.faults = Faults.error
+    assert len(prepare(options, tmp_path / "sound_out")) == 1
+
+
+def test_a_fault_message_lists_the_first_few(tmp_path: Path) -> None:
+    options = raw(tmp_path / "raw", *[JUMP] * 9)
+    options.faults = Faults.error
+    with pytest.raises(
+        FaultError, match=r"(?s)demo/000: jump: car 2 goes from .*\.\.\. and 4 more"
+    ) as e:
+        prepare(options, tmp_path / "out")
+    assert str(e.value).count("demo/") == LISTED
+
+
+def test_nothing_left(tmp_path: Path) -> None:
+    options = raw(tmp_path / "raw", JUMP, INFINITE)
+    with pytest.raises(DataError, match=r"nothing is left of 2 sequences: jump in 1, non_finite"):
+        prepare(options, tmp_path / "out")
+    options = raw(tmp_path / "raw", CLEAN[:1])
+    with pytest.raises(DataError, match="nothing is left of 1 sequences: too_short in 1"):
+        prepare(options, tmp_path / "out")
+
+
+@pytest.mark.parametrize("place", ["write_store", "plot"])
+def test_interrupted_preparation_starts_clean(
+    tmp_path: Path, options: EsimasOptions, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    out = tmp_path / "out"
+    prepare(options, out)
+    before = (out / "manifest.json").read_bytes()
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        target = (
+            "nnode.plots.quality.plot_faults" if place == "plot" else module.__name__ + "." + place
+        )
+        patch.setattr(target, interrupt)
+        options.recording = "demo"
+        with pytest.raises(KeyboardInterrupt):
+            prepare(options, out)
+    assert (out / "manifest.json").read_bytes() == before
+    assert len(Store(out)) == 2
+    (out / ".faults.123.partial").mkdir()
+    (out / ".sequences.parquet.123.partial").write_text("half")
+    prepare(options, out)
+    assert sorted(p.name for p in out.iterdir()) == ["faults", "manifest.json", "sequences.parquet"]
+
+
+def test_same_data_same_files(tmp_path: Path, options: EsimasOptions) -> None:
+    for name in ("a", "b"):
+        prepare(options, tmp_path / name)
+    for file in ("manifest.json", "sequences.parquet", "faults/demo.png"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_open_prepared(tmp_path: Path, options: EsimasOptions) -> None:
+    prepare(options, tmp_path / "out")
+    options.prepared = str(tmp_path / "out")
+    options.source, options.download = "elsewhere", "elsewhere"
+    options.split.heldout, options.loader.batch_size = 0.5, 3
+    store = open_data(options, tmp_path / "unused")
+    assert store.folder == tmp_path / "out"
+    assert not (tmp_path / "unused").exists()
+    options.faults, options.min_vehicles = Faults.keep, 2
+    with pytest.raises(
+        ConfigError, match=r"data\.faults=drop then, keep now; data\.min_vehicles=3 then, 2 now"
+    ):
+        open_data(options, tmp_path / "unused")
+    with pytest.raises(ConfigError, match=r"data\.t_seq=not known then, 1\.0 now"):
+        open_data(JuelichOptions(prepared=options.prepared), tmp_path / "unused")
+    options.prepared = str(tmp_path / "raw")
+    with pytest.raises(DataError):
+        open_data(options, tmp_path / "unused")
+
+
+def test_open_prepares_on_the_fly(tmp_path: Path, options: EsimasOptions) -> None:
+    store = open_data(options, tmp_path / "out")
+    assert len(store) == 2
+    assert not (tmp_path / "out" / "faults").exists()
+
+
+def test_a_moved_table_is_the_same_table(tmp_path: Path) -> None:
+    table = "sequence,time,agent,x\n" + "".join(
+        f"s,{0.1 * k},{a},{30 * a + k}\n" for k in range(4) for a in range(2)
+    )
+    (tmp_path / "t.csv").write_text(table)
+    options = TableOptions(domain="traffic", path=str(tmp_path / "t.csv"))
+    prepare(options, tmp_path / "out")
+    options.path, options.prepared = "far/away/t.csv", str(tmp_path / "out")
+    assert len(open_data(options, tmp_path / "unused")) == 1
+    options.path = "other.csv"
+    with pytest.raises(ConfigError, match=r"data\.path=t\.csv then, other\.csv now"):
+        open_data(options, tmp_path / "unused")
+
+
+def test_people_absent_for_a_while_are_left_out(tmp_path: Path) -> None:
+    rows = [
+        f"s,{0.1 * k},{a},{0.1 * k},{a}"
+        for k in range(5)
+        for a in range(3)
+        if not (a == 1 and k == 0)
+    ]
+    (tmp_path / "t.csv").write_text("sequence,time,agent,x,y\n" + "\n".join(rows))
+    options = TableOptions(domain="crowd", path=str(tmp_path / "t.csv"))
+    store = prepare(options, tmp_path / "out")
+    assert store[0].agents == ("0", "2")
+    (absent,) = store.manifest["dropped_agents"]
+    assert absent == {"sequence": "t/s", "agent": "1", "why": "absent at 1 of 5 samples"}
+
+
+def test_absent_vehicle_makes_the_sequence_faulty(tmp_path: Path) -> None:
+    rows = [
+        f"{s},{0.1 * k},{a},{30 * a + k}"
+        for s in "ab"
+        for k in range(5)
+        for a in range(3)
+        if not (s == "b" and a == 1 and k > 2)
+    ]
+    (tmp_path / "t.csv").write_text("sequence,time,agent,x\n" + "\n".join(rows))
+    options = TableOptions(domain="traffic", path=str(tmp_path / "t.csv"), faults=Faults.keep)
+    store = prepare(options, tmp_path / "out")
+    assert [s.name for s in store] == ["t/a"]
+    assert store.manifest["recordings"]["t"]["faulty"] == {"gap_in_time": 1}
+
+
+def test_one_data_set_has_one_sampling_interval(tmp_path: Path) -> None:
+    folder = tmp_path / "raw"
+    options = raw(folder, CLEAN, recording="a")
+    cells = np.empty((1, 1), dtype=object)
+    cells[0, 0] = {"Xarr": CLEAN, "Tarr": 2 * TIME}
+    savemat(folder / "sequence_datab.mat", {"sequences": cells})
+    with pytest.raises(DataError, match=r"a/000 is sampled every 0.2 s, b/000 every 0.4 s"):
+        prepare(options, tmp_path / "out")
+
+
+def test_wrong_options(tmp_path: Path, options: EsimasOptions) -> None:
+    options.domain = "crowd"
+    with pytest.raises(ConfigError, match="domain=crowd needs 2-dimensional positions"):
+        prepare(options, tmp_path / "out")
+    options.domain = "sea"
+    with pytest.raises(ConfigError, match="domain=sea: expected traffic or crowd"):
+        prepare(options, tmp_path / "out")
+    with pytest.raises(ConfigError, match="no reader for DataOptions"):
+        prepare(DataOptions(), tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"path is not set"):
+        prepare(OmegaConf.structured(VehicleTableOptions()), tmp_path / "out")
+
+
+def test_unwritable_folder(tmp_path: Path, options: EsimasOptions) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="cannot be written"):
+        prepare(options, tmp_path / "file" / "out")
+
+
+def test_options_may_come_from_the_configuration(tmp_path: Path, options: EsimasOptions) -> None:
+    config = OmegaConf.structured(options)
+    assert plain(OmegaConf.to_object(config)) == plain(options)  # type: ignore[arg-type]
+    assert len(prepare(config, tmp_path / "out", plots=False)) == 2
+
+
+@pytest.mark.real
+def test_published_recordings(tmp_path: Path, real_data: Path) -> None:
+    options = EsimasOptions(source=str(real_data), faults=Faults.keep)
+    store = prepare(options, tmp_path / "keep", plots=False)
+    assert len(store) == 265
+    assert len(store.manifest["recordings"]) == 10
+    options.faults = Faults.drop
+    clean = prepare(options, tmp_path / "drop", plots=False)
+    for s in clean:  # judged without the checks: nobody goes back, leaps or overlaps
+        step, gap = np.diff(s.x, axis=0), np.diff(s.x, axis=1)
+        assert step.min() > -0.5
+        assert step.max() < 12.5
+        assert gap.min() >= 2

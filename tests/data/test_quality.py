@@ -1,0 +1,236 @@
+"""Faults are found where they were put, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nnode.data.esimas import read_esimas
+from nnode.data.juelich import juelich_files, read_juelich
+from nnode.data.options import JuelichOptions, VehicleTableOptions
+from nnode.data.quality import KINDS, LIMITS, Fault, find_faults, usable
+from nnode.data.sequence import Sequence
+from nnode.data.vehicles import read_vehicles
+from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults
+
+
+def platoon(n: int = 3, k: int = 8, dt: float = 0.2, speed: float = 25.0) -> Sequence:
+    time = 10.0 + dt * np.arange(k)
+    x = 5.0 + speed * (time[:, None] - time[0]) + 30.0 * np.arange(n)
+    return Sequence(name="r/0", recording="r", time=time, x=x[:, :, None])
+
+
+def people(n: int = 4, k: int = 26, dt: float = 0.04) -> Sequence:
+    time = dt * np.arange(k)
+    x = np.empty((k, n, 2))
+    x[:, :, 0] = 1.3 * time[:, None] * (-1.0) ** np.arange(n)
+    x[:, :, 1] = 0.8 * np.arange(n) + 0.5
+    return Sequence(
+        name="r/0", recording="r", time=time, x=x, agents=tuple(f"p{i}" for i in range(n))
+    )
+
+
+def changed(sequence: Sequence, at: tuple, value: object) -> Sequence:
+    x = sequence.x.copy()
+    x[at] = value
+    return replace(sequence, x=x)
+
+
+def kinds(sequence: Sequence, domain: str = "traffic") -> list[str]:
+    return [fault.kind for fault in find_faults(sequence, domain)]  # type: ignore[arg-type]
+
+
+@given(
+    speed=st.floats(0.0, 55.0),
+    noise=st.floats(0.0, 0.2),
+    dt=st.sampled_from([0.04, 0.1, 0.2, 1.0]),
+    seed=st.integers(0, 1000),
+)
+def test_noisy_platoons_have_no_fault(speed: float, noise: float, dt: float, seed: int) -> None:
+    s = platoon(dt=dt, speed=speed)
+    error = np.random.default_rng(seed).uniform(-noise, noise, s.x.shape)
+    assert kinds(replace(s, x=s.x + error)) == []
+
+
+def test_clean_people_have_no_fault() -> None:
+    assert kinds(people(), "crowd") == []
+
+
+def test_zero_row() -> None:
+    s = changed(platoon(), (slice(None), 1), 0.0)
+    (fault,) = find_faults(s, "traffic")
+    assert (fault.kind, fault.agents, fault.time) == ("zero_row", (1,), 10.0)
+
+
+def test_a_car_may_start_at_the_origin() -> None:
+    s = platoon()
+    assert kinds(replace(s, x=s.x - s.x[0, 0])) == []
+
+
+def test_exchange_of_two_cars_is_a_swap() -> None:
+    s = platoon()
+    x = s.x.copy()
+    x[4:, [0, 1]] = x[4:, [1, 0]]
+    (fault,) = find_faults(replace(s, x=x), "traffic")
+    assert (fault.kind, fault.agents) == ("identity_swap", (0, 1))
+    assert fault.time == pytest.approx(s.time[4])
+
+
+def test_shift_of_all_cars_is_a_swap() -> None:
+    # The leader leaves, a new car enters behind: every row goes on with the car ahead.
+    s = platoon()
+    x = s.x.copy()
+    x[5:, 1:] = x[5:, :-1].copy()
+    x[5:, 0] -= 20.0
+    (fault,) = find_faults(replace(s, x=x), "traffic")
+    assert (fault.kind, fault.agents) == ("identity_swap", (0, 1, 2))
+
+
+def test_a_step_no_other_path_explains_is_a_jump() -> None:
+    s = changed(platoon(), (slice(4, None), 2), platoon().x[4:, 2] + 20.0)
+    (fault,) = find_faults(s, "traffic")
+    assert (fault.kind, fault.agents) == ("jump", (2,))
+    assert fault.time == pytest.approx(s.time[4])
+
+
+def test_limit_of_displacement_grows_with_the_interval() -> None:
+    for dt, step, expected in ((0.2, 13.0, ["jump"]), (0.4, 13.0, []), (0.4, 25.0, ["jump"])):
+        s = platoon(n=2, dt=dt)
+        x = s.x.copy()
+        x[5:, 1] += step - 25.0 * dt
+        assert kinds(replace(s, x=x)) == expected
+
+
+@pytest.mark.parametrize(("step", "expected"), [(-0.4, []), (-1.5, ["backward"]), (-3.0, ["jump"])])
+def test_backward(step: float, expected: list[str]) -> None:
+    s = platoon(n=2, speed=5.0)
+    x = s.x.copy()
+    x[4:, 0] += step - 1.0
+    assert kinds(replace(s, x=x)) == expected
+
+
+def test_overtaking() -> None:
+    s = platoon(n=2)
+    x = s.x.copy()
+    x[:, 0, 0] += 6.5 * np.arange(8) - 0.2  # passes between two samples, never within 2 m
+    (fault,) = find_faults(replace(s, x=x), "traffic")
+    assert (fault.kind, fault.agents) == ("overtaking", (0, 1))
+    assert fault.time == pytest.approx(s.time[5])
+
+
+def test_overlap_of_cars() -> None:
+    s = platoon(n=2)
+    near = changed(s, (slice(3, 5), 0), s.x[3:5, 1] - 1.5)
+    faults = [f for f in find_faults(near, "traffic") if f.kind == "overlap"]
+    assert len(faults) == 1
+    assert "1.50 m apart at 2 of 8 samples" in faults[0].detail
+    follow = replace(s, x=np.stack([s.x[:, 1] - 2.1, s.x[:, 1]], axis=1))
+    assert kinds(follow) == []
+
+
+def test_people() -> None:
+    s = people()
+    swap = s.x.copy()
+    swap[10:, [0, 2]] = swap[10:, [2, 0]]
+    (fault,) = find_faults(replace(s, x=swap), "crowd")
+    assert (fault.kind, fault.agents) == ("identity_swap", (0, 2))
+    assert "p0" in fault.detail
+    jump = changed(s, (slice(10, None), 1, 1), 30.0)
+    assert kinds(jump, "crowd") == ["jump"]
+    beside = s.x.copy()
+    beside[:, 2] = beside[:, 0] + [0.0, 0.05]
+    assert kinds(replace(s, x=beside), "crowd") == ["overlap"]
+
+
+def test_duplicates() -> None:
+    s = people()
+    same = replace(s, agents=("a", "b", "a", "c"))
+    (fault,) = find_faults(same, "crowd")
+    assert (fault.kind, fault.agents) == ("duplicate", (0, 2))
+    twin = replace(s, x=s.x[:, [0, 1, 1, 3]])
+    found = find_faults(twin, "crowd")
+    assert [f.kind for f in found] == ["duplicate", "overlap"]
+    assert not usable(twin, found)
+
+
+def test_gaps_and_numbers() -> None:
+    s = platoon()
+    absent = changed(s, (slice(2, 4), 1), np.nan)
+    (fault,) = find_faults(absent, "traffic")
+    assert (fault.kind, fault.agents) == ("gap_in_time", (1,))
+    assert "10.4-10.6 s" in fault.detail
+    assert not usable(absent, [fault])
+    assert kinds(changed(s, (3, 1), np.inf)) == ["non_finite"]
+    assert kinds(changed(people(), (3, 1, 0), np.nan), "crowd") == ["non_finite"]
+    time = s.time.copy()
+    time[5:] += 0.2
+    (fault,) = find_faults(replace(s, time=time), "traffic")
+    assert fault.kind == "gap_in_time"
+    assert fault.time == pytest.approx(time[5])
+    time[2] = np.nan
+    assert kinds(replace(s, time=time)) == ["non_finite"]
+
+
+def test_too_short() -> None:
+    assert kinds(platoon(k=2)) == ["too_short"]
+    assert kinds(platoon(n=1)) == ["too_short"]
+    assert kinds(people(n=1), "crowd") == []
+    single = platoon(k=1)
+    assert not usable(single, find_faults(single, "traffic"))
+    short = platoon(k=2)
+    assert usable(short, find_faults(short, "traffic"))
+
+
+@pytest.mark.real
+def test_motorway_recording_judged_by_eye(real_data: Path) -> None:
+    sequences = read_esimas(real_data / "esimas" / "sequence_data1-1_1.mat")
+    found = {i: {f.kind for f in find_faults(s, "traffic")} for i, s in enumerate(sequences)}
+    # Sequences whose positions fall by 10 to 25 m although all cars drive on.
+    assert [i for i, k in found.items() if "identity_swap" in k] == [0, 11, 15, 18, 32, 33]
+    # Sequences in which two fronts come closer than 2 m, from the raw positions.
+    close = [i for i, s in enumerate(sequences) if np.diff(s.x[:, :, 0], axis=1).min() < 2]
+    assert [i for i, k in found.items() if "overlap" in k] == close
+    (swap,) = [f for f in find_faults(sequences[0], "traffic") if f.kind == "identity_swap"]
+    assert swap.agents == (0, 1, 2)
+    assert "car 0 carries on as car 1" in swap.detail
+
+
+@pytest.mark.real
+def test_padding_of_the_two_car_family(real_data: Path) -> None:
+    first = read_esimas(real_data / "esimas" / "sequence_data_1-1_1.mat")[1]
+    filled = {i for i in range(first.n_agents) if (first.x[:, i] == 0).all()}
+    assert filled == {2, 3, 4, 5, 6}
+    faults = find_faults(first, "traffic")
+    assert {f.agents[0] for f in faults if f.kind == "zero_row"} == filled
+    assert {f.kind for f in faults} == {"zero_row", "duplicate"}
+
+
+@pytest.mark.real
+def test_sound_recordings_are_left_alone(real_data: Path) -> None:
+    options = JuelichOptions(source=str(real_data))
+    for path in juelich_files(options).values():
+        assert not any(find_faults(s, "crowd") for s in read_juelich(path, options))
+    columns: dict[str, str | None] = {"vehicle": "veh", "time": "t", "speed": "v"}
+    table = real_data / "ngsim" / "i80_lanes_1_2.csv"
+    for s in read_vehicles(table, VehicleTableOptions(columns=columns, window=10.0)):
+        assert find_faults(s, "traffic") == []
+
+
+def test_every_kind_has_a_meaning_and_a_mark() -> None:
+    assert set(STYLES) == set(KINDS)
+    assert len({marker for _, marker in STYLES.values()}) == len(KINDS)
+    assert set(LIMITS) == {"traffic", "crowd"}
+
+
+@pytest.mark.parametrize("domain", ["traffic", "crowd"])
+def test_plot(tmp_path: Path, domain: str) -> None:
+    s = platoon() if domain == "traffic" else people()
+    many = [replace(s, name=f"r/{i}") for i in range(MAX_PANELS + 3)]
+    fault = Fault("jump", "", (1,), float(s.time[3]), "")
+    plot_faults(many, {m.name: [fault] for m in many[1:]}, domain, tmp_path / "f.png")  # type: ignore[arg-type]
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")

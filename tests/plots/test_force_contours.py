@@ -1,0 +1,194 @@
+"""Contour plots of forces, and the compact figure of any model."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+from matplotlib.contour import ContourSet
+from torch import Tensor
+
+from nnode.errors import ConfigError
+from nnode.models import (
+    Crowd,
+    InteractionForce,
+    Linear,
+    NetworkForce,
+    NetworkSpeed,
+    Relaxation,
+    SocialForce,
+    Traffic,
+)
+from nnode.plots import crowd_figures, force_contours, force_figure, save
+from nnode.plots.crowd import ENCOUNTERS
+from nnode.plots.interaction import evaluate_force
+
+PAPER = {"A": 0.0044, "k": 34.9539, "kappa": 9.8894}
+
+
+class Spring(InteractionForce):
+    """A force whose contours are known: pair (2 dx + 3 dv), wall -dx."""
+
+    name = "spring"
+    formula = "2 dx + 3 dv"
+    source = "none"
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        return 2 * dx + 3 * dv
+
+    def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
+        return -dx
+
+
+def _network() -> Crowd:
+    return Crowd([Relaxation(), NetworkForce(generator=torch.Generator().manual_seed(1))])
+
+
+def _panels(figure):
+    return [ax for ax in figure.axes if ax.get_title()]
+
+
+def _sets(ax, filled):
+    return [c for c in ax.collections if isinstance(c, ContourSet) and c.filled == filled]
+
+
+@pytest.mark.parametrize("component", [0, 1])
+@pytest.mark.parametrize(("part", "slope", "push"), [("pair", 2, 3), ("wall", -1, 0), (None, 1, 3)])
+def test_lines_lie_where_the_force_has_their_value(component, part, slope, push) -> None:
+    figure = force_contours(Crowd([Spring()]), component, part=part)
+    count = 0
+    for ax, dv in zip(_panels(figure), ENCOUNTERS, strict=True):
+        assert ax.get_xlim() == (-4.0, 4.0)
+        for lines in _sets(ax, filled=False):
+            for level, path in zip(lines.levels, lines.get_paths(), strict=True):
+                place = (level - push * dv[component]) / slope
+                np.testing.assert_allclose(path.vertices[:, component], place, atol=1e-6)
+                assert (lines.linestyles == "dashed") == (level < 0)
+                count += 1
+    assert count > 4
+
+
+@pytest.mark.parametrize("component", [0, 1])
+@pytest.mark.parametrize("system", [Crowd([SocialForce(**PAPER)]), _network()], ids=["sf", "nn"])
+def test_all_panels_share_one_symmetric_scale(system, component) -> None:
+    figure = force_contours(system, component)
+    levels = [tuple(_sets(ax, filled=True)[0].levels) for ax in _panels(figure)]
+    assert len(levels) == 4
+    assert len(set(levels)) == 1
+    np.testing.assert_allclose(levels[0], -np.array(levels[0])[::-1], atol=1e-12)
+    assert len(levels[0]) % 2 == 0  # a neutral colour about zero
+
+
+def test_extents_follow_the_paper() -> None:
+    social, network = Crowd([SocialForce(**PAPER)]), _network()
+    assert _panels(force_contours(social, 0))[0].get_xlim() == (-0.5, 0.5)
+    assert _panels(force_contours(network, 0))[0].get_xlim() == (-4.0, 4.0)
+    assert _panels(force_contours(social, 0, extent=1.5))[3].get_ylim() == (-1.5, 1.5)
+
+
+def test_labels_units_and_velocities() -> None:
+    figure = force_contours(Crowd([SocialForce(**PAPER)]), 1)
+    panels = _panels(figure)
+    assert panels[2].get_xlabel() == "$x_i - x_j$ (m)"
+    assert panels[0].get_ylabel() == "$y_i - y_j$ (m)"
+    for ax, (dv, what) in zip(panels, ENCOUNTERS.items(), strict=True):
+        assert what in ax.get_title()
+        assert f"({dv[0]:g}, {dv[1]:g}) m/s" in ax.get_title()
+    assert (2.0, 0.0) in ENCOUNTERS
+    (bar,) = [ax for ax in figure.axes if ax not in panels]
+    assert "$F_y$ (N)" in bar.get_ylabel()
+    # the repulsion's peak would leave nothing else to see
+    assert "the scale ends below the peak" in figure.get_suptitle()
+
+
+def test_social_force_is_antisymmetric_and_obeys_its_formula() -> None:
+    system = Crowd([SocialForce(**PAPER)]).double()
+    random = np.random.default_rng(0)
+    dx, dv = random.uniform(-0.5, 0.5, (2, 500, 2))
+    force = evaluate_force(system, dx, dv)
+    np.testing.assert_allclose(force, -evaluate_force(system, -dx, -dv), rtol=1e-12)
+    distance = np.hypot(*dx.T)
+    normal = dx / distance[:, None]
+    tangent = np.stack([-normal[:, 1], normal[:, 0]], 1)
+    overlap = np.maximum(0.5 - distance, 0)
+    push = 0.0044 * np.exp((0.5 - distance) / 0.05) + 34.9539 * overlap
+    slide = -9.8894 * overlap * (dv * tangent).sum(1)
+    np.testing.assert_allclose(
+        force, push[:, None] * normal + slide[:, None] * tangent, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_a_network_is_not_antisymmetric() -> None:
+    dx, dv = np.array([1.0, 0.5]), np.array([2.0, 0.0])
+    force = evaluate_force(_network(), dx, dv)
+    assert not np.allclose(force, -evaluate_force(_network(), -dx, -dv), rtol=0.01)
+
+
+def test_parts_without_walls() -> None:
+    system = Crowd([NetworkForce(walls=False)])
+    dx = np.ones((3, 2))
+    np.testing.assert_array_equal(
+        evaluate_force(system, dx, dx), evaluate_force(system, dx, dx, "pair")
+    )
+    with pytest.raises(ConfigError, match="part=wall"):
+        force_contours(system, 0, part="wall")
+    assert set(crowd_figures(system)) == {"force_x", "force_y", "settings"}
+
+
+def test_crowd_figures() -> None:
+    assert set(crowd_figures(Crowd([SocialForce(**PAPER)]))) == {"force_x", "force_y", "settings"}
+    assert set(crowd_figures(_network())) == {
+        "force_x", "force_y", "settings",
+        "force_x_pair", "force_x_wall", "force_y_pair", "force_y_wall",
+    }  # fmt: skip
+    assert plt.get_fignums() == []
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [0.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("kind", ["sf", "nn"])
+def test_degenerate_models_are_drawn(kind: str, value: float, tmp_path) -> None:
+    system = Crowd([SocialForce(**PAPER)]) if kind == "sf" else _network()
+    with torch.no_grad():
+        for parameter in system.parameters():
+            parameter.fill_(value)
+    figure = force_figure(system)
+    assert save(figure, tmp_path / "a.png").stat().st_size > 0
+    assert ("not finite" in figure.get_suptitle()) == (value != 0.0)
+    for ax in _panels(figure):
+        assert np.isfinite(_sets(ax, filled=True)[0].levels).all()
+
+
+def test_bad_options_are_named() -> None:
+    system = Crowd([SocialForce(**PAPER)])
+    with pytest.raises(ConfigError, match=r"component must be 0 .*got 2"):
+        force_contours(system, 2)
+    for extent in (0.0, -1.0, float("nan")):
+        with pytest.raises(ConfigError, match="extent"):
+            force_contours(system, 0, extent=extent)
+    with pytest.raises(ConfigError, match="part must be sum, pair or wall, got 'pairs'"):
+        force_contours(system, 0, part="pairs")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"crowd model.*relaxation"):
+        force_contours(Crowd([Relaxation()]), 0)
+    with pytest.raises(ConfigError, match=r"found a traffic model.*lin"):
+        force_contours(Traffic([Linear()]), 0)
+
+
+@pytest.mark.parametrize(
+    ("system", "titles"),
+    [
+        (Traffic([NetworkSpeed(4)]), 0),
+        (Crowd([SocialForce(**PAPER)]), 2),
+        (_network(), 2),
+    ],
+    ids=["traffic", "sf", "nn"],
+)
+def test_force_figure_of_every_domain(system, titles, tmp_path) -> None:
+    figure = force_figure(system)
+    save(figure, tmp_path / "a.png")
+    assert len(_panels(figure)) == titles
+    labels = [f"{ax.get_xlabel()} {ax.get_ylabel()}" for ax in figure.axes]
+    assert all("(m" in label or "(N)" in label for label in labels)
+    for ax in _panels(figure):
+        assert "(2, 0) m/s" in ax.get_title()

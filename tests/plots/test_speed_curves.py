@@ -1,0 +1,192 @@
+"""Speed over gap."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.io import loadmat
+
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+from nnode.models import (
+    Crowd,
+    Linear,
+    Logarithmic,
+    NetworkSpeed,
+    Relaxation,
+    System,
+    Traffic,
+)
+from nnode.plots import curve_table, measured_gaps, save, speed_curves, traffic_figures
+from nnode.plots.traffic import SHOWN
+
+
+def _models() -> dict[str, System]:
+    generator = torch.Generator().manual_seed(0)
+    return {
+        "lin": Traffic([Linear(22.0, 4.69)]).double(),
+        "log": Traffic([Logarithmic(21.0, 8.43)]).double(),
+        "n4": Traffic([NetworkSpeed(4, 20.0, generator=generator)]),
+    }
+
+
+def _line(figure, gid):
+    (found,) = [line for line in figure.axes[0].get_lines() if line.get_gid() == gid]
+    return found
+
+
+def _text(figure):
+    """Every label and note of a figure."""
+    words = []
+    for ax in figure.axes:
+        words += [ax.get_xlabel(), ax.get_ylabel(), ax.get_title(), ax.get_title("left")]
+        words += [child.get_ylabel() for child in ax.child_axes]
+    return words
+
+
+def test_table_is_the_formula() -> None:
+    gaps = np.array([3.0, 8.43, 20.0, 47.5])
+    table = curve_table(_models(), gaps)
+    assert table.index.name == "gap"
+    assert list(table) == ["lin", "log", "n4"]
+    np.testing.assert_allclose(table.index, gaps)
+    for gap, row in table.iterrows():
+        assert row["lin"] == pytest.approx(22.0 * (1 - 4.69 / gap), rel=1e-6)
+        assert row["log"] == pytest.approx(21.0 * math.log(gap / 8.43), rel=1e-6, abs=1e-5)
+    assert table["log"].iloc[1] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_curves_are_the_models() -> None:
+    figure = speed_curves(_models(), span=(4.0, 40.0))
+    lin, log = _line(figure, "curve:lin"), _line(figure, "curve:log")
+    gap = lin.get_xdata()
+    assert (gap[0], gap[-1]) == (4.0, 40.0)
+    np.testing.assert_allclose(lin.get_ydata(), 22.0 * (1 - 4.69 / gap), rtol=1e-6)
+    np.testing.assert_allclose(log.get_ydata(), 21.0 * np.log(gap / 8.43), rtol=1e-5, atol=1e-5)
+    for name, v0 in (("lin", 22.0), ("log", 21.0), ("n4", 20.0)):
+        np.testing.assert_allclose(_line(figure, f"v0:{name}").get_ydata(), v0)
+
+
+def test_axes_have_units_and_the_right_one_is_in_kmh() -> None:
+    figure = speed_curves(_models(), np.linspace(5, 40, 100))
+    assert {"speed W (m/s)", "speed W (km/h)", "gap (m)"} <= set(_text(figure))
+    ax = figure.axes[0]
+    figure.draw_without_rendering()
+    np.testing.assert_allclose(ax.child_axes[0].get_ylim(), np.multiply(ax.get_ylim(), 3.6))
+
+
+def test_curves_fade_outside_the_percentiles_of_the_gaps() -> None:
+    gaps = np.linspace(10.0, 30.0, 2001)  # percentiles 1 and 99: 10.2 m and 29.8 m
+    figure = speed_curves(_models(), gaps)
+    solid, pale = _line(figure, "curve:lin"), _line(figure, "unsupported:lin")
+    gap = solid.get_xdata()
+    inside = np.isfinite(solid.get_ydata())
+    np.testing.assert_array_equal(inside, (gap >= 10.2) & (gap <= 29.8))
+    both = np.where(inside, solid.get_ydata(), pale.get_ydata())
+    np.testing.assert_allclose(both, 22.0 * (1 - 4.69 / gap), rtol=1e-6)
+    assert pale.get_alpha() < 0.5
+    heights = [bar.get_height() for bar in figure.axes[1].containers[0]]
+    assert sum(heights) == len(gaps)
+    assert not any("outside" in word for word in _text(figure))
+
+
+def test_gaps_outside_the_figure_are_counted() -> None:
+    figure = speed_curves(_models(), np.array([-3.0, 10.0, 20.0, 30.0, 1e4]), span=(2.0, 50.0))
+    assert sum(bar.get_height() for bar in figure.axes[1].containers[0]) == 3
+    assert any("40.0% of the gaps lie outside" in word for word in _text(figure))
+    assert figure.axes[0].get_xlim() == (2.0, 50.0)
+
+
+def test_steep_curves_are_cut_and_the_figure_says_so() -> None:
+    steep = speed_curves(_models(), span=(0.01, 50.0))
+    assert steep.axes[0].get_ylim()[0] == SHOWN[0]
+    assert any("below −20 m/s" in word for word in _text(steep))
+    mild = speed_curves({"lin": _models()["lin"]}, span=(5.0, 50.0))
+    assert not any("cut" in word for word in _text(mild))
+    fast = speed_curves({"lin": Traffic([Linear(400.0, 4.0)])}, span=(5.0, 50.0))
+    assert fast.axes[0].get_ylim()[1] == SHOWN[1]
+    assert any("above 60 m/s" in word for word in _text(fast))
+
+
+def test_many_checkpoints_share_a_short_legend() -> None:
+    models: dict[str, System] = {f"step {i}": Traffic([Linear(20.0 + i / 5)]) for i in range(50)}
+    figure = speed_curves(models, np.linspace(5, 40, 100))
+    lines = [ln for ln in figure.axes[0].get_lines() if str(ln.get_gid()).startswith("curve:")]
+    assert len(lines) == 50
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert len(legend) <= 5
+    assert {"step 0", "step 49"} <= set(legend)
+    grey = [np.dot(line.get_color()[:3], [0.2126, 0.7152, 0.0722]) for line in lines]
+    assert (np.diff(grey) < 0).all()
+
+
+def test_a_measured_leader_has_no_v0() -> None:
+    figure = speed_curves({"lin": Traffic([Linear()], leader="measured")})
+    assert not any(str(ln.get_gid()).startswith("v0") for ln in figure.axes[0].get_lines())
+
+
+def _zero() -> System:
+    system = Traffic([NetworkSpeed(4, 0.0)])
+    with torch.no_grad():
+        for weight in system.parameters():
+            weight.zero_()
+    return system
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        _zero(),
+        Traffic([Linear(0.0, 5.0)]),
+        Traffic([Logarithmic(0.0, 5.0)]),
+        Traffic([Linear(float("nan"), 5.0)]),
+        Traffic([Linear(float("inf"), 5.0)]),
+    ],
+    ids=["zero weights", "lin v0=0", "log v0=0", "nan", "inf"],
+)
+@pytest.mark.filterwarnings("error")
+def test_degenerate_models_are_drawn(system: System, tmp_path: Path) -> None:
+    figure = speed_curves({"m": system}, np.full(7, 12.0))
+    assert np.isfinite(figure.axes[0].get_ylim()).all()
+    assert save(figure, tmp_path / "a.png").stat().st_size > 0
+    broken = not torch.isfinite(torch.cat([p.ravel() for p in system.parameters()])).all()
+    assert any("not finite everywhere: m" in word for word in _text(figure)) == broken
+
+
+def test_bad_input_is_named() -> None:
+    models = _models()
+    with pytest.raises(ConfigError, match="at least one model"):
+        speed_curves({})
+    with pytest.raises(ConfigError, match=r"walkers: .*found a crowd model.*relaxation"):
+        speed_curves({"walkers": Crowd([Relaxation()])})
+    for span in ((0.0, 5.0), (5.0, 5.0), (5.0, float("nan"))):
+        with pytest.raises(ConfigError, match="span"):
+            speed_curves(models, span=span)
+    for gaps in (np.empty(0), np.array([1.0, np.nan]), np.ones((2, 2))):
+        with pytest.raises(DataError, match="gaps must be a vector"):
+            speed_curves(models, gaps)
+
+
+def test_measured_gaps() -> None:
+    x = np.array([[0.0, 5.0, 30.0], [1.0, 7.0, 33.0]])[..., None]
+    sequence = Sequence(name="s", recording="r", time=np.array([0.0, 0.2]), x=x)
+    assert sorted(measured_gaps([sequence, sequence])) == [5, 5, 6, 6, 25, 25, 26, 26]
+    plane = Sequence(name="p", recording="r", time=np.array([0.0]), x=np.zeros((1, 2, 2)))
+    with pytest.raises(DataError, match="sequence p"):
+        measured_gaps([plane])
+
+
+@pytest.mark.real
+def test_real_gaps_are_all_accounted_for(real_data: Path) -> None:
+    gaps = []
+    for path in sorted((real_data / "esimas").glob("sequence_data1-1_*.mat")):
+        for item in np.atleast_1d(loadmat(path, simplify_cells=True)["sequences"]):
+            gaps.append(np.diff(item["Xarr"], axis=0).ravel())
+    gap = np.concatenate(gaps)
+    figure = traffic_figures(_models(), gap)["speed"]
+    shown = sum(bar.get_height() for bar in figure.axes[1].containers[0])
+    assert 0 < shown == ((gap >= 2.0) & (gap <= 50.0)).sum() < len(gap)
