@@ -12,7 +12,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from nnode.calibrate.options import SolverOptions, TrainerOptions
+from nnode.calibrate.options import Precision, SolverOptions, TrainerOptions
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
@@ -72,11 +72,30 @@ class PlotForcesConfig:
     extent: float | None = None  # m, of contours; null suits the model
 
 
+@dataclass
+class BenchmarkOptions:
+    """What ``scripts/benchmark.py`` times, see :mod:`nnode.app.benchmark`."""
+
+    shapes: list[str] = field(default_factory=lambda: ["paper", "stress", "crowd", "scale"])
+    engines: list[str] | None = None  # null times all that cover a problem
+    repeats: int = 5
+    restarts: int = 16  # of the ensemble
+    dtype: Precision = Precision.float32
+
+
+@dataclass
+class BenchmarkConfig:
+    """``scripts/benchmark.py``: all engines on the same problems."""
+
+    benchmark: BenchmarkOptions = field(default_factory=BenchmarkOptions)
+
+
 SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
     (None, "evaluate_schema"): EvaluateConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
+    (None, "benchmark_schema"): BenchmarkConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),

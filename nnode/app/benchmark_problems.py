@@ -1,0 +1,140 @@
+"""The problems that the benchmark poses, the same for every engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.models import Crowd, NetworkForce, Relaxation, SocialForce, System, Traffic
+from nnode.models.build import MODELS
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The size of a problem.
+
+    Attributes:
+        domain: ``traffic`` or ``crowd``.
+        models: the models that are timed on it.
+        sequences, agents: how many simulations, of how many vehicles or people.
+        samples: measured samples after the first one.
+        per: Euler steps in a sampling interval.
+        step: s.
+    """
+
+    domain: str
+    models: tuple[str, ...]
+    sequences: int
+    agents: int
+    samples: int
+    per: int
+    step: float
+
+    @property
+    def steps(self) -> int:
+        """Euler steps of a simulation."""
+        return self.samples * self.per
+
+
+_LAWS = ("lin", "log", "n4")
+SHAPES: dict[str, tuple[Shape, ...]] = {
+    # the recordings of the paper: sampled at 5 frames/s, 1.2 s
+    "paper": (Shape("traffic", _LAWS, 34, 4, 6, 100, 0.002),),
+    "stress": (Shape("traffic", ("n4",), 100, 10, 50, 100, 0.002),),
+    "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
+    "scale": tuple(
+        Shape("crowd", ("sf",), 1, people, 25, 1, 0.04) for people in (500, 1000, 2000, 5000, 10000)
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A model, its data, and how finely it is solved."""
+
+    shape: Shape
+    model: str
+    system: System
+    batch: Batch
+
+    @property
+    def label(self) -> str:
+        """One line for a table."""
+        shape = self.shape
+        who = "cars" if shape.domain == "traffic" else "people"
+        return (
+            f"{self.model}: {shape.sequences} sequences, {shape.agents} {who}, "
+            f"{shape.steps} steps of {shape.step:g} s"
+        )
+
+
+def _platoons(shape: Shape, draw: np.random.Generator) -> list[Sequence]:
+    t = shape.per * shape.step * np.arange(shape.samples + 1)
+    found = []
+    for number in range(shape.sequences):
+        x0 = np.cumsum(draw.uniform(10, 30, shape.agents))
+        x = x0 + 15.0 * t[:, None]
+        x[1:] += 0.2 * draw.standard_normal(x[1:].shape)
+        name = f"platoon/{number}"
+        found.append(Sequence(name=name, recording="made", time=t, x=x[:, :, None]))
+    return found
+
+
+def _people(shape: Shape, draw: np.random.Generator) -> list[Sequence]:
+    t = shape.per * shape.step * np.arange(shape.samples + 1)
+    # one per square metre: a corridor of 2 walls of 10 m, or a square without walls
+    alone = shape.sequences == 1
+    long = float(np.ceil(shape.agents**0.5)) if alone else 10.0
+    wide = long if alone else shape.agents / long
+    columns = int(np.ceil((shape.agents * long / wide) ** 0.5))
+    place = np.arange(shape.agents)
+    cell = np.stack([place % columns, place // columns], 1) + 0.5
+    grid = cell * np.array([long / columns, wide / np.ceil(shape.agents / columns)])
+    walls = np.array([[0.0, 0.0, long, 0.0], [long, wide, 0.0, wide]])
+    found = []
+    for number in range(shape.sequences):
+        x0 = grid + draw.uniform(-0.2, 0.2, grid.shape)
+        v = np.array([1.3, 0.0]) + 0.1 * draw.standard_normal(grid.shape)
+        x = x0 + t[:, None, None] * v
+        found.append(
+            Sequence(
+                name=f"crowd/{number}",
+                recording="made",
+                time=t,
+                x=x,
+                v=np.broadcast_to(v, x.shape),
+                destination=x0 + np.array([20.0, 0.0]),
+                walls=None if alone else walls,
+            )
+        )
+    return found
+
+
+def _system(model: str) -> System:
+    generator = torch.Generator().manual_seed(1)
+    if model == "sf":
+        return Crowd([Relaxation(), SocialForce(5.0, 30.0, 10.0, B=0.1)])
+    if model == "nn":
+        return Crowd([Relaxation(), NetworkForce(4, generator=generator)])
+    if model.startswith("n"):
+        term = "network_speed"
+        extra: dict[str, Any] = {"hidden": int(model[1:]), "box": None}
+    else:
+        term, extra = model, {"L": 4.0, "L_min": 2.0}
+    system = MODELS[term]({"v0": 18.0, "leader": "constant", **extra}, generator)
+    assert isinstance(system, Traffic)
+    return system
+
+
+def pose(shape: Shape, model: str, dtype: torch.dtype) -> Problem:
+    """The problem of one shape and model, the same numbers at every call and precision."""
+    draw = np.random.default_rng(shape.sequences + shape.agents)
+    items = (_platoons if shape.domain == "traffic" else _people)(shape, draw)
+    # rounded first, so that float32 and float64 pose the same problem
+    batch = collate(items).to(dtype=torch.float32).to(dtype=dtype)
+    system = _system(model).to(torch.float32).to(dtype)
+    return Problem(shape, model, system, batch)

@@ -1,0 +1,144 @@
+"""The fused solver: all steps of a simulation, and its gradient, in one compiled call."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from contextlib import suppress
+from types import ModuleType
+
+import torch
+from torch import Tensor, nn
+
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError
+from nnode.models.system import System
+from nnode.solvers.base import Trajectory, check_finite, substeps
+from nnode.solvers.fused import fallback, traffic
+
+crowd: ModuleType | None = None
+with suppress(ImportError):
+    from nnode.solvers.fused import crowd  # type: ignore[no-redef]
+
+
+class FusedSolver:
+    """Euler's method and the exact gradient of the discrete scheme, in compiled code.
+
+    States equal those of ``TorchdiffeqSolver("euler")`` up to rounding; in float32 they are
+    closer to the float64 ones, because the steps are added with compensation. The gradient is
+    that of ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint,
+    from which it differs by O(dt).
+
+    Follow-the-leader laws that :mod:`nnode.solvers.fused.laws` knows and the crowd models
+    run compiled. Any other model goes through :mod:`nnode.solvers.fused.fallback`: the same
+    gradient, at the speed of PyTorch.
+
+    The first call for a law compiles (seconds) and keeps the result in the user's cache
+    folder, or in NNODE_CACHE where this environment variable is set.
+
+    Args:
+        dt: step, s; None takes the domain's default, as TorchdiffeqSolver.
+        threads: at most so many threads compute blocks of simulations.
+
+    Raises:
+        ConfigError: fewer than one thread, or a step that does not divide.
+    """
+
+    def __init__(self, dt: float | None = None, threads: int = 1) -> None:
+        if threads < 1:
+            raise ConfigError(f"solver.threads={threads} must be a whole number of at least 1")
+        self.dt, self.threads = dt, threads
+
+    def __call__(self, system: System, batch: Batch) -> Trajectory:
+        """Simulate from the first measured state, at the batch's sampling times.
+
+        Raises:
+            DataError: the batch is of another domain, or has no sampling interval.
+            SimulationError: a simulated state is not a finite number.
+        """
+        n = self._substeps(system, batch)
+        if traffic.supports(system, batch):
+            y = traffic.simulate(system, batch, n, self.threads)[:, 0]
+            found = Trajectory(*system.observe(y, batch))
+        else:
+            found = self._other(system, batch, n, list(system.parameters()))
+        return check_finite(found, batch)
+
+    def ensemble(
+        self, system: System, parameters: Mapping[str, Tensor], batch: Batch
+    ) -> Trajectory:
+        """Simulate R runs with parameters of their own, side by side.
+
+        A run that blows up keeps its states that are not finite; the others do not notice.
+
+        Args:
+            parameters: by their names in ``system.named_parameters()``, each with a leading
+                axis of R runs; the trajectory can be differentiated with respect to them.
+                Parameters that are missing are the system's own in all runs.
+
+        Returns:
+            x and v of shape ``(K, R, B, N, D)``.
+
+        Raises:
+            ConfigError: an unknown name, or shapes that do not fit.
+            DataError: as in a single run.
+        """
+        n = self._substeps(system, batch)
+        stacked = _stack(system, parameters)
+        if traffic.supports(system, batch):
+            y = traffic.simulate(system, batch, n, self.threads, stacked)
+            runs = [system.observe(y[:, r], batch)[0] for r in range(y.shape[1])]
+            measured = getattr(system, "leader", "") == "measured"
+            return Trajectory(torch.stack(runs, 1) if measured else y, None)
+        found = []
+        for r in range(len(next(iter(stacked.values())))):
+            own = {name: value[r] for name, value in stacked.items()}
+            found.append(self._other(_replaced(system, own), batch, n, list(own.values())))
+        x = torch.stack([run.x for run in found], 1)
+        speeds = [run.v for run in found if run.v is not None]
+        return Trajectory(x, torch.stack(speeds, 1) if speeds else None)
+
+    def _substeps(self, system: System, batch: Batch) -> int:
+        if batch.x.shape[-1] != system.dim:
+            system.scene(batch)  # says so
+        return substeps(batch.dt, self.dt, system.domain)
+
+    def _other(self, system: System, batch: Batch, n: int, parameters: list[Tensor]) -> Trajectory:
+        if crowd is not None and crowd.supports(system):
+            return Trajectory(*crowd.simulate(system, batch, n, self.threads))
+        y = fallback.simulate(system, batch, n, parameters)
+        return Trajectory(*system.observe(y, batch))
+
+
+def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """All parameters of the system with a leading axis of runs."""
+    own = dict(system.named_parameters())
+    unknown = sorted(set(parameters) - set(own))
+    if unknown or not parameters:
+        raise ConfigError(
+            f"an ensemble needs parameters of the model, found {unknown or 'none'}; the model "
+            f"has: {', '.join(own)}"
+        )
+    runs = {len(value) if value.ndim else 0 for value in parameters.values()}
+    for name, value in parameters.items():
+        if len(runs) > 1 or value.shape[1:] != own[name].shape or 0 in runs:
+            raise ConfigError(
+                f"{name} of an ensemble must have shape (R, {', '.join(map(str, own[name].shape))})"
+                f" with the same R >= 1 for all parameters, found {tuple(value.shape)}"
+            )
+    number = runs.pop()
+    return {
+        name: parameters[name] if name in parameters else value.expand(number, *value.shape)
+        for name, value in own.items()
+    }
+
+
+def _replaced(system: System, parameters: Mapping[str, Tensor]) -> System:
+    """A copy of the system that computes with other tensors in place of its parameters."""
+    other = copy.deepcopy(system)
+    for name, value in parameters.items():
+        owner, _, leaf = name.rpartition(".")
+        module: nn.Module = other.get_submodule(owner)
+        delattr(module, leaf)
+        setattr(module, leaf, value)
+    return other

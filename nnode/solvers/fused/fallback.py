@@ -1,0 +1,174 @@
+"""Exact discrete gradients of any model, for terms that have no compiled kernel.
+
+The states are computed once, without a graph. Backwards, the right-hand side is evaluated for
+many steps in one batched call; its Jacobian comes row by row, each row for all these steps and
+simulations at once; what is left per step is a small matrix product. Where the Jacobian would
+be larger than worth it (a crowd), each step is differentiated by itself instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nnode.data.sequence import Batch
+from nnode.models.system import System, Traffic
+from nnode.models.term import State
+
+#: Jacobians of one batched call may hold so many numbers.
+_ROOM = 16_000_000
+#: Largest Jacobian of one step, in numbers, that pays.
+_WORTH = 100_000
+
+
+class _Problem:
+    """The right-hand side per step, and what else does not change."""
+
+    def __init__(self, system: System, batch: Batch, substeps: int) -> None:
+        self.system, self.scene = system, system.scene(batch)
+        self.dt, self.per = batch.dt / substeps, substeps
+        self.samples = batch.n_samples
+        self.steps = substeps * (batch.n_samples - 1)
+        last = batch.valid.any(-1).sum(0) - 1
+        self.end = substeps * last[:, None, None]
+        self.ragged = bool((last < batch.n_samples - 1).any())
+        self.measured = isinstance(system, Traffic) and system.leader == "measured"
+
+    def rate(self, step: Tensor, y: Tensor) -> Tensor:
+        """``(B, N, order * D)``: change of ``y`` in one step."""
+        rate: Tensor = self.dt * self.system(step * self.dt, y, self.scene)
+        # as in the torchdiffeq solver: a sequence that has ended stands still
+        return rate.where(step <= self.end, 0.0) if self.ragged else rate
+
+    def rates(self, steps: Tensor, y: Tensor) -> Tensor:
+        """The same for many steps in one call: ``(S,)`` and ``(S, B, N, order * D)``."""
+        if not self.measured:
+            return torch.func.vmap(self.rate)(steps, y)
+        lead = self.scene.leader[..., None]
+        places = torch.stack([self.scene.measured_at(step * self.dt) for step in steps])
+        x = torch.where(lead, places, y)
+
+        def one(step: Tensor, x: Tensor) -> Tensor:
+            rate = self.dt * self.system.acceleration(State(step * self.dt, x, None, self.scene))
+            rate = rate.masked_fill(lead, 0.0)
+            return rate.where(step <= self.end, 0.0) if self.ragged else rate
+
+        return torch.func.vmap(one)(steps, x)
+
+
+class _Simulate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, problem: _Problem, y0: Tensor, *parameters: Tensor) -> Tensor:
+        keep = any(ctx.needs_input_grad)
+        steps = torch.arange(problem.steps + 1, dtype=y0.dtype, device=y0.device)
+        y = y0.detach().clone()
+        states = y.new_empty(problem.steps if keep else 0, *y.shape)
+        out = y.new_empty(problem.samples, *y.shape)
+        out[0] = y
+        for s in range(problem.steps):
+            if keep:
+                states[s] = y
+            y = y + problem.rate(steps[s], y)
+            if (s + 1) % problem.per == 0:
+                out[(s + 1) // problem.per] = y
+        # refuses a backward pass after the parameters have been changed in place
+        ctx.save_for_backward(steps, states, *parameters)
+        ctx.problem = problem
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        problem: _Problem = ctx.problem
+        steps, states, *parameters = ctx.saved_tensors
+        wanted = [p for p, need in zip(parameters, ctx.needs_input_grad[2:], strict=True) if need]
+        totals = [torch.zeros_like(p) for p in wanted]
+        adjoint = torch.zeros_like(grads[0][0])
+        _, simulations, agents, width = states.shape
+        row = simulations * (agents * width) ** 2
+        chunk = max(1, _ROOM // max(row, 1)) if row <= _WORTH else 1
+        high = problem.steps
+        while high > 0:
+            low = max(0, high - chunk)
+            adjoint = _pull(
+                problem, steps[low:high], states[low:high], low, grads[0], adjoint, wanted, totals
+            )
+            high = low
+        found = iter(totals)
+        shares = [next(found) if need else None for need in ctx.needs_input_grad[2:]]
+        return None, adjoint + grads[0][0], *shares
+
+
+def _pull(
+    problem: _Problem,
+    steps: Tensor,
+    states: Tensor,
+    low: int,
+    grad_out: Tensor,
+    adjoint: Tensor,
+    wanted: Sequence[Tensor],
+    totals: Sequence[Tensor],
+) -> Tensor:
+    """Adjoint before the steps ``low`` ...; adds the parameters' gradients to ``totals``."""
+
+    def arrived(s: int, adjoint: Tensor) -> Tensor:
+        """The adjoint after step s, with what is observed there."""
+        end = s + 1
+        return adjoint + grad_out[end // problem.per] if end % problem.per == 0 else adjoint
+
+    with torch.enable_grad():
+        y = states.detach().requires_grad_()
+        alone = len(states) == 1
+        rate = problem.rate(steps[0], y[0])[None] if alone else problem.rates(steps, y)
+    if alone:
+        weights = arrived(low, adjoint)[None]
+        inputs = [y, *wanted]
+        grad_y, *shares = torch.autograd.grad(
+            rate, inputs, weights, allow_unused=True, materialize_grads=True
+        )
+        adjoint = weights[0] + grad_y[0]
+    else:
+        count, simulations, agents, width = y.shape
+        size = agents * width
+        one = torch.zeros_like(rate)
+        rows: list[Tensor] = []
+        for i in range(agents):
+            for c in range(width):
+                one[:, :, i, c] = 1
+                rows += torch.autograd.grad(rate, y, one, retain_graph=True)
+                one[:, :, i, c] = 0
+        jacobian = torch.stack(rows, -1).reshape(count, simulations, size, size)
+        weights = torch.empty_like(states)
+        for s in range(count - 1, -1, -1):
+            weights[s] = arrived(low + s, adjoint)
+            change = torch.bmm(jacobian[s], weights[s].reshape(simulations, size, 1))
+            adjoint = weights[s] + change.reshape(simulations, agents, width)
+        shares = list(
+            torch.autograd.grad(rate, wanted, weights, allow_unused=True, materialize_grads=True)
+            if wanted
+            else ()
+        )
+    for total, share in zip(totals, shares, strict=True):
+        total += share
+    return adjoint
+
+
+def simulate(system: System, batch: Batch, substeps: int, parameters: Sequence[Tensor]) -> Tensor:
+    """Simulate any model with Euler's method; the gradient is that of the discrete scheme.
+
+    Terms must be written in operations that ``torch.func.vmap`` knows.
+
+    Args:
+        substeps: Euler steps in a sampling interval.
+        parameters: the tensors that the system computes with and that want a gradient.
+
+    Returns:
+        ``(K, B, N, order * D)`` states at the samples.
+    """
+    problem = _Problem(system, batch, substeps)
+    y: Tensor = _Simulate.apply(problem, system.initial(batch), *parameters)
+    return y

@@ -1,0 +1,34 @@
+"""What the tests of the fused solver compare: a trajectory and all its gradients."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nnode.calibrate.cost import sequence_costs
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.models import System
+from nnode.solvers import Solver, Trajectory
+
+
+def single(items: list[Sequence]) -> Batch:
+    """A batch whose numbers are float32 numbers, in float64: the same problem in both."""
+    return collate(items).to(dtype=torch.float32).to(dtype=torch.float64)
+
+
+def gradient(model: System, solver: Solver, batch: Batch) -> tuple[Trajectory, Tensor]:
+    """A trajectory, and the gradient of the summed costs by all parameters and the start."""
+    model.zero_grad()
+    x = batch.x.clone().requires_grad_(getattr(model, "leader", "") != "measured")
+    moving = Batch(**{**vars(batch), "x": x})
+    found = solver(model, moving)
+    # the measured positions of the cost carry no gradient, the first ones of the start do
+    sequence_costs(found, batch).sum().backward()
+    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
+    parts += [] if x.grad is None else [x.grad[0]]
+    return found, torch.cat([part.flatten() for part in parts]).detach()
+
+
+def difference(found: Tensor, exact: Tensor) -> float:
+    """Norm of the difference relative to the norm."""
+    return float((found.double() - exact.double()).norm() / exact.double().norm())

@@ -1,0 +1,158 @@
+"""Compiled code: vector instructions, laws from elsewhere, and what is kept between processes."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from nnode.errors import ConfigError
+from nnode.models import Linear, Logarithmic, NetworkSpeed, Traffic
+from nnode.solvers import FusedSolver, TorchdiffeqSolver
+from nnode.solvers.fused import _generate, laws, traffic
+from tests.solvers.fused import saturation
+from tests.solvers.fused.compare import difference, gradient, single
+
+#: Divisions of several numbers at once, by processor.
+PACKED = {
+    "x86_64": r"\sv?divp[sd]\s",
+    "AMD64": r"\sv?divp[sd]\s",
+    "aarch64": r"\sfdiv(\.[24][sd])?\s+v",
+    "arm64": r"\sfdiv(\.[24][sd])?\s+v",
+}
+
+
+@pytest.fixture
+def fresh(tmp_path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
+    """An empty cache, and modules loaded from it."""
+    monkeypatch.setenv("NNODE_CACHE", str(tmp_path))
+    plain = _generate.compiled.__wrapped__
+    monkeypatch.setattr(traffic, "compiled", plain)
+    return Path(tmp_path)
+
+
+@pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
+@pytest.mark.parametrize("law", [Linear, Logarithmic, NetworkSpeed])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_loops_are_vector_code(law, dtype, ragged, fresh, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    # losing this makes everything ten times slower and nothing else would tell
+    modules = []
+    load = traffic.compiled
+
+    def remember(kernel: laws.LawKernel) -> object:
+        modules.append(load(kernel))
+        return modules[-1]
+
+    monkeypatch.setattr(traffic, "compiled", remember)
+    batch = single(ragged).to(dtype=dtype)
+    gradient(Traffic([law()]).to(dtype), FusedSolver(0.1), batch)
+    # every law divides in its derivatives, in the loops of the first and of further shares
+    function = modules[-1].backward
+    (signature,) = function.signatures
+    text = function.inspect_asm(signature)
+    assert len(re.findall(PACKED[platform.machine()], text)) >= 2
+
+
+def test_the_guard_sees_scalar_code() -> None:
+    from numba import njit
+
+    @njit(error_model="numpy", forceinline=False)
+    def scalar(x: float) -> float:
+        total = 1.0
+        for _ in range(10):
+            total = x / (1.0 + total)
+        return total
+
+    scalar(2.0)
+    text = scalar.inspect_asm(scalar.signatures[0])
+    assert "div" in text
+    assert not re.findall(PACKED.get(platform.machine(), "^$"), text)
+
+
+def test_a_law_from_elsewhere(ragged, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(laws, "_KERNELS", dict(laws._KERNELS))
+    batch, model = single(ragged), Traffic([saturation.Saturation()])
+    assert not traffic.supports(model, batch)
+    laws.register(saturation.Saturation, saturation.share, saturation.pull, saturation.pack, size=2)
+    assert traffic.supports(model, batch)
+    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
+    found, own = gradient(model, FusedSolver(0.02), batch)
+    torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-12)
+    assert difference(own, wanted) < 1e-10
+
+
+def test_functions_must_be_importable() -> None:
+    def local(gap: float, v0: float) -> float:
+        return v0
+
+    with pytest.raises(ValueError, match="cannot be imported by name"):
+        laws.register(saturation.Saturation, local, saturation.pull, saturation.pack, 2)
+    with pytest.raises(ValueError, match="at least one parameter"):
+        laws.register(saturation.Saturation, saturation.share, saturation.pull, saturation.pack, 0)
+
+
+def test_an_edited_law_gets_a_new_name(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    file = tmp_path / "edited_law.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = Path(saturation.__file__).read_text(encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
+    module = importlib.import_module("edited_law")
+    kernel = laws.LawKernel(module.share, module.pull, module.pack, 2)
+    source = _generate.source(kernel)
+    before = _generate._digest(source, kernel)
+    assert before == _generate._digest(source, kernel)
+    file.write_text(text.replace("real(1, gap)", "real(2, gap)"), encoding="utf-8")
+    assert before != _generate._digest(source, kernel)
+
+
+def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
+    kernel = laws.kernel_of(Linear())
+    assert kernel is not None
+    with pytest.raises(ConfigError, match="NNODE_CACHE"):
+        _generate.compiled.__wrapped__(kernel)
+
+
+SCRIPT = """
+import json, sys, time
+import numpy as np, torch
+from nnode.data.sequence import Sequence, collate
+from nnode.models import NetworkSpeed, Traffic
+x = np.cumsum(np.full((3, 4, 1), 12.0), 1) + np.arange(3.0)[:, None, None]
+batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)])
+model = Traffic([NetworkSpeed(4)])
+start = time.perf_counter()
+from nnode.solvers import FusedSolver
+FusedSolver()(model, batch).x.sum().backward()
+took = time.perf_counter() - start
+from nnode.solvers.fused import _generate, laws
+module = _generate.compiled(laws.kernel_of(model.terms[0]))
+hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
+print(json.dumps({"took": took, "hits": hits}))
+"""
+
+
+def test_a_second_process_does_not_compile(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    environment = {**os.environ, "NNODE_CACHE": str(tmp_path)}
+    runs = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        runs.append(json.loads(done.stdout))
+    assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
+    assert runs[1]["took"] < 2.0  # s
+    assert len(list((tmp_path / "fused").glob("*.py"))) == 1
