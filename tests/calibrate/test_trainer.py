@@ -197,18 +197,17 @@ def test_a_cost_that_is_not_finite_stops_with_the_last_good_checkpoint(
 
 def test_a_line_search_that_goes_too_far_comes_back(make_trainer: Make, tmp_path: Path) -> None:
     trainer = make_trainer(tmp_path, LbfgsOptions(max_iter=20), batch_size=0, max_epochs=6)
-    solver, refused = trainer.solver, []
+    solver, calls = trainer.solver, [0]
 
     def fragile(system: System, batch: Batch) -> Trajectory:
-        v0 = float(system.physical()["v0"][0])
-        if not 20 < v0 < 30.5:
-            refused.append(v0)
+        calls[0] += torch.is_grad_enabled()
+        if torch.is_grad_enabled() and calls[0] in (4, 5):
             raise SimulationError("too far")
         return solver(system, batch)
 
     trainer.solver = fragile
     trainer.fit()
-    assert refused
+    assert calls[0] > 5
     assert trainer.history[-1]["cost/train"] < 0.01 * trainer.history[0]["cost/train"]
 
 
