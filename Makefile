@@ -18,7 +18,7 @@ demo: setup
 	$(BIN)/python -m nnode.data.synthetic $(DEMO)/raw
 	@echo "== traffic: cars in a lane, linear law, true v0 = 25 m/s and L = 6 m"
 	$(BIN)/python scripts/train.py experiment=demo_traffic data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/traffic
-	@echo "== crowd: people in a corridor, social force"
+	@echo "== crowd: people in a corridor, forces as networks"
 	$(BIN)/python scripts/train.py experiment=demo_crowd data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/crowd
 	@echo "== results"
 	@$(BIN)/python scripts/plot_forces.py checkpoint=[$(DEMO)/traffic/checkpoints/best.pt] hydra.run.dir=$(DEMO)/traffic/forces
@@ -26,7 +26,7 @@ demo: setup
 	@echo "TensorBoard: $(BIN)/tensorboard --logdir $(DEMO)"
 	@echo "runs:        $(DEMO)/traffic/tensorboard $(DEMO)/crowd/tensorboard"
 	@echo "checkpoints: $(DEMO)/traffic/checkpoints/best.pt $(DEMO)/crowd/checkpoints/best.pt"
-	@echo "force plots: $(DEMO)/traffic/forces/forces.png $(DEMO)/crowd/forces/sf_force_x.png"
+	@echo "force plots: $(DEMO)/traffic/forces/forces.png $(DEMO)/crowd/forces/nn_force_x.png"
 
 test: setup
 	$(BIN)/python -m pytest

@@ -12,13 +12,13 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from nnode.calibrate.options import Precision, SolverOptions, TrainerOptions
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
     ConsensusOptions,
     LbfgsOptions,
 )
+from nnode.calibrate.options import Precision, SolverOptions, TrainerOptions
 from nnode.data.options import (
     EsimasOptions,
     JuelichOptions,

@@ -83,7 +83,9 @@ def _exact(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     return torch_call(other, solver)()
 
 
-def _check(name: str, engine: Engine, call: Call, exact: tuple[np.ndarray, np.ndarray]) -> dict[str, Any]:
+def _check(
+    name: str, engine: Engine, call: Call, exact: tuple[np.ndarray, np.ndarray]
+) -> dict[str, Any]:
     """Call an engine for the first time, and refuse it where it disagrees."""
     start = time.perf_counter()
     states, gradient = call()

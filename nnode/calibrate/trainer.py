@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import time
 from collections.abc import Callable
@@ -146,27 +147,35 @@ class Trainer:
     def _descend(self, batch: Batch) -> None:
         batch = batch.to(dtype=self.dtype)
         norms: list[float] = []
+        costs: list[float] = []
+
+        def evaluate_here() -> Tensor:
+            cost = sequence_costs(self.solver(self.model, batch), batch, self.options.cost).mean()
+            if cost.requires_grad:
+                cost.backward()
+                gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
+                size = float(torch.linalg.vector_norm(torch.cat([g.flatten() for g in gradients])))
+                if not math.isfinite(size + float(cost.detach())):
+                    raise SimulationError(
+                        f"the cost of {', '.join(batch.names[:5])} ... or its gradient is not "
+                        "finite; start from other parameters, or take a smaller solver.dt"
+                    )
+                norms.append(size)
+            costs.append(float(cost.detach()))
+            return cost
 
         def closure() -> Tensor:
             self.optimizer.zero_grad()
             try:
-                cost = sequence_costs(self.solver(self.model, batch), batch, self.options.cost)
+                return evaluate_here()
             except SimulationError:
-                if torch.is_grad_enabled():
+                if not torch.is_grad_enabled():
+                    return torch.tensor(float("inf"))  # a particle outside the model's range
+                if not costs:
                     raise
-                return torch.tensor(float("inf"))  # a particle outside the model's range
-            loss = cost.mean()
-            if loss.requires_grad:
-                loss.backward()
-                gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
-                size = float(torch.linalg.vector_norm(torch.cat([g.flatten() for g in gradients])))
-                if not size < float("inf"):
-                    raise SimulationError(
-                        f"the gradient of the cost on {', '.join(batch.names[:5])} ... is not "
-                        "finite; start from other parameters, or take a smaller solver.dt"
-                    )
-                norms.append(size)
-            return loss
+                # a line search went too far: a high, flat cost sends it back
+                self.optimizer.zero_grad()
+                return torch.tensor(1e3 * (1 + abs(costs[0])), dtype=self.dtype)
 
         loss = cast(Tensor, self.optimizer.step(cast(Any, closure)))
         self.model.project_()

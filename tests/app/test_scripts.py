@@ -36,8 +36,6 @@ def traffic(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory)
     done = script(
         "train",
         "experiment=demo_traffic",
-        "optimizer=lbfgs",
-        "trainer.max_epochs=4",
         f"data.source={raw}",
         f"hydra.run.dir={folder}",
     )
@@ -106,6 +104,7 @@ def test_crowd_from_raw_file_to_plots(script: Script, raw: Path, tmp_path: Path)
     done = script(
         "train",
         "experiment=demo_crowd",
+        "model=sf",
         "trainer.max_epochs=2",
         f"data.source={raw}",
         f"hydra.run.dir={run}",
@@ -146,6 +145,7 @@ def test_sweep_ends_with_one_table_and_survives_a_failing_run(
         "-m",
         "experiment=demo_traffic",
         "model=lin,n2",
+        "optimizer=adadelta",
         "solver.dt=0.02,0.03",
         "trainer.max_epochs=1",
         f"data.source={raw}",
@@ -175,6 +175,7 @@ def interrupted(raw: Path, folder: Path, stops: int) -> None:
     common = [
         "experiment=demo_traffic",
         "model=n2",
+        "optimizer=adadelta",
         "trainer.max_epochs=40",
         "trainer.save_every=0.1",
         f"data.source={raw}",

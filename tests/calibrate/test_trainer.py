@@ -22,7 +22,10 @@ from nnode.calibrate.optimizers import (
     OptimizerOptions,
 )
 from nnode.calibrate.trainer import Trainer
+from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
+from nnode.models import System
+from nnode.solvers import Trajectory
 
 Make = Callable[..., Trainer]
 
@@ -190,6 +193,22 @@ def test_a_cost_that_is_not_finite_stops_with_the_last_good_checkpoint(
     saved = load_checkpoint(trainer.last_path)
     assert saved.progress["step"] == 4
     assert all(bool(v.isfinite().all()) for v in saved.model.values())
+
+
+def test_a_line_search_that_goes_too_far_comes_back(make_trainer: Make, tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path, LbfgsOptions(max_iter=20), batch_size=0, max_epochs=6)
+    solver, calls = trainer.solver, [0]
+
+    def fragile(system: System, batch: Batch) -> Trajectory:
+        calls[0] += torch.is_grad_enabled()
+        if torch.is_grad_enabled() and calls[0] in (4, 5):
+            raise SimulationError("too far")
+        return solver(system, batch)
+
+    trainer.solver = fragile
+    trainer.fit()
+    assert calls[0] > 5
+    assert trainer.history[-1]["cost/train"] < 0.01 * trainer.history[0]["cost/train"]
 
 
 def test_tensorboard_holds_every_scalar_of_the_history(make_trainer: Make, tmp_path: Path) -> None:

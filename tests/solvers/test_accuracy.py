@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import collate
 from nnode.errors import SimulationError
 from nnode.models import (

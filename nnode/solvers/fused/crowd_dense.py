@@ -78,8 +78,22 @@ def _periods(move: Any, exists: Any, members: Any, end: Any, step: int, dt: Any)
 
 @njit(nogil=True, cache=True, **LOOP)
 def forward(
-    jobs: Any, order: Any, per: int, dt: Any, y0: Any, still: Any, wall: Any, scale: Any,
-    end: Any, rate: Any, slip: Any, mutual: bool, q: Any, q_wall: Any, states: Any, out: Any,
+    jobs: Any,
+    order: Any,
+    per: int,
+    dt: Any,
+    y0: Any,
+    still: Any,
+    wall: Any,
+    scale: Any,
+    end: Any,
+    rate: Any,
+    slip: Any,
+    mutual: bool,
+    q: Any,
+    q_wall: Any,
+    states: Any,
+    out: Any,
 ) -> None:
     """Simulate the blocks ``jobs``, rows of first, width, people, wall points, place in
     ``states``; see :class:`nnode.solvers.fused.crowd._Plan` for the rest."""  # fmt: skip
@@ -107,21 +121,27 @@ def forward(
             y[:, length:] = y[:, :length]
             own = y[:, :length]
             drive[:] = 0
-            interact(
-                room, own, exists, goal, always, width, 0, 1, False, (rate,), drive, reaction
-            )
+            interact(room, own, exists, goal, always, width, 0, 1, False, (rate,), drive, reaction)
             pull[:] = 0
             reaction[:] = 0
-            interact(
-                room, own, exists, y, exists, width, 1, shifts, mutual, q, pull, reaction
-            )
+            interact(room, own, exists, y, exists, width, 1, shifts, mutual, q, pull, reaction)
             push[:] = 0
             if points:
                 at_wall[:2] = own[:2]
                 at_wall[2:] = slip * own[2:]
                 interact(
-                    room, at_wall, exists, barrier, solid, width, 0, points, False, q_wall,
-                    push, reaction,
+                    room,
+                    at_wall,
+                    exists,
+                    barrier,
+                    solid,
+                    width,
+                    0,
+                    points,
+                    False,
+                    q_wall,
+                    push,
+                    reaction,
                 )
             _periods(move, exists, members, end, step, dt)
             for c in range(2):
@@ -136,9 +156,24 @@ def forward(
 
 @njit(nogil=True, cache=True, **LOOP)
 def backward(
-    jobs: Any, order: Any, per: int, dt: Any, still: Any, wall: Any, scale: Any, end: Any,
-    rate: Any, slip: Any, mutual: bool, q: Any, q_wall: Any, states: Any, grad_out: Any,
-    grad_y0: Any, total: Any, total_wall: Any,
+    jobs: Any,
+    order: Any,
+    per: int,
+    dt: Any,
+    still: Any,
+    wall: Any,
+    scale: Any,
+    end: Any,
+    rate: Any,
+    slip: Any,
+    mutual: bool,
+    q: Any,
+    q_wall: Any,
+    states: Any,
+    grad_out: Any,
+    grad_y0: Any,
+    total: Any,
+    total_wall: Any,
 ) -> None:
     """Gradient of :func:`forward`; ``total`` and ``total_wall`` are added to."""  # fmt: skip
     kind = grad_out.dtype
@@ -171,12 +206,38 @@ def backward(
             to_own[:] = 0
             to_other[:] = 0
             interact_pull(
-                room, own, exists, goal, always, width, 0, 1, False, False, (rate,), weight,
-                total, to_own, to_other,
+                room,
+                own,
+                exists,
+                goal,
+                always,
+                width,
+                0,
+                1,
+                False,
+                False,
+                (rate,),
+                weight,
+                total,
+                to_own,
+                to_other,
             )
             interact_pull(
-                room, own, exists, y, exists, width, 1, shifts, mutual, True, q, weighed, total,
-                to_own, to_other,
+                room,
+                own,
+                exists,
+                y,
+                exists,
+                width,
+                1,
+                shifts,
+                mutual,
+                True,
+                q,
+                weighed,
+                total,
+                to_own,
+                to_other,
             )
             if points:
                 at_wall[:2] = own[:2]
@@ -185,8 +246,21 @@ def backward(
                 for c in range(2):
                     product(weighed[c, :length], weight[c], scales[1])
                 interact_pull(
-                    room, at_wall, exists, barrier, solid, width, 0, points, False, False,
-                    q_wall, weighed, total_wall, to_wall, to_other,
+                    room,
+                    at_wall,
+                    exists,
+                    barrier,
+                    solid,
+                    width,
+                    0,
+                    points,
+                    False,
+                    False,
+                    q_wall,
+                    weighed,
+                    total_wall,
+                    to_wall,
+                    to_other,
                 )
                 to_wall[2:] = slip * to_wall[2:]
                 for c in range(4):
@@ -201,5 +275,3 @@ def backward(
                 increase(adjoint[c], to_own[c])
         _load(adjoint, grad_out[0], members, people)
         _store(adjoint, grad_y0, members, people)
-
-

@@ -79,8 +79,18 @@ def meeting(length: int, shift: int, number: int, mutual: bool) -> int:
 
 @njit(**LOOP)
 def interact(
-    room: Any, own: Any, real_own: Any, other: Any, real_other: Any, width: int, first: int,
-    last: int, mutual: bool, q: Any, force: Any, reaction: Any,
+    room: Any,
+    own: Any,
+    real_own: Any,
+    other: Any,
+    real_other: Any,
+    width: int,
+    first: int,
+    last: int,
+    mutual: bool,
+    q: Any,
+    force: Any,
+    reaction: Any,
 ) -> None:
     """Add the forces of sources at shifts ``first`` ... ``last - 1``.
 
@@ -112,8 +122,20 @@ def interact(
 
 @njit(**LOOP)
 def interact_pull(
-    room: Any, own: Any, real_own: Any, other: Any, real_other: Any, width: int, first: int,
-    last: int, mutual: bool, moving: bool, q: Any, weight: Any, total: Any, to_own: Any,
+    room: Any,
+    own: Any,
+    real_own: Any,
+    other: Any,
+    real_other: Any,
+    width: int,
+    first: int,
+    last: int,
+    mutual: bool,
+    moving: bool,
+    q: Any,
+    weight: Any,
+    total: Any,
+    to_own: Any,
     to_other: Any,
 ) -> None:
     """Gradient of :func:`interact`.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from contextlib import suppress
-from types import ModuleType
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,9 +17,8 @@ from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
 from nnode.solvers.fused import fallback, traffic
 
-crowd: ModuleType | None = None
-with suppress(ImportError):
-    from nnode.solvers.fused import crowd  # type: ignore[no-redef]
+_CROWD = "nnode.solvers.fused.crowd"
+crowd: Any = import_module(_CROWD) if find_spec(_CROWD) else None
 
 
 class FusedSolver:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +14,10 @@ from torch.autograd.function import once_differentiable
 from nnode.data.sequence import Batch
 from nnode.models.system import System, Traffic
 from nnode.solvers.fused._generate import compiled
+from nnode.solvers.fused._plan import Plan, run_all
 from nnode.solvers.fused._rows import CHUNK
-from nnode.solvers.fused.laws import LawKernel, kernel_of
+from nnode.solvers.fused.lanes import SimulateLanes, lane_layout, pays
+from nnode.solvers.fused.laws import kernel_of
 
 #: Bytes of one row: a handful of rows are to stay in the first-level cache.
 _ROW_BYTES = 4800
@@ -31,39 +31,6 @@ def supports(system: System, batch: Batch) -> bool:
         return False  # measured positions are constants here
     known = kernel_of(system.terms[0]) is not None  # type: ignore[arg-type]
     return known and batch.x.device.type == "cpu"
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """Everything of a simulation that carries no gradient."""
-
-    kernel: LawKernel
-    jobs: tuple[np.ndarray, ...]  # for every thread rows of run, first simulation, width, slot
-    size: int
-    slots: int
-    steps: int
-    per: int
-    dt: Any
-    number: np.ndarray
-    end: np.ndarray
-    measured: np.ndarray
-    samples: int
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="nnode-fused")
-
-
-def _all(call: Callable[[np.ndarray], None], jobs: Sequence[np.ndarray]) -> None:
-    """Run a compiled function on every share of the jobs, one thread each."""
-    if len(jobs) == 1:
-        call(jobs[0])
-        return
-    others = [_pool(len(jobs) - 1).submit(call, share) for share in jobs[1:]]
-    call(jobs[0])
-    for other in others:
-        other.result()
 
 
 def _layout(
@@ -94,7 +61,7 @@ class _Simulate(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, plan: _Plan, x0: Tensor, v0: Tensor, offset: Tensor, shares: Tensor
+        ctx: Any, plan: Plan, x0: Tensor, v0: Tensor, offset: Tensor, shares: Tensor
     ) -> Tensor:
         values = [np.ascontiguousarray(t.detach().numpy()) for t in (x0, v0, offset, shares)]
         keep = any(ctx.needs_input_grad)
@@ -117,14 +84,14 @@ class _Simulate(torch.autograd.Function):
                 out.numpy(),
             )
 
-        _all(call, plan.jobs)
+        run_all(call, plan.jobs)
         ctx.plan, ctx.states, ctx.shares = plan, states, values[3]
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        plan: _Plan = ctx.plan
+        plan: Plan = ctx.plan
         grad_out = np.ascontiguousarray(grads[0].numpy())
         runs, _, simulations, agents = grad_out.shape
         grad_x0 = np.zeros((runs, simulations, agents), grad_out.dtype)
@@ -149,7 +116,7 @@ class _Simulate(torch.autograd.Function):
                 grad_rest,
             )
 
-        _all(call, plan.jobs)
+        run_all(call, plan.jobs)
         owner = np.concatenate([share[:, 0] for share in plan.jobs])
 
         def total(values: np.ndarray) -> Tensor:
@@ -158,11 +125,7 @@ class _Simulate(torch.autograd.Function):
             return torch.from_numpy(found).to(grads[0].dtype)
 
         rest = total(grad_rest)
-        start = torch.from_numpy(grad_x0.sum(0))
-        if len(plan.measured):
-            leader = torch.from_numpy(plan.number)[:, None] - 1 == torch.arange(agents)
-            start = start.masked_fill(leader, 0.0)  # never read: its place is measured
-        return None, start, rest[:, 0], rest[:, 1], total(grad_shares)
+        return None, plan.start(grad_x0.sum(0)), rest[:, 0], rest[:, 1], total(grad_shares)
 
 
 def simulate(
@@ -198,7 +161,7 @@ def simulate(
     jobs, size, slots = _layout(len(v0), simulations, agents, x0.element_size(), threads)
     measured = batch.x.detach()[..., 0] if system.leader == "measured" else x0.new_empty(0, 0, 0)
     last = batch.valid.any(-1).sum(0) - 1
-    plan = _Plan(
+    plan = Plan(
         kernel=kernel,
         jobs=jobs,
         size=size,
@@ -211,5 +174,10 @@ def simulate(
         measured=np.ascontiguousarray(measured.numpy()),
         samples=batch.n_samples,
     )
-    out: Tensor = _Simulate.apply(plan, x0, v0, offset, shares)
+    if pays(len(v0), simulations, agents):
+        jobs, size, slots = lane_layout(len(v0) * simulations, agents, threads)
+        plan = replace(plan, jobs=jobs, size=size, slots=slots)
+        out: Tensor = SimulateLanes.apply(plan, x0, v0, offset, shares)
+    else:
+        out = _Simulate.apply(plan, x0, v0, offset, shares)
     return out.transpose(0, 1)[..., None]
