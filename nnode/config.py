@@ -18,7 +18,7 @@ from nnode.calibrate.optimizers import (
     ConsensusOptions,
     LbfgsOptions,
 )
-from nnode.calibrate.options import Precision, SolverOptions, TrainerOptions
+from nnode.calibrate.options import Device, Precision, SolverOptions, TrainerOptions
 from nnode.data.options import (
     EsimasOptions,
     JuelichOptions,
@@ -60,6 +60,7 @@ class EvaluateConfig:
     checkpoint: str = MISSING
     data: Any = MISSING
     solver: SolverOptions = field(default_factory=SolverOptions)
+    device: Device = Device.auto
     part: str = "auto"  # heldout | train | all; auto: heldout where there is one
 
 

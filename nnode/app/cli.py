@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from copy import deepcopy
@@ -21,7 +22,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from nnode.app.launchers import check_launcher, has_no_part, out_of_sight
 from nnode.app.sweep import failures, record_failure
+from nnode.calibrate.distributed import World, join
 from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
@@ -38,7 +41,13 @@ _FLAGS_WITH_VALUE = {"--package", "-p", "--config-path", "-cp", "--config-name",
 }
 
 
-def run(name: str, job: Job, inject: Callable[[list[str]], list[str]] | None = None) -> None:
+def run(
+    name: str,
+    job: Job,
+    inject: Callable[[list[str]], list[str]] | None = None,
+    *,
+    parallel: bool = False,
+) -> None:
     """Run ``job(config, folder)`` as ``scripts/<name>.py``; ends the process on errors.
 
     Args:
@@ -46,36 +55,64 @@ def run(name: str, job: Job, inject: Callable[[list[str]], list[str]] | None = N
         job: does the work; writes only into ``folder``.
         inject: looks at the overrides given by the user and returns further ones that go
             before them.
+        parallel: whether the job is for all processes that were started together; otherwise
+            the first one does it alone.
     """
+    if has_no_part(parallel):
+        return
     register()
     folder = Path(sys.argv[0]).resolve().parent.parent / "conf"
     try:
-        if not folder.is_dir():
-            raise ConfigError(f"no configuration folder {folder}; run scripts/{name}.py in place")
-        given = user_overrides(sys.argv[1:])
-        if inject is not None:
-            extra = inject(given)
-            sys.argv[1:1] = extra
-            given = extra + given
-        if "--help" not in sys.argv and "-h" not in sys.argv:
-            free = check_overrides(given, folder, name)
-            # what goes into a mapping that takes any name is added, not only replaced
-            sys.argv[1:] = [f"++{a}" if a in free else a for a in sys.argv[1:]]
-        hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_guarded(job))()
+        if parallel:
+            join()
+        with World().together():
+            given = _arguments(name, folder, inject)
+        with out_of_sight(given):
+            hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(
+                _guarded(job)
+            )()
+            failed = failures()
     except NNodeError as error:
         _end(error)
     except _Escape as escape:
         _end(escape.error)
-    if failures():
+    World().part()
+    if failed:
         sys.exit(1)
 
 
+def _arguments(
+    name: str, folder: Path, inject: Callable[[list[str]], list[str]] | None
+) -> list[str]:
+    """Check the command line and complete it in place; returns its overrides."""
+    if not folder.is_dir():
+        raise ConfigError(f"no configuration folder {folder}; run scripts/{name}.py in place")
+    given = user_overrides(sys.argv[1:])
+    if inject is not None:
+        extra = inject(given)
+        sys.argv[1:1] = extra
+        given = extra + given
+    check_launcher(given)
+    if "--help" not in sys.argv and "-h" not in sys.argv:
+        free = check_overrides(given, folder, name)
+        # what goes into a mapping that takes any name is added, not only replaced
+        sys.argv[1:] = [f"++{a}" if a in free else a for a in sys.argv[1:]]
+    return user_overrides(sys.argv[1:])
+
+
 def _end(error: NNodeError) -> NoReturn:
-    """Say what happened and leave with the exit status that belongs to it."""
+    """Say what happened and leave with the exit status that belongs to it.
+
+    What all processes know is said by the first one, and they leave together.
+    """
+    stopped = isinstance(error, Interrupted)
+    world = World()
+    if world.first or not world.agreed:
+        _say(str(error) if stopped else f"error: {error}")
+    if world.agreed:
+        world.part()
     if isinstance(error, Interrupted):
-        _say(str(error))
         sys.exit(128 + error.signal)
-    _say(f"error: {error}")
     sys.exit(2 if isinstance(error, ConfigError) else 1)
 
 
@@ -91,18 +128,22 @@ class _Escape(BaseException):
 
 
 def _guarded(job: Job) -> Callable[[DictConfig], None]:
+    here = os.getpid()
+
     def task(config: DictConfig) -> None:
         settings = HydraConfig.get()
         folder = Path(settings.runtime.output_dir)
         try:
             job(config, folder)
-        except Interrupted as stop:
-            raise _Escape(stop) from None
         except NNodeError as error:
-            if settings.mode != RunMode.MULTIRUN:
+            # a launcher may run the job elsewhere, where only this job can be stopped
+            stopped = isinstance(error, Interrupted) and os.getpid() == here
+            alone = World().size > 1 and not World().agreed
+            if stopped or alone or settings.mode != RunMode.MULTIRUN:
                 raise _Escape(error) from None
             # the other jobs of a sweep go on
-            _say(f"error in {folder}: {error}")
+            if World().first:
+                _say(f"error in {folder}: {error}")
             record_failure(folder, str(error))
 
     return task

@@ -14,8 +14,9 @@ from nnode.app.sweep import write_json
 from nnode.app.train import build_solver, set_threads, source_hashes, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
+from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import Metrics, Simulate, baselines, evaluate
-from nnode.calibrate.options import SolverOptions
+from nnode.calibrate.options import Device, SolverOptions
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.store import Store
@@ -64,13 +65,15 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
     store = open_data(data, folder / "data")
     part, indices = choose(store, checkpoint, config.part)
-    model, solver = checkpoint.build(), build_solver(solver_options)
+    device = World().use(Device(config.device), "device")
+    model, solver = checkpoint.build().to(device), build_solver(solver_options)
     dtype = getattr(torch, checkpoint.config["trainer"]["dtype"])
     convention = Convention(checkpoint.config["trainer"]["cost"])
 
     def measure(simulate: Simulate) -> Metrics:
         size = data.loader.batch_size
-        return evaluate(simulate, stream(straight_loader(store, indices, size), dtype), convention)
+        batches = stream(straight_loader(store, indices, size), dtype, device)
+        return evaluate(simulate, batches, convention)
 
     name = checkpoint.config["model"]["name"]
     found = measure(lambda batch: solver(model, batch))

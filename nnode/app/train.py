@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 from nnode.app.saved import merge_saved, plain_config, refuse_changes
 from nnode.app.sweep import RESULT, write_json
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.interrupt import Interrupted
 from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
@@ -28,7 +29,7 @@ from nnode.data.sequence import Batch
 from nnode.data.split import split
 from nnode.data.store import Store
 from nnode.errors import ConfigError
-from nnode.models import build_model
+from nnode.models import System, build_model
 from nnode.plots import force_figure
 from nnode.solvers import TorchdiffeqSolver, substeps
 
@@ -39,6 +40,7 @@ RESUMABLE = (
     "data.source",
     "data.prepared",
     "data.loader.workers",
+    "trainer.device",
     "trainer.max_epochs",
     "trainer.patience",
     "trainer.min_delta",
@@ -55,15 +57,22 @@ def build_solver(options: SolverOptions) -> TorchdiffeqSolver:
     )
 
 
-def stream(loader: DataLoader[Any], dtype: torch.dtype = torch.float64) -> Iterator[Batch]:
-    """The mini-batches of a loader, in the precision asked for."""
-    return (batch.to(dtype=dtype) for batch in loader)
+def stream(
+    loader: DataLoader[Any],
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Iterator[Batch]:
+    """The mini-batches of a loader, in the precision and on the device asked for."""
+    return (batch.to(device, dtype) for batch in loader)
 
 
-def straight_loader(store: Store, indices: list[int], size: int) -> DataLoader[Any]:
-    """A loader that visits sequences in order."""
+def straight_loader(
+    store: Store, indices: list[int], size: int, world: World | None = None
+) -> DataLoader[Any]:
+    """A loader that visits sequences in order; this process's shares where a world is given."""
     options = LoaderOptions(batch_size=size, shuffle=False)
-    return make_loader(SequenceDataset(store, indices), options, seed=0)
+    rank, number = (world.rank, world.size) if world else (0, 1)
+    return make_loader(SequenceDataset(store, indices), options, seed=0, rank=rank, size=number)
 
 
 def set_threads(threads: int | None, domain: str) -> None:
@@ -86,9 +95,41 @@ def _check(config: DictConfig) -> None:
 def train(config: DictConfig, folder: Path) -> None:
     """Run one training as configured and say where its results are.
 
+    Processes that were started together share it; the first one's folder is taken.
+
     Raises:
         NNodeError: see the packages below; Interrupted after a signal, with all work saved.
     """
+    world = World()
+    folder = world.from_first(folder)
+    with world.together():
+        config, checkpoint = _composed(config)
+    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
+    device = world.use(options.device, "trainer.device")
+    with world.together():
+        model, store = _model(config), None
+        if world.first:
+            data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+            store = open_data(data, folder / "data")
+    place = world.from_first(Path() if store is None else store.folder)
+    with world.together():
+        store = Store(place) if store is None else store
+        trainer = _trainer(config, folder, model.to(device), store, checkpoint, world)
+    start = time.monotonic()
+    try:
+        trainer.fit()
+    except Interrupted as stop:
+        raise Interrupted(
+            f"{stop}\nresume with: python scripts/train.py resume={trainer.last_path} "
+            f"hydra.run.dir={folder}",
+            stop.signal,
+        ) from None
+    if world.first:
+        _report(trainer, plain_config(config), folder, time.monotonic() - start)
+
+
+def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:
+    """The checked configuration, that of the checkpoint under it when a run is resumed."""
     checkpoint: Checkpoint | None = None
     resume = config.resume
     if resume is not None:
@@ -96,28 +137,49 @@ def train(config: DictConfig, folder: Path) -> None:
         config = merge_saved(config, checkpoint.config, SECTIONS)
         refuse_changes(plain_config(config), checkpoint.config, RESUMABLE)
     _check(config)
-    plain = plain_config(config)
+    return config, checkpoint
+
+
+def _model(config: DictConfig) -> System:
+    """The model, if it is of the data's domain; torch's threads are set for it."""
+    model = build_model(config.model, int(config.seed), getattr(torch, config.trainer.dtype.value))
+    domain = str(config.data.domain)
+    if domain in ("traffic", "crowd") and domain != model.domain:
+        raise ConfigError(
+            f"model={config.model.name} is a {model.domain} model, data={config.data.name} are "
+            f"{domain} data; choose both of one domain"
+        )
+    set_threads(config.trainer.threads, domain)
+    return model
+
+
+def _trainer(
+    config: DictConfig,
+    folder: Path,
+    model: System,
+    store: Store,
+    checkpoint: Checkpoint | None,
+    world: World,
+) -> Trainer:
     data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
-    set_threads(options.threads, data.domain)
     optimizer_options: Any = OmegaConf.to_object(config.optimizer)
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     seed = int(config.seed)
-    dtype = getattr(torch, options.dtype.value)
-
-    model = build_model(config.model, seed, dtype)
-    if data.domain in ("traffic", "crowd") and data.domain != model.domain:
-        raise ConfigError(
-            f"model={config.model.name} is a {model.domain} model, data={data.name} are "
-            f"{data.domain} data; choose both of one domain"
-        )
-    store = open_data(data, folder / "data")
     _check_same_data(store, checkpoint)
     parts = split(store, data.split)
-    loader = make_loader(SequenceDataset(store, parts.train), data.loader, seed=seed)
+    loader = make_loader(
+        SequenceDataset(store, parts.train),
+        data.loader,
+        seed=seed,
+        rank=world.rank,
+        size=world.size,
+    )
     heldout = (
-        straight_loader(store, parts.heldout, data.loader.batch_size) if parts.heldout else None
+        straight_loader(store, parts.heldout, data.loader.batch_size, world)
+        if parts.heldout
+        else None
     )
     solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
     solver = build_solver(solver_options)
@@ -127,7 +189,7 @@ def train(config: DictConfig, folder: Path) -> None:
         data.name, len(parts.train), len(parts.heldout), len(parts.dropped), n,
     )  # fmt: skip
     free_speed = None
-    if model.domain == "traffic":
+    if model.domain == "traffic" and world.first:
         free_speed = best_common_speed(
             stream(straight_loader(store, parts.train, data.loader.batch_size))
         )
@@ -141,26 +203,18 @@ def train(config: DictConfig, folder: Path) -> None:
         options,
         folder,
         Provenance(
-            config=plain,
+            config=plain_config(config),
             manifest=brief(store.manifest),
             split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in _PARTS},
             free_speed=free_speed,
         ),
         force_figure,
+        world,
     )
-    if resume is not None:
-        trainer.restore(Path(resume))
-        log.info("resumed from %s at epoch %d, step %d", resume, trainer.epoch, trainer.step)
-    start = time.monotonic()
-    try:
-        trainer.fit()
-    except Interrupted as stop:
-        raise Interrupted(
-            f"{stop}\nresume with: python scripts/train.py resume={trainer.last_path} "
-            f"hydra.run.dir={folder}",
-            stop.signal,
-        ) from None
-    _report(trainer, plain, folder, time.monotonic() - start)
+    if config.resume is not None:
+        trainer.restore(Path(config.resume))
+        log.info("resumed from %s at epoch %d, step %d", config.resume, trainer.epoch, trainer.step)
+    return trainer
 
 
 _PARTS = ("train", "heldout", "dropped")

@@ -22,6 +22,14 @@ class Precision(str, Enum):
     float64 = "float64"
 
 
+class Device(str, Enum):
+    """Where the calculation runs; ``auto`` is a CUDA device where torch finds one."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
 class Monitor(str, Enum):
     """Whose cost decides which checkpoint is best and when to stop early."""
 
@@ -51,6 +59,7 @@ class TrainerOptions:
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
     dtype: Precision = Precision.float64
+    device: Device = Device.auto
     threads: int | None = None  # of torch; null: one for traffic, all cores for crowds
     save_every: float = 30.0  # s between checkpoints within an epoch
     figure_every: int = 50  # epochs between force curves in TensorBoard; 0 draws none

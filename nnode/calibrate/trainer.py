@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +22,7 @@ from torch.utils.data import DataLoader
 from nnode.calibrate.adadelta import NoisyAdadelta
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import evaluate
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.calibrate.logbook import Logbook
@@ -47,6 +50,10 @@ class Provenance:
 class Trainer:
     """Calibrates a model; the state of a run is its checkpoint, at any mini-batch.
 
+    Several processes calibrate together when each has a trainer whose loaders give its share of
+    the mini-batches; only the first one writes files. Model, optimiser state and costs are the
+    same in all of them, so a run may be resumed with another number of processes.
+
     Args:
         model, solver, optimizer: what is calibrated, and how.
         train: loader whose batch sampler is an :class:`EpochSampler`.
@@ -55,6 +62,7 @@ class Trainer:
         folder: ``checkpoints/`` and ``tensorboard/`` are written here.
         provenance: goes into the checkpoints.
         figure: draws the model for TensorBoard.
+        world: the processes that train together; by default those that were joined.
     """
 
     def __init__(
@@ -68,11 +76,14 @@ class Trainer:
         folder: Path,
         provenance: Provenance,
         figure: Callable[[System], Figure] | None = None,
+        world: World | None = None,
     ) -> None:
         self.model, self.solver, self.optimizer = model, solver, optimizer
         self.train, self.heldout, self.options = train, heldout, options
         self.folder, self.provenance, self.figure = folder, provenance, figure
-        self.dtype = next(model.parameters()).dtype
+        self.world = world or World()
+        first = next(model.parameters())
+        self.dtype, self.device = first.dtype, first.device
         self.history: list[dict[str, float]] = []
         self.epoch = self.batch = self.step = 0
         self.sum, self.gradient_norm = 0.0, 0.0  # over the mini-batches of this epoch
@@ -115,7 +126,7 @@ class Trainer:
             manifest=self.provenance.manifest,
             split=self.provenance.split,
             free_speed=self.provenance.free_speed,
-            model={k: v.detach().clone() for k, v in self.model.state_dict().items()},
+            model=_copy(dict(self.model.state_dict())),
             optimizer=_copy(self.optimizer.state_dict()),
             progress={name: getattr(self, name) for name in self._COUNTERS},
             history=list(self.history),
@@ -130,38 +141,57 @@ class Trainer:
             setattr(self, name, checkpoint.progress[name])
         self.history = list(checkpoint.history)
         best = path.parent / self.best_path.name
-        if best.is_file() and best.resolve() != self.best_path.resolve():
+        foreign = best.is_file() and best.resolve() != self.best_path.resolve()
+        if foreign and self.world.first:
             self.best_path.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(best, self.best_path)
 
     def save(self) -> None:
         """Write the best checkpoint, if there is a new one, then the last."""
-        if self._pending_best is not None:
-            save_checkpoint(self._pending_best, self.best_path)
-            self._pending_best = None
-        save_checkpoint(self.checkpoint(), self.last_path)
+        if self.world.first:
+            if self._pending_best is not None:
+                save_checkpoint(self._pending_best, self.best_path)
+            save_checkpoint(self.checkpoint(), self.last_path)
+        self._pending_best = None
         self._saved = time.monotonic()
 
     # -- one step --------------------------------------------------------------------------
 
-    def _descend(self, batch: Batch) -> None:
-        batch = batch.to(dtype=self.dtype)
+    def _gradient_norm(self) -> float:
+        gradients = [p.grad.flatten() for p in self.model.parameters() if p.grad is not None]
+        return float(torch.linalg.vector_norm(torch.cat(gradients))) if gradients else 0.0
+
+    def _share(self, batch: Batch | None, number: int) -> Tensor:
+        """This process's part of the mean cost of ``number`` sequences; its gradient as well."""
+        if batch is None:
+            return torch.zeros((), dtype=self.dtype, device=self.device)
+        costs = sequence_costs(self.solver(self.model, batch), batch, self.options.cost)
+        cost = costs.sum() / number
+        if cost.requires_grad:
+            cost.backward()
+            if not math.isfinite(self._gradient_norm() + float(cost.detach())):
+                raise SimulationError(
+                    f"the cost of {', '.join(batch.names[:5])} ... or its gradient is not "
+                    "finite; start from other parameters, or take a smaller solver.dt"
+                )
+        return cost.detach()
+
+    def _descend(self, batch: Batch | None) -> None:
+        batch = None if batch is None else batch.to(self.device, self.dtype)
+        number = cast(EpochSampler, self.train.batch_sampler).sequences(self.batch)
+        trained = [p for p in self.model.parameters() if p.requires_grad]
         norms: list[float] = []
         costs: list[float] = []
 
         def evaluate_here() -> Tensor:
-            cost = sequence_costs(self.solver(self.model, batch), batch, self.options.cost).mean()
-            if cost.requires_grad:
-                cost.backward()
-                gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
-                size = float(torch.linalg.vector_norm(torch.cat([g.flatten() for g in gradients])))
-                if not math.isfinite(size + float(cost.detach())):
-                    raise SimulationError(
-                        f"the cost of {', '.join(batch.names[:5])} ... or its gradient is not "
-                        "finite; start from other parameters, or take a smaller solver.dt"
-                    )
-                norms.append(size)
-            costs.append(float(cost.detach()))
+            share, error = torch.zeros((), dtype=self.dtype, device=self.device), None
+            try:
+                share = self._share(batch, number)
+            except SimulationError as caught:
+                error = caught
+            cost = self.world.combine(share, trained, error)
+            norms.append(self._gradient_norm())
+            costs.append(float(cost))
             return cost
 
         def closure() -> Tensor:
@@ -192,12 +222,24 @@ class Trainer:
                 continue
             if name == "train":
                 cast(EpochSampler, loader.batch_sampler).set_epoch(self.epoch)
-            batches = (batch.to(dtype=self.dtype) for batch in loader)
-            metrics = evaluate(lambda b: self.solver(self.model, b), batches, self.options.cost)
-            found[f"cost/{name}"] = metrics.J
+            sums = torch.zeros(2, dtype=torch.float64)
+            with self.world.together():
+                metrics = evaluate(
+                    lambda b: self.solver(self.model, b), self._shares(loader), self.options.cost
+                )
+                sums[0], sums[1] = metrics.J * metrics.sequences, metrics.sequences
+            if self.world.size > 1:
+                total, number = self.world.total(sums).tolist()
+                found[f"cost/{name}"] = total / number
+            else:
+                found[f"cost/{name}"] = metrics.J
         return found
 
-    def _evaluate(self, logbook: Logbook, minibatch: float | None = None) -> None:
+    def _shares(self, loader: DataLoader[Any]) -> Iterator[Batch]:
+        """This process's shares of the mini-batches, where it has one."""
+        return (batch.to(self.device, self.dtype) for batch in loader if batch is not None)
+
+    def _evaluate(self, logbook: Logbook | None, minibatch: float | None = None) -> None:
         row: dict[str, float] = {"epoch": float(self.epoch), "step": float(self.step)}
         row.update(self.costs())
         if minibatch is not None:
@@ -208,7 +250,8 @@ class Trainer:
         for name, (value, _) in self.model.physical().items():
             row[f"parameters/{name}"] = float(value)
         self.history.append(row)
-        logbook.scalars({k: v for k, v in row.items() if k not in ("epoch", "step")}, self.step)
+        if logbook is not None:
+            logbook.scalars({k: v for k, v in row.items() if k not in ("epoch", "step")}, self.step)
         monitored = row.get(f"cost/{self.options.monitor.value}", row["cost/train"])
         if monitored < self.best - self.options.min_delta:
             self.best, self.best_epoch, self.stale = monitored, self.epoch, 0
@@ -216,9 +259,10 @@ class Trainer:
         else:
             self.stale += 1
 
-    def _draw(self, logbook: Logbook) -> None:
-        if self.figure is not None:
-            logbook.figure("force", self.figure(self.model), self.step)
+    def _draw(self, logbook: Logbook | None) -> None:
+        if self.figure is not None and logbook is not None:
+            model = copy.deepcopy(self.model).cpu()  # plots are drawn from CPU tensors
+            logbook.figure("force", self.figure(model), self.step)
 
     # -- the loop --------------------------------------------------------------------------
 
@@ -226,7 +270,7 @@ class Trainer:
         """Train up to ``max_epochs`` or until nothing improves any more.
 
         Raises:
-            Interrupted: on SIGINT or SIGTERM, after saving.
+            Interrupted: on SIGINT or SIGTERM to any of the processes, after saving.
             SimulationError: the cost or its gradient is not finite; the last good state is in
                 the last checkpoint.
         """
@@ -235,12 +279,14 @@ class Trainer:
         if options.monitor is Monitor.heldout and self.heldout is None:
             log.warning("trainer.monitor=heldout, but no sequence is held out: watching train")
         fresh = self.step == 0 and not self.history
-        logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
+        logbook, reporter = None, None
+        if self.world.first:
+            logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
+            reporter = Reporter(options.max_epochs * per_epoch, self.step)
         self._clock = time.monotonic()
         finished = False
-        reporter = Reporter(options.max_epochs * per_epoch, self.step)
         try:
-            with InterruptGuard() as guard, reporter:
+            with InterruptGuard() as guard, reporter or nullcontext():
                 if fresh:
                     self._evaluate(logbook)
                     self._draw(logbook)
@@ -252,16 +298,18 @@ class Trainer:
                         self._descend(batch)
                         self.batch += 1
                         self.step += 1
-                        reporter.advance(self._note())
+                        if reporter is not None:
+                            reporter.advance(self._note())
                         self._save_if_due(guard)
                     self._end_epoch(logbook, per_epoch)
                     self._save_if_due(guard)
                 self.save()
             finished = True
         finally:
-            logbook.close({"cost/best": self.best} if finished else None)
+            if logbook is not None:
+                logbook.close({"cost/best": self.best} if finished else None)
 
-    def _end_epoch(self, logbook: Logbook, per_epoch: int) -> None:
+    def _end_epoch(self, logbook: Logbook | None, per_epoch: int) -> None:
         minibatch = self.sum / per_epoch
         # counters first: a checkpoint made below belongs to the start of the next epoch
         self.epoch, self.batch, self.sum = self.epoch + 1, 0, 0.0
@@ -279,21 +327,24 @@ class Trainer:
         return f"epoch {self.epoch + 1}, best {self.options.monitor.value} cost {self.best:.4g}"
 
     def _save_if_due(self, guard: InterruptGuard) -> None:
-        if guard.requested is not None:
+        number = self.world.most(guard.requested or 0)
+        if number:
             self.save()
+            self.world.meet()  # nobody leaves before the state is on the disk
+            World.agreed = True
             raise Interrupted(
                 f"stopped at step {self.step} (epoch {self.epoch + 1}); "
                 f"everything up to here is in {self.last_path}",
-                guard.requested,
+                number,
             )
         if time.monotonic() - self._saved >= self.options.save_every:
             self.save()
 
 
 def _copy(value: Any) -> Any:
-    """Deep copy of nested state with detached tensors."""
+    """Deep copy of nested state with detached tensors, on the CPU so that any machine reads it."""
     if isinstance(value, Tensor):
-        return value.detach().clone()
+        return value.detach().cpu().clone()
     if isinstance(value, dict):
         return {key: _copy(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -51,12 +51,22 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
         batch_size: most sequences per mini-batch, shared out evenly; 0 takes all at once.
         seed: of the shuffling, >= 0.
         shuffle: False keeps the order of the data set.
+        rank, size: this process's number and the number of processes that share out every
+            mini-batch; a process gets an empty list of one that is smaller than their number.
 
     Raises:
         ConfigError: a negative batch size or seed.
     """
 
-    def __init__(self, n: int, batch_size: int, seed: int, shuffle: bool = True) -> None:
+    def __init__(
+        self,
+        n: int,
+        batch_size: int,
+        seed: int,
+        shuffle: bool = True,
+        rank: int = 0,
+        size: int = 1,
+    ) -> None:
         if batch_size < 0:
             raise ConfigError(
                 f"data.loader.batch_size={batch_size}: expected at least 1, or 0 for all at once"
@@ -67,6 +77,7 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
         self.batch_size = batch_size or max(n, 1)
         self.seed = seed
         self.shuffle = shuffle
+        self.rank, self.size = rank, size
         self.epoch = 0
         self.start = 0
 
@@ -74,6 +85,11 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
     def n_batches(self) -> int:
         """Mini-batches of a whole epoch."""
         return -(-self.n // self.batch_size)
+
+    def sequences(self, batch: int) -> int:
+        """Sequences of mini-batch number ``batch``, those of all processes."""
+        least, more = divmod(self.n, self.n_batches)
+        return least + (batch < more)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, counted from 0; it starts at its first mini-batch."""
@@ -102,13 +118,16 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
         # shared out evenly: a last mini-batch of one or two sequences would give a wild gradient
         batches = np.array_split(self.order(), self.n_batches)
         for batch in batches[self.start :]:
-            yield batch.tolist()
+            yield batch[self.rank :: self.size].tolist()
 
 
 def make_loader(
-    dataset: SequenceDataset, options: LoaderOptions, *, seed: int
+    dataset: SequenceDataset, options: LoaderOptions, *, seed: int, rank: int = 0, size: int = 1
 ) -> DataLoader[Sequence]:
     """A loader of :class:`~nnode.data.sequence.Batch` mini-batches.
+
+    With several processes (``size``) it gives this one's share of every mini-batch, None where
+    that is empty.
 
     ``loader.batch_sampler`` is an :class:`EpochSampler`: call its ``set_epoch`` before each
     epoch, and ``set_start`` to resume within one. The order is the same for every number of
@@ -124,12 +143,18 @@ def make_loader(
         raise ConfigError(f"data.loader.workers={options.workers}: expected at least 0")
     return DataLoader(
         dataset,
-        batch_sampler=EpochSampler(len(dataset), options.batch_size, seed, options.shuffle),
+        batch_sampler=EpochSampler(
+            len(dataset), options.batch_size, seed, options.shuffle, rank, size
+        ),
         num_workers=options.workers,
-        collate_fn=collate,
+        collate_fn=_collate_share,
         # Its own generator: a loader would otherwise advance the global one at every epoch.
         generator=torch.Generator().manual_seed(seed),
     )
+
+
+def _collate_share(sequences: list[Sequence]) -> Batch | None:
+    return collate(sequences) if sequences else None
 
 
 def load_all(store: Store, indices: Iterable[int] | None = None) -> Batch:

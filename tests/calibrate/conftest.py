@@ -23,6 +23,11 @@ LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0,
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
+    """See :func:`write_platoons`."""
+    return write_platoons(tmp_path / "store")
+
+
+def write_platoons(folder: Path) -> Store:
     """Seven platoons of two to four cars over 1 s, v0 = 22 m/s and L = 4 m."""
     rng = np.random.default_rng(1)
     sequences = []
@@ -37,7 +42,7 @@ def store(tmp_path: Path) -> Store:
         sequences.append(
             Sequence(name=f"r/{i:03d}", recording="r", time=time, x=np.array(rows)[::100, :, None])
         )
-    return write_store(tmp_path / "store", sequences, {"dt": 0.2, "files": {}})
+    return write_store(folder, sequences, {"dt": 0.2, "files": {}})
 
 
 @pytest.fixture

@@ -22,10 +22,10 @@ import numpy as np
 
 import nnode.models.crowd
 from nnode.errors import ConfigError
-from nnode.solvers.fused import _math, _rows, crowd_laws, crowd_rows, neighbours
+from nnode.solvers.fused import _math, _rows, crowd_laws, crowd_network, crowd_rows, neighbours
 from nnode.solvers.fused._generate import cache_folder
 
-_COMPILED_IN = (_math, _rows, crowd_laws, crowd_rows, neighbours, nnode.models.crowd)
+_COMPILED_IN = (_math, _rows, crowd_laws, crowd_network, crowd_rows, neighbours, nnode.models.crowd)
 
 
 def digest(text: bytes) -> str:

@@ -8,12 +8,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 from nnode.solvers.fused._math import real
 from nnode.solvers.fused.crowd_laws import LOOP, ROWS, SIZE
-from nnode.solvers.fused.crowd_rows import increase, interact, interact_pull, product
+from nnode.solvers.fused.crowd_network import meet, meet_pull
+from nnode.solvers.fused.crowd_rows import (
+    blank,
+    clear,
+    copy,
+    increase,
+    interact,
+    interact_pull,
+    multiply,
+    product,
+)
 
 
 @njit(**LOOP)
@@ -28,10 +37,10 @@ def _scene(
     """
     width = len(members)
     length = people * width
-    exists, goal = np.zeros(2 * length, scale.dtype), np.zeros((4, length), scale.dtype)
-    scales = np.zeros((2, length), scale.dtype)
+    exists, goal = blank(1, 2 * length, scale)[0], blank(4, length, scale)
+    scales = blank(2, length, scale)
     rows = (points + people) * width if points else 0
-    barrier, solid = np.zeros((4, rows), scale.dtype), np.zeros(rows, scale.dtype)
+    barrier, solid = blank(4, rows, scale), blank(1, rows, scale)[0]
     for b in range(width):
         member = members[b]
         for i in range(people):
@@ -44,6 +53,18 @@ def _scene(
                 barrier[c, p * width + b] = wall[member, p % points, c]
             solid[p * width + b] = wall[member, p % points, 4]
     return exists, goal, barrier, solid, scales
+
+
+@njit(**LOOP)
+def _memory(kept: Any, length: int, hidden: int) -> tuple[Any, Any]:
+    """Places (2, hidden, L) for what pair and wall networks keep; empty where nothing is kept."""
+    size = 2 * hidden * length if len(kept) else 0
+    shape = (2, hidden if size else 0, length)
+    first = 4 * length if size else 0
+    return (
+        kept[first : first + size].reshape(shape),
+        kept[first + size : first + 2 * size].reshape(shape),
+    )
 
 
 @njit(**LOOP)
@@ -97,52 +118,49 @@ def forward(
 ) -> None:
     """Simulate the blocks ``jobs``, rows of first, width, people, wall points, place in
     ``states``; see :class:`nnode.solvers.fused.crowd._Plan` for the rest."""  # fmt: skip
-    kind = y0.dtype
-    room = np.zeros(ROWS * SIZE, kind)
+    room, one = blank(1, ROWS * SIZE, scale)[0], real(1, dt)
     steps = per * (out.shape[0] - 1)
+    hidden = q.shape[0] - 1 if q.ndim == 2 else 0
     for job in range(jobs.shape[0]):
-        low, width, people, points, place = jobs[job]
+        low, width, people = jobs[job, 0], jobs[job, 1], jobs[job, 2]
+        points, place = jobs[job, 3], jobs[job, 4]
         members = order[low : low + width]
         length = people * width
         exists, goal, barrier, solid, scales = _scene(members, people, points, still, wall, scale)
-        y, at_wall = np.zeros((4, 2 * length), kind), np.zeros((4, length), kind)
-        pull, reaction = np.zeros((2, length), kind), np.zeros((2, 2 * length), kind)
-        push, drive = np.zeros((2, length), kind), np.zeros((2, length), kind)
-        move, always = np.zeros(length, kind), np.ones(length, kind)
+        y, at_wall = blank(4, 2 * length, scale), blank(4, length, scale)
+        pull, reaction = blank(2, length, scale), blank(2, 2 * length, scale)
+        push, drive = blank(2, length, scale), blank(2, length, scale)
+        move, always = blank(1, length, scale)[0], blank(1, length, scale)[0]
+        for t in range(length):
+            always[t] = one
         _load(y, y0, members, people)
         shifts = people // 2 + 1 if mutual else people
         for step in range(steps):
             if step % per == 0:
                 _store(y, out[step // per], members, people)
+            begin = place + step * (4 + 4 * hidden) * length
+            kept = states[begin : begin + (4 + 4 * hidden) * length]
             if states.shape[0] > 0:
                 for c in range(4):
-                    begin = place + (step * 4 + c) * length
-                    states[begin : begin + length] = y[c, :length]
-            y[:, length:] = y[:, :length]
+                    copy(kept[c * length :], y[c, :length])
+            sums, wall_sums = _memory(kept, length, hidden)
+            for c in range(4):
+                copy(y[c, length:], y[c, :length])
             own = y[:, :length]
-            drive[:] = 0
-            interact(room, own, exists, goal, always, width, 0, 1, False, (rate,), drive, reaction)
-            pull[:] = 0
-            reaction[:] = 0
-            interact(room, own, exists, y, exists, width, 1, shifts, mutual, q, pull, reaction)
-            push[:] = 0
+            clear(drive)
+            sides = (own, exists, goal, always)
+            interact(room, sides, (width, 0, 1), False, (rate,), drive, reaction, sums)
+            clear(pull)
+            clear(reaction)
+            sides = (own, exists, y, exists)
+            meet(room, sides, (width, 1, shifts), mutual, q, pull, reaction, sums)
+            clear(push)
             if points:
-                at_wall[:2] = own[:2]
-                at_wall[2:] = slip * own[2:]
-                interact(
-                    room,
-                    at_wall,
-                    exists,
-                    barrier,
-                    solid,
-                    width,
-                    0,
-                    points,
-                    False,
-                    q_wall,
-                    push,
-                    reaction,
-                )
+                for c in range(4):
+                    multiply(at_wall[c], own[c], one if c < 2 else slip)
+                sides_wall = (at_wall, exists, barrier, solid)
+                span = (width, 0, points)
+                meet(room, sides_wall, span, False, q_wall, push, reaction, wall_sums)
             _periods(move, exists, members, end, step, dt)
             for c in range(2):
                 increase(pull[c], reaction[c, :length])
@@ -176,94 +194,63 @@ def backward(
     total_wall: Any,
 ) -> None:
     """Gradient of :func:`forward`; ``total`` and ``total_wall`` are added to."""  # fmt: skip
-    kind = grad_out.dtype
-    room = np.zeros(ROWS * SIZE, kind)
+    room, one = blank(1, ROWS * SIZE, scale)[0], real(1, dt)
     steps = per * (grad_out.shape[0] - 1)
+    hidden = q.shape[0] - 1 if q.ndim == 2 else 0
     for job in range(jobs.shape[0]):
-        low, width, people, points, place = jobs[job]
+        low, width, people = jobs[job, 0], jobs[job, 1], jobs[job, 2]
+        points, place = jobs[job, 3], jobs[job, 4]
         members = order[low : low + width]
         length = people * width
         exists, goal, barrier, solid, scales = _scene(members, people, points, still, wall, scale)
-        y, at_wall = np.zeros((4, 2 * length), kind), np.zeros((4, length), kind)
-        adjoint, to_own = np.zeros((4, length), kind), np.zeros((4, length), kind)
-        to_other, to_wall = np.zeros((4, 2 * length), kind), np.zeros((4, length), kind)
-        weight, weighed = np.zeros((2, length), kind), np.zeros((2, 2 * length), kind)
-        move, always = np.zeros(length, kind), np.ones(length, kind)
+        y, at_wall = blank(4, 2 * length, scale), blank(4, length, scale)
+        adjoint, to_own = blank(4, length, scale), blank(4, length, scale)
+        to_other, to_wall = blank(4, 2 * length, scale), blank(4, length, scale)
+        weight, weighed = blank(2, length, scale), blank(2, 2 * length, scale)
+        move, always = blank(1, length, scale)[0], blank(1, length, scale)[0]
+        for t in range(length):
+            always[t] = one
         shifts = people // 2 + 1 if mutual else people
         for step in range(steps - 1, -1, -1):
             if (step + 1) % per == 0:
                 _load(adjoint, grad_out[(step + 1) // per], members, people)
+            begin = place + step * (4 + 4 * hidden) * length
+            kept = states[begin : begin + (4 + 4 * hidden) * length]
             for c in range(4):
-                begin = place + (step * 4 + c) * length
-                y[c, :length] = states[begin : begin + length]
-                y[c, length:] = states[begin : begin + length]
+                copy(y[c], kept[c * length : (c + 1) * length])
+                copy(y[c, length:], y[c, :length])
+            sums, wall_sums = _memory(kept, length, hidden)
             own = y[:, :length]
             _periods(move, exists, members, end, step, dt)
             for c in range(2):
                 product(weight[c], move, adjoint[2 + c])
                 product(weighed[c, :length], weight[c], scales[0])
-                weighed[c, length:] = weighed[c, :length]
-            to_own[:] = 0
-            to_other[:] = 0
+                copy(weighed[c, length:], weighed[c, :length])
+            clear(to_own)
+            clear(to_other)
+            span = (width, 0, 1)
             interact_pull(
-                room,
-                own,
-                exists,
-                goal,
-                always,
-                width,
-                0,
-                1,
-                False,
-                False,
-                (rate,),
-                weight,
-                total,
-                to_own,
-                to_other,
-            )
-            interact_pull(
-                room,
-                own,
-                exists,
-                y,
-                exists,
-                width,
-                1,
-                shifts,
-                mutual,
-                True,
-                q,
-                weighed,
-                total,
-                to_own,
-                to_other,
-            )
+                room, (own, exists, goal, always), span, False, False, (rate,), weight, total,
+                to_own, to_other, sums,
+            )  # fmt: skip
+            span = (width, 1, shifts)
+            meet_pull(
+                room, (own, exists, y, exists), span, mutual, True, q, weighed, total, to_own,
+                to_other, sums,
+            )  # fmt: skip
             if points:
-                at_wall[:2] = own[:2]
-                at_wall[2:] = slip * own[2:]
-                to_wall[:] = 0
+                for c in range(4):
+                    multiply(at_wall[c], own[c], one if c < 2 else slip)
+                clear(to_wall)
                 for c in range(2):
                     product(weighed[c, :length], weight[c], scales[1])
-                interact_pull(
-                    room,
-                    at_wall,
-                    exists,
-                    barrier,
-                    solid,
-                    width,
-                    0,
-                    points,
-                    False,
-                    False,
-                    q_wall,
-                    weighed,
-                    total_wall,
-                    to_wall,
-                    to_other,
-                )
-                to_wall[2:] = slip * to_wall[2:]
+                span = (width, 0, points)
+                meet_pull(
+                    room, (at_wall, exists, barrier, solid), span, False, False, q_wall, weighed,
+                    total_wall, to_wall, to_other, wall_sums,
+                )  # fmt: skip
                 for c in range(4):
+                    multiply(to_wall[c], to_wall[c], one if c < 2 else slip)
                     increase(to_own[c], to_wall[c])
             for c in range(4):
                 increase(to_own[c], to_other[c, :length])

@@ -42,7 +42,7 @@ LANES = 16
 ROWS = 10
 
 #: Options of functions that hold a loop.
-LOOP: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
+LOOP: Any = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 # unsigned: a signed index may be negative, and would be tested for it in every load
 _1, _2, _3, _4, _5, _6, _7, _8, _9 = (np.uint64(row * SIZE) for row in range(1, ROWS))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import njit
 
 from nnode.solvers.fused._math import real
@@ -17,9 +18,36 @@ from nnode.solvers.fused.crowd_laws import LANES, LOOP, SIZE, law, law_pull
 
 
 @njit(**LOOP)
+def blank(rows: int, length: int, like: Any) -> Any:
+    """Zeros ``(rows, length)`` of the type of the array ``like``."""
+    return np.zeros((rows, length), like.dtype)
+
+
+@njit(**LOOP)
 def subtract(target: Any, a: Any, b: Any) -> None:
     for t in range(len(target)):
         target[t] = a[t] - b[t]
+
+
+@njit(**LOOP)
+def copy(target: Any, a: Any) -> None:
+    for t in range(len(a)):
+        target[t] = a[t]
+
+
+@njit(**LOOP)
+def multiply(target: Any, a: Any, factor: Any) -> None:
+    for t in range(len(target)):
+        target[t] = factor * a[t]
+
+
+@njit(**LOOP)
+def clear(rows: Any) -> None:
+    """Zeros in all rows of two axes."""
+    zero = real(0, rows[0, 0])
+    for c in range(rows.shape[0]):
+        for t in range(rows.shape[1]):
+            rows[c, t] = zero
 
 
 @njit(**LOOP)
@@ -79,29 +107,21 @@ def meeting(length: int, shift: int, number: int, mutual: bool) -> int:
 
 @njit(**LOOP)
 def interact(
-    room: Any,
-    own: Any,
-    real_own: Any,
-    other: Any,
-    real_other: Any,
-    width: int,
-    first: int,
-    last: int,
-    mutual: bool,
-    q: Any,
-    force: Any,
-    reaction: Any,
+    room: Any, sides: Any, span: Any, mutual: bool, q: Any, force: Any, reaction: Any, memory: Any
 ) -> None:
-    """Add the forces of sources at shifts ``first`` ... ``last - 1``.
+    """Add the forces of sources on receivers.
 
     Args:
-        own: ``(4, L)`` x, y, u, v of the receivers.
-        other: ``(4, M)`` the same of the sources.
-        real_own, real_other: 1 where a receiver or source exists, else 0.
+        sides: x, y, u, v of the receivers ``(4, L)``; 1 for every receiver that exists, else
+            0; the same two of the sources, periodic.
+        span: simulations in a row, first shift, and one more than the last shift.
         mutual: the sources are the receivers, and feel the opposite force.
         force: ``(2, L)`` sums over existing sources.
         reaction: ``(2, 2 L)`` sums over existing receivers, where ``mutual``.
-    """  # fmt: skip
+        memory: not used here.
+    """
+    own, real_own, other, real_other = sides
+    width, first, last = span
     length = own.shape[1]
     piece = pieces(length)
     for shift in range(first, last):
@@ -122,30 +142,19 @@ def interact(
 
 @njit(**LOOP)
 def interact_pull(
-    room: Any,
-    own: Any,
-    real_own: Any,
-    other: Any,
-    real_other: Any,
-    width: int,
-    first: int,
-    last: int,
-    mutual: bool,
-    moving: bool,
-    q: Any,
-    weight: Any,
-    total: Any,
-    to_own: Any,
-    to_other: Any,
-) -> None:
+    room: Any, sides: Any, span: Any, mutual: bool, moving: bool, q: Any, weight: Any,
+    total: Any, to_own: Any, to_other: Any, memory: Any,
+) -> None:  # fmt: skip
     """Gradient of :func:`interact`.
 
     Args:
         moving: the gradient with respect to the sources is wanted.
-        weight: ``(2, L)`` of the forces; ``(2, 2 L)``, periodic, where ``mutual``.
+        weight: ``(2, 2 L)`` of the forces, periodic.
         total: gradient with respect to ``q``, added to.
-        to_own, to_other: gradients with respect to ``own`` and ``other``, added to.
-    """  # fmt: skip
+        to_own, to_other: gradients with respect to receivers and sources, added to.
+    """
+    own, real_own, other, real_other = sides
+    width, first, last = span
     length = own.shape[1]
     piece = pieces(length)
     for shift in range(first, last):

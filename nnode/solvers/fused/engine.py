@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from importlib import import_module
-from importlib.util import find_spec
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,10 +12,7 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.fused import fallback, traffic
-
-_CROWD = "nnode.solvers.fused.crowd"
-crowd: Any = import_module(_CROWD) if find_spec(_CROWD) else None
+from nnode.solvers.fused import crowd, fallback, traffic
 
 
 class FusedSolver:
@@ -104,7 +98,7 @@ class FusedSolver:
         return substeps(batch.dt, self.dt, system.domain)
 
     def _other(self, system: System, batch: Batch, n: int, parameters: list[Tensor]) -> Trajectory:
-        if crowd is not None and crowd.supports(system):
+        if crowd.supports(system, batch):
             return Trajectory(*crowd.simulate(system, batch, n, self.threads))
         y = fallback.simulate(system, batch, n, parameters)
         return Trajectory(*system.observe(y, batch))

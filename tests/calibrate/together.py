@@ -1,0 +1,138 @@
+"""What the processes of ``test_distributed.py`` do: ``torchrun together.py STORE FOLDER``."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nnode.calibrate.distributed import World, join
+from nnode.calibrate.interrupt import Interrupted
+from nnode.calibrate.optimizers import (
+    AdadeltaOptions,
+    AdamOptions,
+    ConsensusOptions,
+    LbfgsOptions,
+    OptimizerOptions,
+    build_optimizer,
+)
+from nnode.calibrate.options import TrainerOptions
+from nnode.calibrate.trainer import Provenance, Trainer
+from nnode.data.dataset import SequenceDataset, make_loader
+from nnode.data.options import LoaderOptions
+from nnode.data.store import Store
+from nnode.errors import SimulationError
+from nnode.models import build_model
+from nnode.solvers import TorchdiffeqSolver
+
+N4 = {
+    "term": "network_speed",
+    "name": "n4",
+    "leader": "constant",
+    "hidden": 4,
+    "v0": 30.0,
+    "box": None,
+}
+LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 2.5, "L_min": 2.0}
+
+#: name: model, optimiser, sequences per mini-batch, epochs. Of five sequences, mini-batches of
+#: two leave an uneven rest, and of one nothing for the second process.
+CASES: dict[str, tuple[dict[str, Any], OptimizerOptions, int, int]] = {
+    "adadelta": (N4, AdadeltaOptions(), 2, 7),
+    "single": (N4, AdadeltaOptions(eta1=0.1), 1, 4),
+    "projected": (LIN, AdamOptions(lr=1.0), 2, 7),
+    "lbfgs": (N4, LbfgsOptions(max_iter=2), 0, 20),
+    "cbo": (LIN, ConsensusOptions(particles=4), 0, 20),
+}
+
+
+def make_trainer(case: str, store: Store, folder: Path) -> Trainer:
+    """A trainer of this process, with its share of the data."""
+    options, optimizer, size, epochs = CASES[case]
+    world, model = World(), build_model(options, 0)
+
+    def loader(indices: range, batch_size: int) -> Any:
+        chosen = LoaderOptions(batch_size=batch_size)
+        dataset = SequenceDataset(store, indices)
+        return make_loader(dataset, chosen, seed=0, rank=world.rank, size=world.size)
+
+    settings = TrainerOptions(max_epochs=epochs, figure_every=0, evaluate_every=3, save_every=1e9)
+    config = {"model": options, "seed": 0, "trainer": {"dtype": "float64"}}
+    return Trainer(
+        model,
+        TorchdiffeqSolver(dt=0.02),
+        build_optimizer(model, optimizer, 0),
+        loader(range(5), size),
+        loader(range(5, 7), 1),
+        settings,
+        folder,
+        Provenance(config=config, manifest=store.manifest, split={}),
+    )
+
+
+def numbers(trainer: Trainer) -> dict[str, Any]:
+    """Where a training has ended."""
+    flat = torch.cat([p.detach().flatten() for p in trainer.model.parameters()])
+    return {
+        "parameters": flat.tolist(),
+        "step": trainer.step,
+        "train": [row["cost/train"] for row in trainer.history],
+        "heldout": [row["cost/heldout"] for row in trainer.history],
+        "norms": [row["gradient_norm"] for row in trainer.history[1:]],
+    }
+
+
+def failing(store: Store, folder: Path) -> str:
+    """The message in this process when the simulation fails in the last process only."""
+    trainer = make_trainer("adadelta", store, folder)
+    solve = trainer.solver
+
+    def fail(model: Any, batch: Any) -> Any:
+        if trainer.step == 3 and World().rank == World().size - 1:
+            raise SimulationError(f"process {World().rank} lost a car")
+        return solve(model, batch)
+
+    trainer.solver = fail
+    try:
+        trainer.fit()
+    except SimulationError as error:
+        return str(error)
+    return "no error"
+
+
+def interrupted(store: Store, folder: Path) -> list[int]:
+    """Step and signal at the end, when only the last process is asked to stop in step 4."""
+    trainer = make_trainer("adadelta", store, folder)
+    descend = trainer._descend
+
+    def ask(batch: Any) -> None:
+        descend(batch)
+        if trainer.step == 3 and World().rank == World().size - 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    trainer._descend = ask  # type: ignore[method-assign]
+    try:
+        trainer.fit()
+    except Interrupted as stop:
+        return [trainer.step, stop.signal]
+    return [trainer.step, 0]
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    join()
+    prepared, out = Store(Path(sys.argv[1])), Path(sys.argv[2])
+    found: dict[str, Any] = {}
+    for name in CASES:
+        fitted = make_trainer(name, prepared, out / name)
+        fitted.fit()
+        found[name] = numbers(fitted)
+    found["failing"] = failing(prepared, out / "failing")
+    found["interrupted"] = interrupted(prepared, out / "interrupted")
+    (out / f"process_{World().rank}.json").write_text(json.dumps(found))
+    World().part()
