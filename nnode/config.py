@@ -60,14 +60,14 @@ class EvaluateConfig:
     checkpoint: str = MISSING
     data: Any = MISSING
     solver: SolverOptions = field(default_factory=SolverOptions)
-    part: str = "auto"  # heldout | train | all; auto: heldout where there is one
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
 
 
 @dataclass
 class PlotForcesConfig:
     """``scripts/plot_forces.py``: what calibrated models have learned."""
 
-    checkpoint: list[str] = MISSING
+    checkpoint: Any = MISSING  # one path or a list of paths
     data: Any = MISSING
     extent: float | None = None  # m, of contours; null suits the model
 

@@ -19,7 +19,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nnode.app.sweep import failures, record_failure
 from nnode.calibrate.interrupt import Interrupted
@@ -55,7 +55,8 @@ def run(name: str, job: Job, inject: Callable[[list[str]], list[str]] | None = N
         given = user_overrides(sys.argv[1:])
         if inject is not None:
             extra = inject(given)
-            sys.argv[1:1] = extra
+            first = sys.argv.index(given[0], 1) if given else len(sys.argv)
+            sys.argv[first:first] = extra
             given = extra + given
         if "--help" not in sys.argv and "-h" not in sys.argv:
             free = check_overrides(given, folder, name)
@@ -95,8 +96,14 @@ def _guarded(job: Job) -> Callable[[DictConfig], None]:
         settings = HydraConfig.get()
         folder = Path(settings.runtime.output_dir)
         try:
-            job(config, folder)
+            try:
+                job(config, folder)
+            except OmegaConfBaseException as error:
+                raise ConfigError(_missing(error)) from None
         except Interrupted as stop:
+            if settings.mode == RunMode.MULTIRUN:
+                text = f"{stop}\nthe sweep ends here: its later runs were not started"
+                stop = Interrupted(text, stop.signal)
             raise _Escape(stop) from None
         except NNodeError as error:
             if settings.mode != RunMode.MULTIRUN:
@@ -106,6 +113,14 @@ def _guarded(job: Job) -> Callable[[DictConfig], None]:
             record_failure(folder, str(error))
 
     return task
+
+
+def _missing(error: OmegaConfBaseException) -> str:
+    """What is wrong with a composed configuration, in one line."""
+    if isinstance(error, MissingMandatoryValue):
+        key = error.full_key or str(error).rpartition(" ")[2]
+        return f"{key} is not set; give it a value with {key}=..."
+    return str(error).splitlines()[0]
 
 
 def user_overrides(arguments: list[str]) -> list[str]:
@@ -203,14 +218,15 @@ def _check_option(override: Override, config: DictConfig) -> bool:
             if not depth:
                 valid += [g for g in ("experiment", "hydra") if g not in valid]
             nearest = get_close_matches(part, valid, n=1, cutoff=0.5)
-            hint = f"; did you mean {'.'.join([*parts[:depth], nearest[0]])}?" if nearest else ""
+            meant = ".".join([*parts[:depth], *nearest, *parts[depth + 1 :]])
+            hint = f"; did you mean {meant}?" if nearest else ""
             parent = ".".join(parts[:depth]) or "the configuration"
             raise ConfigError(
                 f"option {key} is unknown{hint} ({parent} has: {', '.join(valid) or 'no options'})"
             )
         node = node._get_node(part)
     if override.is_delete():
-        return False
+        raise ConfigError(f"~{key}: an option cannot be deleted; set {key}=null or leave it out")
     values = list(override.sweep_iterator()) if override.is_sweep_override() else [override.value()]
     for value in values:
         try:

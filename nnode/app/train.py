@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
-from nnode.app.saved import merge_saved, plain_config, refuse_changes
+from nnode.app.saved import merge_saved, plain_config, refuse_changes, shell_override
 from nnode.app.sweep import RESULT, write_json
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.evaluate import best_common_speed
@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 RESUMABLE = (
     "data.source",
     "data.prepared",
+    "data.path",
+    "data.download",
     "data.loader.workers",
     "trainer.max_epochs",
     "trainer.patience",
@@ -79,6 +81,8 @@ def _check(config: DictConfig) -> None:
     for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
         if trainer[name] < low:
             raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}")
+    if trainer.save_every < 0:
+        raise ConfigError(f"trainer.save_every={trainer.save_every} must be at least 0 s")
     if trainer.patience is not None and trainer.patience < 1:
         raise ConfigError(f"trainer.patience={trainer.patience} must be at least 1, or null")
 
@@ -151,13 +155,16 @@ def train(config: DictConfig, folder: Path) -> None:
     if resume is not None:
         trainer.restore(Path(resume))
         log.info("resumed from %s at epoch %d, step %d", resume, trainer.epoch, trainer.step)
+        if trainer.epoch >= options.max_epochs:
+            log.info("nothing left to train: raise trainer.max_epochs=%d", options.max_epochs)
     start = time.monotonic()
     try:
         trainer.fit()
     except Interrupted as stop:
         raise Interrupted(
-            f"{stop}\nresume with: python scripts/train.py resume={trainer.last_path} "
-            f"hydra.run.dir={folder}",
+            f"{stop}\nresume with: python scripts/train.py "
+            f"{shell_override('resume', trainer.last_path)} "
+            f"{shell_override('hydra.run.dir', folder)}",
             stop.signal,
         ) from None
     _report(trainer, plain, folder, time.monotonic() - start)
@@ -223,4 +230,5 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
     for name, (_, unit) in physical.items():
         print(f"{name} = {best[f'parameters/{name}']:.4g} {unit}")
     for what, path in paths.items():
-        print(f"{what}: {path}")
+        if Path(path).exists():
+            print(f"{what}: {path}")

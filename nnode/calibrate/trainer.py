@@ -6,10 +6,10 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import torch
 from matplotlib.figure import Figure
@@ -42,6 +42,10 @@ class Provenance:
     manifest: dict[str, Any]
     split: dict[str, list[str]]
     free_speed: float | None = None
+
+
+class _StopRequested(Exception):
+    """A signal arrived during an evaluation, which will be done again after resuming."""
 
 
 class Trainer:
@@ -79,6 +83,7 @@ class Trainer:
         self.best, self.best_epoch, self.stale = float("inf"), -1, 0
         self.seconds = 0.0
         self._pending_best: Checkpoint | None = None
+        self._guard = InterruptGuard()
         self._clock = self._saved = time.monotonic()
 
     @property
@@ -187,13 +192,21 @@ class Trainer:
     def costs(self) -> dict[str, float]:
         """Cost of the present model on the training and on the held-out sequences."""
         found = {}
+
+        def batches(loader: DataLoader[Any]) -> Iterator[Batch]:
+            for batch in loader:
+                if self._guard.requested is not None:
+                    raise _StopRequested
+                yield batch.to(dtype=self.dtype)
+
         for name, loader in (("train", self.train), ("heldout", self.heldout)):
             if loader is None:
                 continue
             if name == "train":
                 cast(EpochSampler, loader.batch_sampler).set_epoch(self.epoch)
-            batches = (batch.to(dtype=self.dtype) for batch in loader)
-            metrics = evaluate(lambda b: self.solver(self.model, b), batches, self.options.cost)
+            metrics = evaluate(
+                lambda b: self.solver(self.model, b), batches(loader), self.options.cost
+            )
             found[f"cost/{name}"] = metrics.J
         return found
 
@@ -238,36 +251,47 @@ class Trainer:
         logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
         self._clock = time.monotonic()
         finished = False
-        reporter = Reporter(options.max_epochs * per_epoch, self.step)
         try:
-            with InterruptGuard() as guard, reporter:
+            with InterruptGuard() as self._guard:
                 if fresh:
-                    self._evaluate(logbook)
-                    self._draw(logbook)
-                    self.save()
-                while self.epoch < options.max_epochs and not self._stalled():
-                    sampler.set_epoch(self.epoch)
-                    sampler.set_start(self.batch)
-                    for batch in self.train:
-                        self._descend(batch)
-                        self.batch += 1
-                        self.step += 1
-                        reporter.advance(self._note())
-                        self._save_if_due(guard)
-                    self._end_epoch(logbook, per_epoch)
-                    self._save_if_due(guard)
+                    self._start(logbook)
+                with Reporter(options.max_epochs * per_epoch, self.step) as reporter:
+                    while self.epoch < options.max_epochs and not self._stalled():
+                        sampler.set_epoch(self.epoch)
+                        sampler.set_start(self.batch)
+                        for batch in self.train:
+                            self._descend(batch)
+                            self.batch += 1
+                            self.step += 1
+                            reporter.advance(self._note())
+                            self._save_if_due()
+                        self._end_epoch(logbook, per_epoch)
+                        self._save_if_due()
                 self.save()
             finished = True
         finally:
             logbook.close({"cost/best": self.best} if finished else None)
 
+    def _start(self, logbook: Logbook) -> None:
+        self.save()  # something to resume from, even during a long first evaluation
+        try:
+            self._evaluate(logbook)
+        except _StopRequested:
+            self._stop()
+        self._draw(logbook)
+        self.save()
+
     def _end_epoch(self, logbook: Logbook, per_epoch: int) -> None:
-        minibatch = self.sum / per_epoch
+        before = self.epoch, self.batch, self.sum
         # counters first: a checkpoint made below belongs to the start of the next epoch
         self.epoch, self.batch, self.sum = self.epoch + 1, 0, 0.0
         last = self.epoch == self.options.max_epochs
         if self.epoch % self.options.evaluate_every == 0 or last:
-            self._evaluate(logbook, minibatch)
+            try:
+                self._evaluate(logbook, before[2] / per_epoch)
+            except _StopRequested:
+                self.epoch, self.batch, self.sum = before
+                self._stop()
         every = self.options.figure_every
         if every and (self.epoch % every == 0 or last):
             self._draw(logbook)
@@ -278,16 +302,21 @@ class Trainer:
     def _note(self) -> str:
         return f"epoch {self.epoch + 1}, best {self.options.monitor.value} cost {self.best:.4g}"
 
-    def _save_if_due(self, guard: InterruptGuard) -> None:
-        if guard.requested is not None:
-            self.save()
-            raise Interrupted(
-                f"stopped at step {self.step} (epoch {self.epoch + 1}); "
-                f"everything up to here is in {self.last_path}",
-                guard.requested,
-            )
+    def _save_if_due(self) -> None:
+        if self._guard.requested is not None:
+            self._stop()
         if time.monotonic() - self._saved >= self.options.save_every:
             self.save()
+
+    def _stop(self) -> NoReturn:
+        """Save, and end because a signal asked for it."""
+        self.save()
+        assert self._guard.requested is not None
+        raise Interrupted(
+            f"stopped at step {self.step} (epoch {self.epoch + 1}); "
+            f"everything up to here is in {self.last_path}",
+            self._guard.requested,
+        )
 
 
 def _copy(value: Any) -> Any:
