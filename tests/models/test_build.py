@@ -128,7 +128,8 @@ def test_v0_of_a_network_with_a_measured_leader_is_idle() -> None:
     assert list(free.physical()) == ["v0"]
     assert list(idle.physical()) == []
     trained = [name for name, p in idle.named_parameters() if p.requires_grad]
-    assert trained and not any(name.endswith("v0") for name in trained)
+    assert trained
+    assert not any(name.endswith("v0") for name in trained)
 
 
 @pytest.mark.parametrize("v0", [0.0, -3.0, float("nan")])
