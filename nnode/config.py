@@ -18,7 +18,13 @@ from nnode.calibrate.optimizers import (
     ConsensusOptions,
     LbfgsOptions,
 )
-from nnode.calibrate.options import Device, Precision, SolverOptions, TrainerOptions
+from nnode.calibrate.options import (
+    Device,
+    FusedOptions,
+    Precision,
+    TorchdiffeqOptions,
+    TrainerOptions,
+)
 from nnode.data.options import (
     EsimasOptions,
     JuelichOptions,
@@ -39,7 +45,7 @@ class TrainConfig:
 
     model: Any = MISSING
     data: Any = MISSING
-    solver: SolverOptions = field(default_factory=SolverOptions)
+    solver: Any = MISSING
     optimizer: Any = MISSING
     trainer: TrainerOptions = field(default_factory=TrainerOptions)
     seed: int = 0  # of start weights, order of mini-batches and noise
@@ -59,16 +65,16 @@ class EvaluateConfig:
 
     checkpoint: str = MISSING
     data: Any = MISSING
-    solver: SolverOptions = field(default_factory=SolverOptions)
+    solver: Any = MISSING
     device: Device = Device.auto
-    part: str = "auto"  # heldout | train | all; auto: heldout where there is one
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
 
 
 @dataclass
 class PlotForcesConfig:
     """``scripts/plot_forces.py``: what calibrated models have learned."""
 
-    checkpoint: list[str] = MISSING
+    checkpoint: Any = MISSING  # one path or a list of paths
     data: Any = MISSING
     extent: float | None = None  # m, of contours; null suits the model
 
@@ -106,6 +112,8 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("data", "vehicles_schema"): VehicleTableOptions,
     ("data", "juelich_schema"): JuelichOptions,
     ("data", "table_schema"): TableOptions,
+    ("solver", "torchdiffeq_schema"): TorchdiffeqOptions,
+    ("solver", "fused_schema"): FusedOptions,
     ("optimizer", "adadelta_schema"): AdadeltaOptions,
     ("optimizer", "adam_schema"): AdamOptions,
     ("optimizer", "lbfgs_schema"): LbfgsOptions,

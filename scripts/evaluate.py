@@ -14,5 +14,5 @@ if __name__ == "__main__":
     run(
         "evaluate",
         evaluate_checkpoint,
-        partial(saved_groups, option="checkpoint", groups=("data",)),
+        partial(saved_groups, option="checkpoint", groups=("data", "solver")),
     )

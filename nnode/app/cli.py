@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nnode.app.launchers import check_launcher, has_no_part, out_of_sight
 from nnode.app.sweep import failures, record_failure
@@ -90,7 +90,8 @@ def _arguments(
     given = user_overrides(sys.argv[1:])
     if inject is not None:
         extra = inject(given)
-        sys.argv[1:1] = extra
+        first = sys.argv.index(given[0], 1) if given else len(sys.argv)
+        sys.argv[first:first] = extra
         given = extra + given
     check_launcher(given)
     if "--help" not in sys.argv and "-h" not in sys.argv:
@@ -134,12 +135,18 @@ def _guarded(job: Job) -> Callable[[DictConfig], None]:
         settings = HydraConfig.get()
         folder = Path(settings.runtime.output_dir)
         try:
-            job(config, folder)
+            try:
+                job(config, folder)
+            except OmegaConfBaseException as error:
+                raise ConfigError(_missing(error)) from None
         except NNodeError as error:
             # a launcher may run the job elsewhere, where only this job can be stopped
             stopped = isinstance(error, Interrupted) and os.getpid() == here
             alone = World().size > 1 and not World().agreed
             if stopped or alone or settings.mode != RunMode.MULTIRUN:
+                if isinstance(error, Interrupted) and settings.mode == RunMode.MULTIRUN:
+                    text = f"{error}\nthe sweep ends here: its later runs were not started"
+                    error = Interrupted(text, error.signal)
                 raise _Escape(error) from None
             # the other jobs of a sweep go on
             if World().first:
@@ -147,6 +154,14 @@ def _guarded(job: Job) -> Callable[[DictConfig], None]:
             record_failure(folder, str(error))
 
     return task
+
+
+def _missing(error: OmegaConfBaseException) -> str:
+    """What is wrong with a composed configuration, in one line."""
+    if isinstance(error, MissingMandatoryValue):
+        key = error.full_key or str(error).rpartition(" ")[2]
+        return f"{key} is not set; give it a value with {key}=..."
+    return str(error).splitlines()[0]
 
 
 def user_overrides(arguments: list[str]) -> list[str]:
@@ -244,14 +259,15 @@ def _check_option(override: Override, config: DictConfig) -> bool:
             if not depth:
                 valid += [g for g in ("experiment", "hydra") if g not in valid]
             nearest = get_close_matches(part, valid, n=1, cutoff=0.5)
-            hint = f"; did you mean {'.'.join([*parts[:depth], nearest[0]])}?" if nearest else ""
+            meant = ".".join([*parts[:depth], *nearest, *parts[depth + 1 :]])
+            hint = f"; did you mean {meant}?" if nearest else ""
             parent = ".".join(parts[:depth]) or "the configuration"
             raise ConfigError(
                 f"option {key} is unknown{hint} ({parent} has: {', '.join(valid) or 'no options'})"
             )
         node = node._get_node(part)
     if override.is_delete():
-        return False
+        raise ConfigError(f"~{key}: an option cannot be deleted; set {key}=null or leave it out")
     values = list(override.sweep_iterator()) if override.is_sweep_override() else [override.value()]
     for value in values:
         try:

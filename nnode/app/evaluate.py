@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -18,38 +19,61 @@ from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import Metrics, Simulate, baselines, evaluate
 from nnode.calibrate.options import Device, SolverOptions
 from nnode.data.options import DataOptions
-from nnode.data.prepare import open_data
+from nnode.data.prepare import NOT_PREPARATION, open_data
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 
-PARTS = ("auto", "heldout", "train", "all")
+PARTS = ("auto", "heldout", "train", "unseen", "all")
 
 
-def choose(store: Store, checkpoint: Checkpoint, part: str) -> tuple[str, list[int]]:
+def choose(store: Store, checkpoint: Checkpoint, part: str) -> tuple[str, list[int], int | None]:
     """Which sequences of a store are evaluated.
 
-    ``heldout`` and ``train`` are the checkpoint's own parts, recognised by name and source
-    hashes. ``auto``: held-out sequences where the data are the checkpoint's and it held some
-    out, else all.
+    ``heldout`` and ``train`` are the checkpoint's own parts; ``unseen`` is what it neither
+    trained on nor dropped beside it. ``auto`` takes the held-out sequences where these data have
+    some, else the unseen ones, else all.
+
+    Returns:
+        The part, its positions in the store, and how many of them were trained on; None where
+        that cannot be told, because the same files were cut into sequences in another way.
 
     Raises:
         ConfigError: an unknown part, or one that these data do not have.
     """
     if part not in PARTS:
         raise ConfigError(f"part={part} is unknown, expected one of {', '.join(PARTS)}")
-    same = source_hashes(store.manifest) == source_hashes(checkpoint.manifest)
-    own = {name: set(checkpoint.split.get(name, [])) for name in ("heldout", "train")}
+    before = set(source_hashes(checkpoint.manifest).values())
+    shared = bool(before & set(source_hashes(store.manifest).values()))
+    known = not shared or _cutting(store.manifest) == _cutting(checkpoint.manifest)
+    own = {
+        name: set(checkpoint.split.get(name, [])) if shared and known else set()
+        for name in ("heldout", "train", "dropped")
+    }
+    names = [entry["name"] for entry in store.index]
+    found = {
+        "heldout": [i for i, name in enumerate(names) if name in own["heldout"]],
+        "train": [i for i, name in enumerate(names) if name in own["train"]],
+        "unseen": [
+            i for i, n in enumerate(names) if known and n not in own["train"] | own["dropped"]
+        ],
+        "all": list(range(len(store))),
+    }
     if part == "auto":
-        part = "heldout" if same and own["heldout"] else "all"
-    if part == "all":
-        return part, list(range(len(store)))
-    indices = [i for i, entry in enumerate(store.index) if entry["name"] in own[part]]
-    if not same or not indices:
+        part = next(name for name in ("heldout", "unseen", "all") if found[name])
+    if not found[part]:
         raise ConfigError(
-            f"part={part} needs data with sequences of the checkpoint's {part} part; these have "
-            "none, use part=all"
+            f"part={part}: these data have no such sequences of the checkpoint; use part=all"
         )
-    return part, indices
+    trained = len(set(found[part]) & set(found["train"])) if known else None
+    return part, found[part], trained
+
+
+def _cutting(manifest: dict[str, Any]) -> dict[str, Any]:
+    """The options that decide how files become sequences, whichever of them are kept."""
+    options = dict(manifest.get("options", {}))
+    for key in ("recording", "faults", "path", "name", *NOT_PREPARATION):
+        options.pop(key, None)
+    return options
 
 
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
@@ -64,9 +88,14 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
     store = open_data(data, folder / "data")
-    part, indices = choose(store, checkpoint, config.part)
+    part, indices, trained = choose(store, checkpoint, config.part)
+    if trained is None:
+        print("these files were cut into sequences in another way than in training: some of what")
+        print("is evaluated may have been trained on")
+    elif trained and part != "train":
+        print(f"{trained} of the {len(indices)} sequences were trained on")
     device = World().use(Device(config.device), "device")
-    model, solver = checkpoint.build().to(device), build_solver(solver_options)
+    model, solver = checkpoint.build().to(device), build_solver(solver_options, device)
     dtype = getattr(torch, checkpoint.config["trainer"]["dtype"])
     convention = Convention(checkpoint.config["trainer"]["cost"])
 
@@ -88,6 +117,7 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
             "model": name,
             "data": data.name,
             "part": part,
+            "trained_on": trained,
             "unit": "m² s" if convention is Convention.integral else "m²",
             "parameters": {k: float(v) for k, (v, _) in model.physical().items()},
             "free_speed": checkpoint.free_speed,

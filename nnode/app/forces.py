@@ -46,7 +46,8 @@ def plot_forces(config: DictConfig, folder: Path) -> None:
     Raises:
         NNodeError: a missing or damaged checkpoint, or traffic and crowd models together.
     """
-    paths = list(config.checkpoint)
+    given = config.checkpoint
+    paths = [given] if isinstance(given, str) else list(given)
     if not paths:
         raise ConfigError("checkpoint=[] names no checkpoint; give one or more paths")
     checkpoints = [load_checkpoint(path) for path in paths]

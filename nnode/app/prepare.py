@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.data.options import DataOptions
 from nnode.data.prepare import prepare
+from nnode.plots.quality import plot_faults
 
 
 def prepare_data(config: DictConfig, folder: Path) -> None:
@@ -17,6 +18,13 @@ def prepare_data(config: DictConfig, folder: Path) -> None:
         NNodeError: see :func:`nnode.data.prepare.prepare`.
     """
     options: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    store = prepare(options, folder)
-    print(f"{len(store)} sequences: {folder}")
+    store = prepare(options, folder, draw=plot_faults)
+    reasons: dict[str, int] = {}
+    for recording in store.manifest["recordings"].values():
+        for kind, number in recording["faulty"].items():
+            reasons[kind] = reasons.get(kind, 0) + number
+    if reasons:
+        listed = ", ".join(f"{kind} in {number}" for kind, number in sorted(reasons.items()))
+        print(f"faults: {listed} sequences; pictures in {folder / 'faults'}")
+    print(f"{len(store)} sequences: {folder} (train with data.prepared={folder})")
     print(f"manifest: {folder / 'manifest.json'}")

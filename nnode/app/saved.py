@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -10,7 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.errors import ConfigError
 
-GROUPS = ("model", "data", "optimizer")
+GROUPS = ("model", "data", "optimizer", "solver")
+
+
+#: Groups that were chosen for the user, from his first checkpoint.
+_chosen: set[str] = set()
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
@@ -19,6 +26,11 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     assert isinstance(plain, dict)
     choices = HydraConfig.get().runtime.choices
     groups = {group: str(choices[group]) for group in GROUPS if group in choices}
+    data = plain.get("data", {})
+    for key in ("path", "source", "prepared", "walls"):
+        place = data.get(key)
+        if isinstance(place, str) and Path(place).exists():
+            data[key] = str(Path(place).absolute())  # found again from any working directory
     return {**{str(k): v for k, v in plain.items() if k != "resume"}, "groups": groups}
 
 
@@ -38,18 +50,28 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
         return []
     saved = load_checkpoint(path).config["groups"]
     given = {override.partition("=")[0] for override in overrides}
-    return [f"{g}={saved[g]}" for g in groups if g in saved and g not in given]
+    chosen = [g for g in groups if g in saved and g not in given]
+    _chosen.update(chosen)
+    return [f"{group}={saved[group]}" for group in chosen]
 
 
 def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, ...]) -> DictConfig:
     """``config`` with ``sections`` as a checkpoint has them, and the user's options on top.
 
     A section stays as composed where the user chose another group than the checkpoint's.
+
+    Raises:
+        ConfigError: checkpoints of different groups in one sweep.
     """
     merged = config.copy()
     choices = HydraConfig.get().runtime.choices
     for name in sections:
         if name in saved["groups"] and choices[name] != saved["groups"][name]:
+            if name in _chosen:
+                raise ConfigError(
+                    f"this checkpoint has {name}={saved['groups'][name]}, the first one of the "
+                    f"sweep {name}={choices[name]}; sweep over checkpoints of one {name}"
+                )
             continue
         OmegaConf.update(merged, name, saved[name], merge=True)
     for override in HydraConfig.get().overrides.task:
@@ -80,3 +102,12 @@ def refuse_changes(
                 f"{saved.get(key)}, asked for is {now[key]}; leave the option out, or start a "
                 "new run without resume="
             )
+
+
+def shell_override(key: str, value: object) -> str:
+    """``key=value`` as it can be typed, whatever characters the value has."""
+    text = str(value)
+    if not re.fullmatch(r"[\w./:+-]*", text):
+        escaped = text.replace("'", "\\'")
+        text = f"'{escaped}'"
+    return shlex.quote(f"{key}={text}")

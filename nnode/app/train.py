@@ -13,14 +13,19 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
-from nnode.app.saved import merge_saved, plain_config, refuse_changes
+from nnode.app.saved import merge_saved, plain_config, refuse_changes, shell_override
 from nnode.app.sweep import RESULT, write_json
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.interrupt import Interrupted
 from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
-from nnode.calibrate.options import SolverOptions, TrainerOptions
+from nnode.calibrate.options import (
+    FusedOptions,
+    SolverOptions,
+    TorchdiffeqOptions,
+    TrainerOptions,
+)
 from nnode.calibrate.trainer import Provenance, Trainer
 from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import DataOptions, LoaderOptions
@@ -31,7 +36,7 @@ from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.models import System, build_model
 from nnode.plots import force_figure
-from nnode.solvers import TorchdiffeqSolver, substeps
+from nnode.solvers import Solver, TorchdiffeqSolver, substeps
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +44,8 @@ log = logging.getLogger(__name__)
 RESUMABLE = (
     "data.source",
     "data.prepared",
+    "data.path",
+    "data.download",
     "data.loader.workers",
     "trainer.device",
     "trainer.max_epochs",
@@ -50,8 +57,22 @@ RESUMABLE = (
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
 
 
-def build_solver(options: SolverOptions) -> TorchdiffeqSolver:
-    """The solver that the options describe."""
+def build_solver(options: SolverOptions, device: torch.device | None = None) -> Solver:
+    """The solver that the options describe.
+
+    Raises:
+        ConfigError: unknown options, or a compiled solver asked to work on a GPU.
+    """
+    if isinstance(options, FusedOptions):
+        if device is not None and device.type != "cpu":
+            raise ConfigError(
+                f"solver=fused works on the CPU, the device is {device}; set the device to cpu, "
+                "or take solver=torchdiffeq"
+            )
+        from nnode.solvers import FusedSolver  # loads Numba, which takes a second
+
+        return FusedSolver(options.dt, options.threads)
+    assert isinstance(options, TorchdiffeqOptions)
     return TorchdiffeqSolver(
         options.method, options.gradient.value, options.dt, options.rtol, options.atol
     )
@@ -88,6 +109,8 @@ def _check(config: DictConfig) -> None:
     for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
         if trainer[name] < low:
             raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}")
+    if trainer.save_every < 0:
+        raise ConfigError(f"trainer.save_every={trainer.save_every} must be at least 0 s")
     if trainer.patience is not None and trainer.patience < 1:
         raise ConfigError(f"trainer.patience={trainer.patience} must be at least 1, or null")
 
@@ -120,8 +143,9 @@ def train(config: DictConfig, folder: Path) -> None:
         trainer.fit()
     except Interrupted as stop:
         raise Interrupted(
-            f"{stop}\nresume with: python scripts/train.py resume={trainer.last_path} "
-            f"hydra.run.dir={folder}",
+            f"{stop}\nresume with: python scripts/train.py "
+            f"{shell_override('resume', trainer.last_path)} "
+            f"{shell_override('hydra.run.dir', folder)}",
             stop.signal,
         ) from None
     if world.first:
@@ -182,7 +206,7 @@ def _trainer(
         else None
     )
     solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
-    solver = build_solver(solver_options)
+    solver = build_solver(solver_options, next(model.parameters()).device)
     n = substeps(store[0].dt, solver_options.dt, model.domain)
     log.info(
         "%s: %d sequences train, %d held out, %d dropped between; %d steps per sample",
@@ -214,6 +238,8 @@ def _trainer(
     if config.resume is not None:
         trainer.restore(Path(config.resume))
         log.info("resumed from %s at epoch %d, step %d", config.resume, trainer.epoch, trainer.step)
+        if trainer.epoch >= options.max_epochs:
+            log.info("nothing left to train: raise trainer.max_epochs=%d", options.max_epochs)
     return trainer
 
 
@@ -277,4 +303,5 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
     for name, (_, unit) in physical.items():
         print(f"{name} = {best[f'parameters/{name}']:.4g} {unit}")
     for what, path in paths.items():
-        print(f"{what}: {path}")
+        if Path(path).exists():
+            print(f"{what}: {path}")

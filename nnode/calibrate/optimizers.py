@@ -69,18 +69,25 @@ class ConsensusOptions(OptimizerOptions):
     dt: float = 0.1
 
 
+def _trained(model: System) -> list[torch.nn.Parameter]:
+    return [parameter for parameter in model.parameters() if parameter.requires_grad]
+
+
 def _adadelta(model: System, o: dict[str, Any], seed: int) -> Optimizer:
-    return NoisyAdadelta(model.parameters(), **o, seed=seed)
+    return NoisyAdadelta(_trained(model), **o, seed=seed)
 
 
 def _adam(model: System, o: dict[str, Any], seed: int) -> Optimizer:
     betas = (o["beta1"], o["beta2"])
-    return torch.optim.Adam(model.parameters(), lr=o["lr"], betas=betas, eps=o["eps"])
+    return torch.optim.Adam(_trained(model), lr=o["lr"], betas=betas, eps=o["eps"])
 
 
 def _lbfgs(model: System, o: dict[str, Any], seed: int) -> Optimizer:
+    for name in ("max_iter", "history"):
+        if o[name] < 1:
+            raise ValueError(f"{name}={o[name]} must be at least 1")
     return torch.optim.LBFGS(
-        model.parameters(),
+        _trained(model),
         lr=o["lr"],
         max_iter=o["max_iter"],
         history_size=o["history"],
@@ -89,7 +96,7 @@ def _lbfgs(model: System, o: dict[str, Any], seed: int) -> Optimizer:
 
 
 def _cbo(model: System, o: dict[str, Any], seed: int) -> Optimizer:
-    return ConsensusBased(model.parameters(), **o, project=model.project_, seed=seed)
+    return ConsensusBased(_trained(model), **o, project=model.project_, seed=seed)
 
 
 #: name: how to build it, and whether it compares costs of different steps

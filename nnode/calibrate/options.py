@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from omegaconf import MISSING
+
 from nnode.calibrate.cost import Convention
 
 
@@ -39,13 +41,29 @@ class Monitor(str, Enum):
 
 @dataclass
 class SolverOptions:
+    """What all solvers share."""
+
+    name: str = MISSING
+    dt: float | None = None  # s; null takes the domain's
+
+
+@dataclass
+class TorchdiffeqOptions(SolverOptions):
     """See :class:`nnode.solvers.TorchdiffeqSolver`."""
 
+    name: str = "torchdiffeq"
     method: str = "euler"
     gradient: Gradient = Gradient.adjoint
-    dt: float | None = None  # s
     rtol: float = 1e-6
     atol: float = 1e-8
+
+
+@dataclass
+class FusedOptions(SolverOptions):
+    """See :class:`nnode.solvers.FusedSolver`."""
+
+    name: str = "fused"
+    threads: int = 1
 
 
 @dataclass

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import torch
 from matplotlib.figure import Figure
@@ -45,6 +45,10 @@ class Provenance:
     manifest: dict[str, Any]
     split: dict[str, list[str]]
     free_speed: float | None = None
+
+
+class _StopRequested(Exception):
+    """A signal arrived during an evaluation, which will be done again after resuming."""
 
 
 class Trainer:
@@ -90,6 +94,7 @@ class Trainer:
         self.best, self.best_epoch, self.stale = float("inf"), -1, 0
         self.seconds = 0.0
         self._pending_best: Checkpoint | None = None
+        self._guard = InterruptGuard()
         self._clock = self._saved = time.monotonic()
 
     @property
@@ -217,6 +222,7 @@ class Trainer:
     def costs(self) -> dict[str, float]:
         """Cost of the present model on the training and on the held-out sequences."""
         found = {}
+
         for name, loader in (("train", self.train), ("heldout", self.heldout)):
             if loader is None:
                 continue
@@ -237,7 +243,12 @@ class Trainer:
 
     def _shares(self, loader: DataLoader[Any]) -> Iterator[Batch]:
         """This process's shares of the mini-batches, where it has one."""
-        return (batch.to(self.device, self.dtype) for batch in loader if batch is not None)
+        for batch in loader:
+            # several processes have to agree before they stop, which they do after a step
+            if self.world.size == 1 and self._guard.requested is not None:
+                raise _StopRequested
+            if batch is not None:
+                yield batch.to(self.device, self.dtype)
 
     def _evaluate(self, logbook: Logbook | None, minibatch: float | None = None) -> None:
         row: dict[str, float] = {"epoch": float(self.epoch), "step": float(self.step)}
@@ -279,43 +290,57 @@ class Trainer:
         if options.monitor is Monitor.heldout and self.heldout is None:
             log.warning("trainer.monitor=heldout, but no sequence is held out: watching train")
         fresh = self.step == 0 and not self.history
-        logbook, reporter = None, None
+        logbook = None
         if self.world.first:
             logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
-            reporter = Reporter(options.max_epochs * per_epoch, self.step)
         self._clock = time.monotonic()
         finished = False
         try:
-            with InterruptGuard() as guard, reporter or nullcontext():
+            with InterruptGuard() as self._guard:
                 if fresh:
-                    self._evaluate(logbook)
-                    self._draw(logbook)
-                    self.save()
-                while self.epoch < options.max_epochs and not self._stalled():
-                    sampler.set_epoch(self.epoch)
-                    sampler.set_start(self.batch)
-                    for batch in self.train:
-                        self._descend(batch)
-                        self.batch += 1
-                        self.step += 1
-                        if reporter is not None:
-                            reporter.advance(self._note())
-                        self._save_if_due(guard)
-                    self._end_epoch(logbook, per_epoch)
-                    self._save_if_due(guard)
+                    self._start(logbook)
+                reporter = None
+                if self.world.first:
+                    reporter = Reporter(options.max_epochs * per_epoch, self.step)
+                with reporter or nullcontext():
+                    while self.epoch < options.max_epochs and not self._stalled():
+                        sampler.set_epoch(self.epoch)
+                        sampler.set_start(self.batch)
+                        for batch in self.train:
+                            self._descend(batch)
+                            self.batch += 1
+                            self.step += 1
+                            if reporter is not None:
+                                reporter.advance(self._note())
+                            self._save_if_due()
+                        self._end_epoch(logbook, per_epoch)
+                        self._save_if_due()
                 self.save()
             finished = True
         finally:
             if logbook is not None:
                 logbook.close({"cost/best": self.best} if finished else None)
 
+    def _start(self, logbook: Logbook | None) -> None:
+        self.save()  # something to resume from, even during a long first evaluation
+        try:
+            self._evaluate(logbook)
+        except _StopRequested:
+            self._stop(self._guard.requested or 0)
+        self._draw(logbook)
+        self.save()
+
     def _end_epoch(self, logbook: Logbook | None, per_epoch: int) -> None:
-        minibatch = self.sum / per_epoch
+        before = self.epoch, self.batch, self.sum
         # counters first: a checkpoint made below belongs to the start of the next epoch
         self.epoch, self.batch, self.sum = self.epoch + 1, 0, 0.0
         last = self.epoch == self.options.max_epochs
         if self.epoch % self.options.evaluate_every == 0 or last:
-            self._evaluate(logbook, minibatch)
+            try:
+                self._evaluate(logbook, before[2] / per_epoch)
+            except _StopRequested:
+                self.epoch, self.batch, self.sum = before
+                self._stop(self._guard.requested or 0)
         every = self.options.figure_every
         if every and (self.epoch % every == 0 or last):
             self._draw(logbook)
@@ -326,19 +351,23 @@ class Trainer:
     def _note(self) -> str:
         return f"epoch {self.epoch + 1}, best {self.options.monitor.value} cost {self.best:.4g}"
 
-    def _save_if_due(self, guard: InterruptGuard) -> None:
-        number = self.world.most(guard.requested or 0)
+    def _save_if_due(self) -> None:
+        number = self.world.most(self._guard.requested or 0)
         if number:
-            self.save()
-            self.world.meet()  # nobody leaves before the state is on the disk
-            World.agreed = True
-            raise Interrupted(
-                f"stopped at step {self.step} (epoch {self.epoch + 1}); "
-                f"everything up to here is in {self.last_path}",
-                number,
-            )
+            self._stop(number)
         if time.monotonic() - self._saved >= self.options.save_every:
             self.save()
+
+    def _stop(self, number: int) -> NoReturn:
+        """Save, and end because the signal ``number`` asked for it."""
+        self.save()
+        self.world.meet()  # nobody leaves before the state is on the disk
+        World.agreed = True
+        raise Interrupted(
+            f"stopped at step {self.step} (epoch {self.epoch + 1}); "
+            f"everything up to here is in {self.last_path}",
+            number,
+        )
 
 
 def _copy(value: Any) -> Any:

@@ -98,7 +98,7 @@ class VehicleTableOptions(DataOptions):
     speed_unit: str = "m/s"  # m/s | km/h | ft/s | mph
     time_unit: str = "s"  # s | ms | frame
     frame_rate: float | None = None  # 1/s, with time_unit=frame
-    kinds: dict[str, str] = field(default_factory=dict)  # class code: name
+    kinds: Any = field(default_factory=dict)  # {class code: name}; codes may be numbers
     lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
     direction: int = 1  # -1 where positions fall as vehicles drive on
     dt: float = 0.2  # reference time grid, s

@@ -49,6 +49,10 @@ DIMENSIONS = {"traffic": 1, "crowd": 2}
 _Files = dict[str, Path]
 
 
+#: Draws the faulty ones of some sequences: sequences, faults by name, domain, path of the PNG.
+Draw = Callable[[list[Sequence], dict[str, list[Fault]], Domain, Path], Any]
+
+
 @dataclass(frozen=True)
 class Format:
     """A raw format: which files it needs, and how they become sequences."""
@@ -73,14 +77,15 @@ FORMATS: dict[type[DataOptions], Format] = {
 }
 
 
-def prepare(options: DataOptions, folder: Path | str, *, plots: bool = True) -> Store:
+def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = None) -> Store:
     """Read raw files, sort out faults, and write the sequences and a manifest.
 
     Args:
         options: one of the options classes of :data:`FORMATS`.
         folder: where the store is written; an earlier one is replaced only when all is read
             and judged.
-        plots: whether to draw the faulty sequences of each recording into ``folder/faults``.
+        draw: draws the faulty sequences of each recording into ``folder/faults``, such as
+            :func:`nnode.plots.quality.plot_faults`; None draws nothing.
 
     Returns:
         The store. Its manifest tells the source files and their SHA-256, all options, the
@@ -115,7 +120,7 @@ def prepare(options: DataOptions, folder: Path | str, *, plots: bool = True) -> 
         "dropped_agents": absent,
         "faults": [asdict(fault) for found in faults.values() for fault in found],
     }
-    with _drawn(folder, sequences, faults, domain, plots):
+    with _drawn(folder, sequences, faults, domain, draw):
         store = write_store(folder, kept, manifest)
     log.info("%d of %d sequences kept in %s", len(kept), len(read), folder)
     return store
@@ -134,7 +139,7 @@ def open_data(options: DataOptions, folder: Path | str) -> Store:
     """
     options = _as_dataclass(options)
     if options.prepared is None:
-        return prepare(options, folder, plots=False)
+        return prepare(options, folder)
     store = Store(Path(options.prepared).expanduser())
     before = _preparation(store.manifest.get("options", {}))
     now = _preparation(plain(options))
@@ -212,7 +217,7 @@ def _drawn(
     sequences: list[Sequence],
     faults: dict[str, list[Fault]],
     domain: Domain,
-    plots: bool,
+    draw: Draw | None,
 ) -> Iterator[None]:
     """Draw beside the folder's present plots, and put them in place after the body succeeds."""
     partial = folder / f".{PLOTS}.{os.getpid()}.partial"
@@ -224,14 +229,12 @@ def _drawn(
     except OSError as error:
         raise DataError(f"{folder} cannot be written: {error}; choose another folder") from error
     try:
-        if plots:
-            from nnode.plots.quality import plot_faults  # matplotlib is slow to load
-
+        if draw is not None:
             for recording in dict.fromkeys(s.recording for s in sequences):
                 own = [s for s in sequences if s.recording == recording]
                 if any(faults[s.name] for s in own):
                     name = recording.replace(os.sep, "_") + ".png"
-                    plot_faults(own, faults, domain, partial / name)
+                    draw(own, faults, domain, partial / name)
         yield
         shutil.rmtree(folder / PLOTS, ignore_errors=True)
         if any(partial.iterdir()):

@@ -2,7 +2,7 @@
 
 Each limit below is physical, not fitted. Two things are deliberately not judged. Accelerations:
 positions from video are uncertain by metres (second differences of the ESIMAS positions reach
-10 m within 0.2 s although nothing is wrong with the path), so a limit on acceleration would
+8 m within 0.2 s although nothing is wrong with the path), so a limit on acceleration would
 condemn noise. And what a fault means for a calibration: see the ``faults`` option.
 """
 

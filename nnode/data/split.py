@@ -8,8 +8,8 @@ agent with it are dropped from training.
 
 Without identifiers (ESIMAS), two sequences closer in time than ``gap`` count as sharing an agent.
 The default of 5 s comes from those recordings: at the end of a sequence its last vehicle has
-2 s (median) and at most 5 s (90 to 95 %) to go until it leaves the camera's view, so that later
-sequences cannot hold it.
+2 to 3 s (median) and mostly (82 to 95 %) at most 5 s to go until it leaves the camera's view, so
+that later sequences rarely hold it.
 """
 
 from __future__ import annotations

@@ -185,6 +185,7 @@ def _stints(table: Table, options: VehicleTableOptions) -> dict[str, list[_Stint
     cut = ~same | (step > options.max_hole + 1e-9)
     if lane is not None:
         cut |= lane[order][1:] != lane[order][:-1]
+    names_of_kinds = {str(code): str(name) for code, name in dict(options.kinds).items()}
     found: dict[str, list[_Stint]] = {name: [] for name in lanes}
     for rows in np.split(order, np.flatnonzero(cut) + 1):
         place = "" if lane is None else lane[rows[0]]
@@ -203,7 +204,7 @@ def _stints(table: Table, options: VehicleTableOptions) -> dict[str, list[_Stint
                 x=np.interp(grid, time[rows], x[rows]),
                 speed=None if speed is None else np.interp(grid, time[rows], speed[rows]),
                 length=np.nan if length is None else float(length[rows[0]]),
-                kind=None if kind is None else options.kinds.get(code_of_kind, code_of_kind),
+                kind=None if kind is None else names_of_kinds.get(code_of_kind, code_of_kind),
             )
         )
     return found

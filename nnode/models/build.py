@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from typing import Any
@@ -20,6 +21,8 @@ START = (0.0, 50.0)
 
 
 def _traffic(term: Linear | Logarithmic | NetworkSpeed, options: Options) -> Traffic:
+    if not (math.isfinite(options["v0"]) and options["v0"] > 0):
+        raise ConfigError(f"model.v0={options['v0']} must be a positive speed in m/s")
     return Traffic([term], leader=str(getattr(options["leader"], "value", options["leader"])))
 
 
@@ -33,7 +36,10 @@ def _log(options: Options, generator: torch.Generator) -> System:
 
 def _network_speed(options: Options, generator: torch.Generator) -> System:
     term = NetworkSpeed(options["hidden"], options["v0"], options["box"], generator)
-    return _traffic(term, options)
+    model = _traffic(term, options)
+    if model.leader == "measured":
+        term.idle("v0")  # no equation contains it then
+    return model
 
 
 def _social_force(options: Options, generator: torch.Generator) -> System:

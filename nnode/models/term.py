@@ -79,6 +79,11 @@ class Term(nn.Module):
             if name.startswith(prefix):
                 self.bounds[name] = bounds
 
+    def idle(self, name: str) -> None:
+        """Take a declared parameter out of calibration and out of reports."""
+        getattr(self, name).requires_grad_(False)
+        del self.units[name]
+
     @torch.no_grad()
     def project_(self) -> None:
         """Move every parameter to the nearest point of its admissible set."""

@@ -38,33 +38,32 @@ class FollowTheLeader(Term):
         return rate[..., None]
 
 
-class Linear(FollowTheLeader):
+class LighthillWhithamRichards(FollowTheLeader):
+    """What the microscopic LWR laws share: the parameters v0 (m/s) and L >= L_min (m)."""
+
+    def __init__(self, v0: float = 30.0, L: float = 5.0, L_min: float = 2.0) -> None:
+        super().__init__(v0)
+        self.declare("L", L, unit="m", bounds=Interval(low=L_min))
+        self.L: Tensor
+
+
+class Linear(LighthillWhithamRichards):
     """The LWR law with linear velocity, W = v0 (1 - L / gap)."""
 
     name = "lin"
     formula = "v0 (1 - L / gap)"
     source = "Göttlich & Totzeck, section 5.1.1"
 
-    def __init__(self, v0: float = 30.0, L: float = 5.0, L_min: float = 2.0) -> None:
-        super().__init__(v0)
-        self.declare("L", L, unit="m", bounds=Interval(low=L_min))
-        self.L: Tensor
-
     def speed(self, gap: Tensor) -> Tensor:
         return self.v0 - self.v0 * self.L / gap
 
 
-class Logarithmic(FollowTheLeader):
+class Logarithmic(LighthillWhithamRichards):
     """The LWR law with logarithmic velocity, W = v0 log(gap / L)."""
 
     name = "log"
     formula = "v0 log(gap / L)"
     source = "Göttlich & Totzeck, section 5.1.1"
-
-    def __init__(self, v0: float = 30.0, L: float = 5.0, L_min: float = 2.0) -> None:
-        super().__init__(v0)
-        self.declare("L", L, unit="m", bounds=Interval(low=L_min))
-        self.L: Tensor
 
     def speed(self, gap: Tensor) -> Tensor:
         return self.v0 * torch.log(gap.clamp(min=SMALLEST_GAP) / self.L)

@@ -97,6 +97,8 @@ class TorchdiffeqSolver:
                 "solver.method=scipy_solver leaves no graph to differentiate; use "
                 "solver.gradient=adjoint, or another method"
             )
+        if not (rtol > 0 and atol > 0):
+            raise ConfigError(f"solver.rtol={rtol} and solver.atol={atol} must be positive")
         self.method, self.gradient, self.dt = method, gradient, dt
         self.rtol, self.atol = rtol, atol
 

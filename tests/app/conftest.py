@@ -41,7 +41,7 @@ def script() -> Script:
             env={**environment(), **env},
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=900,
             check=False,
         )
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from nnode.app.cli import check_overrides, user_overrides
+from nnode.app.saved import shell_override
 from nnode.config import register
 from nnode.errors import ConfigError
 
@@ -23,6 +26,8 @@ def _schemas() -> None:
     [
         (["trainer.max_epoch=3"], "did you mean trainer.max_epochs"),
         (["modle=lin"], "did you mean model"),
+        (["trainr.max_epochs=3"], r"did you mean trainer\.max_epochs"),
+        (["~trainer.patience"], "cannot be deleted"),
         (["model=n5"], "expected one of lin, log, n10, n2, n4, nn, sf"),
         (["model=lin_schema"], "model=lin_schema is unknown"),
         (["model.hidden=3"], "option model.hidden is unknown"),
@@ -31,6 +36,7 @@ def _schemas() -> None:
         (["data.faults=kep"], r"expected one of \[drop, keep, error\]"),
         (["data.split.heldout=abc"], "could not be converted to Float"),
         (["+trainer.extra=1"], "option trainer.extra is unknown"),
+        (["solver=fused", "solver.gradient=adjoint"], "option solver.gradient is unknown"),
         (["solver.gradient=exact"], r"expected one of \[adjoint, discrete\]"),
         (["model=lin,n5"], "model=n5 is unknown"),
         (["seed=1,two"], "seed=two is refused"),
@@ -61,7 +67,7 @@ def test_right_options_pass(overrides: list[str]) -> None:
 
 @pytest.mark.parametrize("name", ["train", "prepare_data", "evaluate", "plot_forces"])
 def test_every_group_of_every_script_composes(name: str) -> None:
-    for group in ("model", "data", "optimizer", "experiment"):
+    for group in ("model", "data", "optimizer", "solver", "experiment"):
         for file in sorted((CONF / group).glob("*.yaml")):
             if name == "train" or group == "data":
                 check_overrides([f"{group}={file.stem}"], CONF, name)
@@ -70,3 +76,11 @@ def test_every_group_of_every_script_composes(name: str) -> None:
 def test_flags_are_told_from_overrides() -> None:
     arguments = ["-m", "model=lin,log", "--config-name", "other", "seed=1", "--cfg=job"]
     assert user_overrides(arguments) == ["model=lin,log", "seed=1"]
+
+
+@pytest.mark.parametrize("place", ["runs/a/last.pt", "/tmp/a folder/it's/last.pt", "a,b=[c]/x.pt"])
+def test_overrides_can_be_pasted_into_a_shell(place: str) -> None:
+    typed = shlex.split(shell_override("resume", place))
+    (override,) = OverridesParser.create().parse_overrides(typed)
+    value = override.value()
+    assert getattr(value, "text", value) == place

@@ -227,3 +227,73 @@ def test_resume_refuses_another_problem(script: Script, traffic: Path, tmp_path:
         assert done.returncode == 2
         assert "cannot change when a run is resumed" in done.stderr
     assert os.path.exists(last)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "key"),
+    [
+        ("evaluate", [], "checkpoint"),
+        ("plot_forces", [], "checkpoint"),
+        ("train", ["data=table", "data.domain=traffic"], "data.path"),
+        ("prepare_data", ["data=table", "data.path=x.csv"], "data.domain"),
+    ],
+)
+def test_a_forgotten_option_is_named(
+    script: Script, tmp_path: Path, name: str, overrides: list[str], key: str
+) -> None:
+    done = script(name, *overrides, f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {key} is not set")
+
+
+def test_resuming_and_evaluating_can_be_swept(
+    script: Script, traffic: Path, tmp_path: Path
+) -> None:
+    best, last = (traffic / "checkpoints" / name for name in ("best.pt", "last.pt"))
+    for name, overrides in (
+        ("train", [f"resume={last}", "trainer.max_epochs=7,8"]),
+        ("evaluate", [f"checkpoint={best},{last}"]),
+    ):
+        done = script(name, "-m", *overrides, f"hydra.sweep.dir={tmp_path / name}")
+        assert done.returncode == 0, done.stderr
+        assert {p.name for p in (tmp_path / name).iterdir() if p.is_dir()} == {"0", "1"}
+
+
+def test_evaluation_tells_what_was_trained_on(
+    script: Script, traffic: Path, tmp_path: Path
+) -> None:
+    best = traffic / "checkpoints" / "best.pt"
+    split = load_checkpoint(best).split
+    for part, trained in (("heldout", 0), ("train", len(split["train"])), ("all", None)):
+        run = tmp_path / part
+        done = script("evaluate", f"checkpoint={best}", f"part={part}", f"hydra.run.dir={run}")
+        assert done.returncode == 0, done.stderr
+        metrics = json.loads((run / "metrics.json").read_text())
+        assert metrics["trained_on"] == (len(split["train"]) if trained is None else trained)
+        assert metrics["sequences"] >= metrics["trained_on"]
+
+
+def test_the_fused_solver_trains_to_the_same_numbers(
+    script: Script, traffic: Path, raw: Path, tmp_path: Path
+) -> None:
+    source = f"data.source={raw}"
+    found = {}
+    for name, more in (("torchdiffeq", ["solver.gradient=discrete"]), ("fused", [])):
+        done = script(
+            "train",
+            "experiment=demo_traffic",
+            f"solver={name}",
+            *more,
+            "trainer.max_epochs=2",
+            source,
+            f"hydra.run.dir={tmp_path / name}",
+        )
+        assert done.returncode == 0, done.stderr
+        found[name] = json.loads((tmp_path / name / "result.json").read_text())["summary"]
+    for key in ("cost_train", "cost_heldout", "v0", "L"):
+        assert found["fused"][key] == pytest.approx(found["torchdiffeq"][key], rel=1e-6)
+    best = tmp_path / "fused" / "checkpoints" / "best.pt"
+    done = script("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path / 'e'}")
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "e" / "metrics.json").read_text())
+    assert metrics["J"] == pytest.approx(found["fused"]["cost_heldout"], rel=1e-9)

@@ -138,6 +138,32 @@ def test_ten_interruptions_change_no_bit(
     assert same_bits(list(a.model.values()), list(b.model.values()))
 
 
+@pytest.mark.parametrize("evaluation", [0, 1, 3])
+def test_a_signal_during_an_evaluation_is_obeyed_at_once(
+    make_trainer: Make, tmp_path: Path, evaluation: int
+) -> None:
+    straight = make_trainer(tmp_path / "straight")
+    straight.fit()
+    trainer = make_trainer(tmp_path / "broken")
+    costs, count = trainer.costs, [0]
+
+    def interrupted() -> dict[str, float]:
+        if count[0] == evaluation:
+            os.kill(os.getpid(), signal.SIGTERM)
+        count[0] += 1
+        return costs()
+
+    trainer.costs = interrupted  # type: ignore[method-assign]
+    with pytest.raises(Interrupted):
+        trainer.fit()
+    assert len(trainer.history) == evaluation
+    again = make_trainer(tmp_path / "broken")
+    again.restore(trainer.last_path)
+    again.fit()
+    assert again.history == straight.history
+    assert same_bits(parameters(straight), parameters(again))
+
+
 def test_resuming_from_the_best_checkpoint_gives_the_same_end(
     make_trainer: Make, tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ from nnode.data.policy import LISTED
 from nnode.data.prepare import open_data, plain, prepare
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError, FaultError
+from nnode.plots.quality import plot_faults
 
 TIME = 0.2 * np.arange(6)
 CLEAN = np.array([[0.0], [30.0], [60.0]]) + 25 * TIME
@@ -46,7 +47,7 @@ def options(tmp_path: Path) -> EsimasOptions:
 
 
 def test_drop(tmp_path: Path, options: EsimasOptions) -> None:
-    store = prepare(options, tmp_path / "out")
+    store = prepare(options, tmp_path / "out", draw=plot_faults)
     assert [s.name for s in store] == ["demo/000", "demo/003"]
     np.testing.assert_array_equal(store[0].x[:, :, 0].T, CLEAN)
     m = store.manifest
@@ -73,7 +74,7 @@ def test_drop(tmp_path: Path, options: EsimasOptions) -> None:
 
 def test_keep_keeps_what_can_be_simulated(tmp_path: Path, options: EsimasOptions) -> None:
     options.faults = Faults.keep
-    store = prepare(options, tmp_path / "out", plots=False)
+    store = prepare(options, tmp_path / "out")
     assert [s.name for s in store] == ["demo/000", "demo/001", "demo/003"]
     assert {f["kind"] for f in store.manifest["faults"]} == {"jump", "non_finite"}
     assert not (tmp_path / "out" / "faults").exists()
@@ -115,31 +116,29 @@ def test_interrupted_preparation_starts_clean(
     tmp_path: Path, options: EsimasOptions, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     out = tmp_path / "out"
-    prepare(options, out)
+    prepare(options, out, draw=plot_faults)
     before = (out / "manifest.json").read_bytes()
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        target = (
-            "nnode.plots.quality.plot_faults" if place == "plot" else module.__name__ + "." + place
-        )
-        patch.setattr(target, interrupt)
+        if place == "write_store":
+            patch.setattr(module, place, interrupt)
         options.recording = "demo"
         with pytest.raises(KeyboardInterrupt):
-            prepare(options, out)
+            prepare(options, out, draw=interrupt if place == "plot" else plot_faults)
     assert (out / "manifest.json").read_bytes() == before
     assert len(Store(out)) == 2
     (out / ".faults.123.partial").mkdir()
     (out / ".sequences.parquet.123.partial").write_text("half")
-    prepare(options, out)
+    prepare(options, out, draw=plot_faults)
     assert sorted(p.name for p in out.iterdir()) == ["faults", "manifest.json", "sequences.parquet"]
 
 
 def test_same_data_same_files(tmp_path: Path, options: EsimasOptions) -> None:
     for name in ("a", "b"):
-        prepare(options, tmp_path / name)
+        prepare(options, tmp_path / name, draw=plot_faults)
     for file in ("manifest.json", "sequences.parquet", "faults/demo.png"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -246,17 +245,17 @@ def test_unwritable_folder(tmp_path: Path, options: EsimasOptions) -> None:
 def test_options_may_come_from_the_configuration(tmp_path: Path, options: EsimasOptions) -> None:
     config = OmegaConf.structured(options)
     assert plain(OmegaConf.to_object(config)) == plain(options)  # type: ignore[arg-type]
-    assert len(prepare(config, tmp_path / "out", plots=False)) == 2
+    assert len(prepare(config, tmp_path / "out")) == 2
 
 
 @pytest.mark.real
 def test_published_recordings(tmp_path: Path, real_data: Path) -> None:
     options = EsimasOptions(source=str(real_data), faults=Faults.keep)
-    store = prepare(options, tmp_path / "keep", plots=False)
+    store = prepare(options, tmp_path / "keep")
     assert len(store) == 265
     assert len(store.manifest["recordings"]) == 10
     options.faults = Faults.drop
-    clean = prepare(options, tmp_path / "drop", plots=False)
+    clean = prepare(options, tmp_path / "drop")
     for s in clean:  # judged without the checks: nobody goes back, leaps or overlaps
         step, gap = np.diff(s.x, axis=0), np.diff(s.x, axis=1)
         assert step.min() > -0.5

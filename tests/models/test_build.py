@@ -119,3 +119,21 @@ def test_an_unknown_term_suggests_the_nearest() -> None:
 def test_impossible_values_are_a_config_error(choice: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         build_model(choice)
+
+
+def test_v0_of_a_network_with_a_measured_leader_is_idle() -> None:
+    options = {"term": "network_speed", "v0": 30.0, "hidden": 2, "box": None}
+    free = build_model({**options, "leader": "constant"})
+    idle = build_model({**options, "leader": "measured"})
+    assert list(free.physical()) == ["v0"]
+    assert list(idle.physical()) == []
+    trained = [name for name, p in idle.named_parameters() if p.requires_grad]
+    assert trained
+    assert not any(name.endswith("v0") for name in trained)
+
+
+@pytest.mark.parametrize("v0", [0.0, -3.0, float("nan")])
+def test_a_speed_that_is_none_is_refused(v0: float) -> None:
+    options = {"term": "lin", "v0": v0, "L": 5.0, "L_min": 2.0, "leader": "constant"}
+    with pytest.raises(ConfigError, match=r"model\.v0"):
+        build_model(options)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +15,7 @@ from nnode.errors import ConfigError
 from nnode.models.crowd import InteractionForce, NetworkForce, Relaxation, SocialForce
 from nnode.models.scene import Scene
 from nnode.models.system import Crowd, System
+from nnode.solvers.fused._plan import run_all
 from nnode.solvers.fused.crowd_cache import load
 from nnode.solvers.fused.crowd_laws import LANES, SIZE
 from nnode.solvers.fused.neighbours import cutoff_distance
@@ -57,7 +55,7 @@ class _Plan:
     Attributes:
         module: the compiled functions, dense or sparse.
         jobs: for every thread rows of first place in ``order``, simulations, people, wall
-            points, place in the stored states.
+            points, place in the stored states, number of the thread.
         order: simulations in the order in which they are cut into blocks.
         size: numbers of stored states.
         per: steps in a sampling interval.
@@ -90,19 +88,6 @@ class _Plan:
     samples: int
 
 
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="nnode-crowd")
-
-
-def _all(call: Callable[[int], None], number: int) -> None:
-    """Call with 0 ... number - 1, one thread each."""
-    others = [_pool(number - 1).submit(call, i) for i in range(1, number)]
-    call(0)
-    for other in others:
-        other.result()
-
-
 class _Simulate(torch.autograd.Function):
     """Euler's method and the exact gradient of what it computes."""
 
@@ -115,14 +100,14 @@ class _Simulate(torch.autograd.Function):
         # whoever is not computed, because he is padding, stays where he is
         out = y0.detach().expand(plan.samples, *y0.shape).clone()
 
-        def call(i: int) -> None:
+        def call(jobs: np.ndarray) -> None:
             plan.module.forward(
-                plan.jobs[i], plan.order, plan.per, plan.dt, values[0], plan.still, plan.wall,
+                jobs, plan.order, plan.per, plan.dt, values[0], plan.still, plan.wall,
                 plan.scale, plan.end, plan.rate, plan.slip, plan.mutual, values[1], values[2],
                 states, out.numpy(), *plan.cutoff,
             )  # fmt: skip
 
-        _all(call, len(plan.jobs))
+        run_all(call, plan.jobs)
         ctx.plan, ctx.states, ctx.values = plan, states, values
         return out
 
@@ -135,14 +120,14 @@ class _Simulate(torch.autograd.Function):
         # sums over all steps are kept in float64 whatever the precision of the states
         totals = [np.zeros((len(plan.jobs), *value.shape)) for value in ctx.values[1:]]
 
-        def call(i: int) -> None:
+        def call(jobs: np.ndarray) -> None:
             plan.module.backward(
-                plan.jobs[i], plan.order, plan.per, plan.dt, plan.still, plan.wall, plan.scale,
+                jobs, plan.order, plan.per, plan.dt, plan.still, plan.wall, plan.scale,
                 plan.end, plan.rate, plan.slip, plan.mutual, *ctx.values[1:], ctx.states,
-                grad_out, grad_y0, totals[0][i], totals[1][i], *plan.cutoff,
+                grad_out, grad_y0, *(total[jobs[0, 5]] for total in totals), *plan.cutoff,
             )  # fmt: skip
 
-        _all(call, len(plan.jobs))
+        run_all(call, plan.jobs)
         padding = plan.still[..., 2] == 0
         grad_y0[padding] = grad_out[:, padding].sum(0)
         shares = [torch.from_numpy(total.sum(0)).to(grads[0].dtype) for total in totals]
@@ -170,17 +155,18 @@ def _layout(
     order: np.ndarray, people: np.ndarray, points: np.ndarray, kept: int, width: int, threads: int
 ) -> tuple[tuple[np.ndarray, ...], int]:
     """Jobs of every thread, and the size of all that is stored, ``kept`` numbers a person."""
-    rows, place = [], 0
+    rows: list[tuple[int, ...]] = []
+    place = 0
     for low in range(0, len(order), width):
         members = order[low : low + width]
         most = int(people[members].max())
-        rows.append((low, len(members), most, int(points[members].max()), place))
+        # blocks come sorted by size: dealt out in turn, every thread has its share of large ones
+        thread = len(rows) % threads
+        rows.append((low, len(members), most, int(points[members].max()), place, thread))
         place += kept * most * len(members)
     table = np.array(rows, dtype=np.int64)
-    # blocks come sorted by size: dealt out in turn, every thread has its share of large ones
-    return tuple(
-        np.ascontiguousarray(table[i::threads]) for i in range(min(threads, len(table)))
-    ), place
+    number = min(threads, len(table))
+    return tuple(np.ascontiguousarray(table[i::number]) for i in range(number)), place
 
 
 def _width(simulations: int, people: int, threads: int) -> int:

@@ -95,7 +95,7 @@ def fill_up(room: Any, n: int, rows: int) -> int:
 def pieces(length: int) -> int:
     """Length of equal pieces of at most SIZE numbers."""
     number = max(1, (length + SIZE - 1) // SIZE)
-    piece = (length + number - 1) // number
+    piece = max(1, (length + number - 1) // number)
     return (piece + LANES - 1) // LANES * LANES
 
 

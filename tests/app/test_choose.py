@@ -1,0 +1,75 @@
+"""Which sequences an evaluation takes, whatever was trained on before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nnode.app.evaluate import choose
+from nnode.calibrate.checkpoint import Checkpoint
+from nnode.data.sequence import Sequence
+from nnode.data.store import Store, write_store
+from nnode.errors import ConfigError
+
+
+def store(folder: Path, recordings: str, **options: Any) -> Store:
+    """Three sequences of each recording; a recording's hash is its name."""
+    x = np.arange(6.0).reshape(3, 2, 1)
+    sequences = [
+        Sequence(name=f"{r}/{i}", recording=r, time=np.arange(3.0), x=x)
+        for r in recordings
+        for i in range(3)
+    ]
+    files = {r: {"name": r, "sha256": r} for r in recordings}
+    return write_store(folder, sequences, {"files": files, "options": options})
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Checkpoint:
+    return Checkpoint(
+        config={},
+        manifest=store(tmp_path / "then", "ab", t_seq=1.0, faults="drop", recording="ab").manifest,
+        model={},
+        optimizer={},
+        progress={},
+        split={"train": ["a/0", "b/0", "b/1"], "heldout": ["a/1", "b/2"], "dropped": ["a/2"]},
+    )
+
+
+@pytest.mark.parametrize(
+    ("recordings", "part", "expected"),
+    [
+        ("ab", "auto", ("heldout", ["a/1", "b/2"], 0)),
+        ("a", "auto", ("heldout", ["a/1"], 0)),  # fewer recordings than in training
+        ("abc", "auto", ("heldout", ["a/1", "b/2"], 0)),  # more
+        ("abc", "unseen", ("unseen", ["a/1", "b/2", "c/0", "c/1", "c/2"], 0)),
+        ("c", "auto", ("unseen", ["c/0", "c/1", "c/2"], 0)),
+        ("a", "all", ("all", ["a/0", "a/1", "a/2"], 1)),
+        ("b", "train", ("train", ["b/0", "b/1"], 2)),
+    ],
+)
+def test_parts(
+    tmp_path: Path,
+    checkpoint: Checkpoint,
+    recordings: str,
+    part: str,
+    expected: tuple[str, list[str], int],
+) -> None:
+    now = store(tmp_path / "now", recordings, t_seq=1.0, faults="keep", recording=recordings)
+    found, indices, trained = choose(now, checkpoint, part)
+    assert (found, [now.index[i]["name"] for i in indices], trained) == expected
+
+
+def test_another_cutting_cannot_be_told_apart(tmp_path: Path, checkpoint: Checkpoint) -> None:
+    now = store(tmp_path / "now", "a", t_seq=2.0)
+    assert choose(now, checkpoint, "auto") == ("all", [0, 1, 2], None)
+    with pytest.raises(ConfigError, match="part=heldout"):
+        choose(now, checkpoint, "heldout")
+
+
+def test_an_unknown_part_is_refused(tmp_path: Path, checkpoint: Checkpoint) -> None:
+    with pytest.raises(ConfigError, match="part=test is unknown"):
+        choose(store(tmp_path / "now", "a"), checkpoint, "test")

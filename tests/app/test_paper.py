@@ -1,0 +1,32 @@
+"""The printed costs of recording 1-1_1, reached with the paper's optimiser and step."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.mark.slow
+@pytest.mark.real
+@pytest.mark.parametrize(("model", "epochs", "printed"), [("lin", 300, 49.1), ("n4", 600, 54.2)])
+def test_printed_cost_is_reached(
+    script: Script, real_data: Path, tmp_path: Path, model: str, epochs: int, printed: float
+) -> None:
+    done = script(
+        "train",
+        f"model={model}",
+        "experiment=paper_traffic",
+        "data.recording=1-1_1",
+        "data.loader.batch_size=0",
+        f"data.source={real_data}",
+        f"trainer.max_epochs={epochs}",
+        f"hydra.run.dir={tmp_path}",
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "result.json").read_text())["summary"]["cost_train"] <= printed
