@@ -20,7 +20,8 @@ from nnode.solvers.fused.crowd_cache import load
 from nnode.solvers.fused.crowd_laws import LANES, SIZE
 from nnode.solvers.fused.neighbours import cutoff_distance
 
-#: From so many people on, cell lists of a social force are faster than to meet everybody.
+#: From so many people on, social forces use cell lists. They are faster for 50 already; smaller
+#: crowds, and so most recordings, are exact to rounding instead.
 LISTS_FROM = 200
 
 
@@ -98,7 +99,8 @@ class _Simulate(torch.autograd.Function):
         # NumPy asks for huge pages, which are far faster to touch for the first time
         states = np.empty(plan.size if keep else 0, values[0].dtype)
         # whoever is not computed, because he is padding, stays where he is
-        out = y0.detach().expand(plan.samples, *y0.shape).clone()
+        still = y0.detach().expand(plan.samples, *y0.shape)
+        out = still.clone(memory_format=torch.contiguous_format)
 
         def call(jobs: np.ndarray) -> None:
             plan.module.forward(

@@ -17,6 +17,7 @@ from nnode.models.network import FeedForward
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
 from nnode.solvers.fused import crowd as compiled
 from nnode.solvers.fused import crowd_laws, crowd_network, fallback
+from nnode.solvers.fused.crowd_cache import load
 from tests.solvers.fused.compare import difference, single
 from tests.solvers.fused.test_fallback import Sway
 
@@ -218,6 +219,17 @@ def test_a_blow_up_is_reported(crowd) -> None:  # type: ignore[no-untyped-def]
     model = Crowd([Relaxation(), SocialForce(1e300, 0.0, 0.0, B=1e-4)])
     with pytest.raises(SimulationError, match="crushed blew up"):
         FusedSolver(DT)(model, collate(items))
+
+
+def test_one_compilation_for_all_shapes(people: list[Sequence], crowd) -> None:  # type: ignore[no-untyped-def]
+    # arrays of another layout would be compiled for again, unnoticed but for the seconds
+    for items in (people, people[3:4], [crowd(2, samples=2)], [crowd(3)] * 70):
+        for name in ("sf", "sf_open", "nn"):
+            gradient(Crowd(MODELS[name]()), FusedSolver(DT), collate(items))
+    module = load("crowd_dense")
+    for function in (module.forward, module.backward):
+        # two laws in two precisions
+        assert len(function.signatures) <= 4
 
 
 def test_what_is_covered(people: list[Sequence]) -> None:
