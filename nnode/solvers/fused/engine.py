@@ -18,8 +18,8 @@ from nnode.solvers.fused import crowd, fallback, traffic
 class FusedSolver:
     """Euler's method and the exact gradient of the discrete scheme, in compiled code.
 
-    States equal those of ``TorchdiffeqSolver("euler")`` up to rounding; in float32 they are
-    closer to the float64 ones, because the steps are added with compensation. The gradient is
+    States equal those of ``TorchdiffeqSolver("euler")`` up to rounding; in float32 those of
+    traffic are closer to the float64 ones, as steps are added with compensation. The gradient is
     that of ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint,
     from which it differs by O(dt).
 
