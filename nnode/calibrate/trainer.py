@@ -222,7 +222,6 @@ class Trainer:
     def costs(self) -> dict[str, float]:
         """Cost of the present model on the training and on the held-out sequences."""
         found = {}
-
         for name, loader in (("train", self.train), ("heldout", self.heldout)):
             if loader is None:
                 continue

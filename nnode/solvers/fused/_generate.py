@@ -1,28 +1,13 @@
-"""Compiled functions of a law: generated, so that Numba keeps them between processes.
-
-Numba stores compiled code beside the file that holds the function, and compiles again when this
-file changes; changes of what it imports go unseen. The generated file therefore carries a
-digest of everything that it is made of in its name.
-"""
+"""Compiled functions of a law: generated, so that Numba keeps them between processes."""
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import os
 import sys
-import tempfile
 from functools import cache
-from pathlib import Path
 from types import ModuleType
 
-import llvmlite
-import numba
-import numpy as np
-from platformdirs import user_cache_path
-
-from nnode.errors import ConfigError
 from nnode.solvers.fused import _math, _rows
+from nnode.solvers.fused._cache import digest, keep
 from nnode.solvers.fused._templates import TEMPLATE
 from nnode.solvers.fused.laws import LawKernel
 
@@ -66,19 +51,7 @@ def _digest(text: str, kernel: LawKernel) -> str:
         kernel.share.__module__,
         kernel.pull.__module__,
     }
-    found = hashlib.sha256(text.encode())
-    for name in sorted(modules):
-        file = sys.modules[name].__file__
-        assert file is not None
-        found.update(Path(file).read_bytes())
-    found.update(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
-    return found.hexdigest()[:16]
-
-
-def cache_folder() -> Path:
-    """The folder of generated modules: NNODE_CACHE, else the user's own cache."""
-    chosen = os.environ.get("NNODE_CACHE")
-    return (Path(chosen) if chosen else user_cache_path("nnode")) / "fused"
+    return digest(text.encode(), [sys.modules[name] for name in sorted(modules)])
 
 
 @cache
@@ -90,25 +63,4 @@ def compiled(kernel: LawKernel) -> ModuleType:
     """
     text = source(kernel)
     name = f"nnode_fused_{_digest(text, kernel)}"
-    path = cache_folder() / f"{name}.py"
-    if not path.is_file():
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # written aside: another process may want the same file
-            with tempfile.NamedTemporaryFile(
-                "w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8"
-            ) as file:
-                file.write(text)
-            os.replace(file.name, path)
-        except OSError as error:
-            raise ConfigError(
-                f"cannot keep compiled code in {path.parent}: {error.strerror}; set the "
-                "environment variable NNODE_CACHE to a folder that can be written"
-            ) from error
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+    return keep(name, text.encode())
