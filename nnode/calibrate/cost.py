@@ -24,16 +24,25 @@ class Convention(str, Enum):
 
 
 def squared_error(trajectory: Trajectory, batch: Batch) -> Tensor:
-    """``(K, B, N)`` squared distance between simulation and measurement, m²; 0 in the padding."""
-    away = trajectory.x - batch.x
+    """``(K, B, N)`` squared distance between simulation and measurement, m²; 0 in the padding.
+
+    Runs side by side, ``(K, R, B, N, D)`` positions, give ``(K, R, B, N)``.
+    """
+    measured, valid = batch.x, batch.valid[..., None]
+    if trajectory.x.ndim > measured.ndim:
+        measured, valid = measured[:, None], valid[:, None]
+    away = trajectory.x - measured
     # masked before squaring: past its last sample a simulation may leave the finite numbers
-    return away.masked_fill(~batch.valid[..., None], 0.0).square().sum(-1)
+    return away.masked_fill(~valid, 0.0).square().sum(-1)
 
 
 def sequence_costs(
     trajectory: Trajectory, batch: Batch, convention: Convention = Convention.integral
 ) -> Tensor:
-    """``(B,)`` cost of every sequence: summed over samples and agents, see :class:`Convention`."""
+    """``(B,)`` cost of every sequence: summed over samples and agents, see :class:`Convention`.
+
+    Runs side by side give ``(R, B)``.
+    """
     weight = 0.5 * (batch.dt if convention is Convention.integral else 1.0)
-    total: Tensor = weight * squared_error(trajectory, batch).sum((0, 2))
+    total: Tensor = weight * squared_error(trajectory, batch).sum((0, -1))
     return total

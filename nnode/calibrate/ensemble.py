@@ -1,0 +1,113 @@
+"""Many runs of one model at once: cost and gradient as functions of flat parameter vectors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from nnode.calibrate.cost import Convention, sequence_costs
+from nnode.data.sequence import Batch
+from nnode.models.system import System
+from nnode.models.term import Term
+from nnode.solvers.fused.engine import FusedSolver
+
+
+class EnsembleCost:
+    """Cost of R runs of a model on one batch, each run with parameters of its own.
+
+    A run is a row of K numbers: all parameters that are calibrated, one after the other.
+    Rows are in float64 whatever the precision of the simulation.
+
+    Args:
+        system: the model; it is not changed. Parameters that need no gradient stay its own.
+        batch: the sequences, in the precision of the system.
+        solver: its step and threads.
+        convention: see :class:`nnode.calibrate.cost.Convention`.
+
+    Attributes:
+        names: parameters by their names in ``system.named_parameters()``.
+        low, high: ``(K,)`` admissible set, from the model's terms; infinite where it is open.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        batch: Batch,
+        solver: FusedSolver,
+        convention: Convention = Convention.integral,
+    ) -> None:
+        self.system, self.batch, self.solver = system, batch, solver
+        self.convention = convention
+        self._own = {name: p for name, p in system.named_parameters() if p.requires_grad}
+        self.names = list(self._own)
+        self._sizes = [p.numel() for p in self._own.values()]
+        limits = _bounds(system)
+        low, high = (
+            [limits.get(name, (-math.inf, math.inf))[side] for name in self.names]
+            for side in (0, 1)
+        )
+        sizes = torch.tensor(self._sizes)
+        self.low = torch.tensor(low, dtype=torch.float64).repeat_interleave(sizes)
+        self.high = torch.tensor(high, dtype=torch.float64).repeat_interleave(sizes)
+
+    def row(self, system: System) -> Tensor:
+        """``(K,)`` the parameters of another system of the same model."""
+        own = dict(system.named_parameters())
+        return torch.cat([own[name].detach().double().flatten() for name in self.names])
+
+    def parameters(self, rows: Tensor) -> dict[str, Tensor]:
+        """Rows ``(R, K)`` as parameters by name, each with a leading axis of R."""
+        return {
+            name: part.reshape(-1, *self._own[name].shape).to(self._own[name].dtype)
+            for name, part in zip(self.names, rows.split(self._sizes, 1), strict=True)
+        }
+
+    @torch.no_grad()
+    def fill_(self, system: System, row: Tensor) -> System:
+        """Write one row ``(K,)`` into a system of the same model."""
+        own = dict(system.named_parameters())
+        for name, value in self.parameters(row[None]).items():
+            own[name].copy_(value[0])
+        return system
+
+    def costs(self, rows: Tensor) -> Tensor:
+        """``(R, B)`` cost of every sequence, inf where a simulation blows up; no gradient."""
+        with torch.no_grad():
+            found = self._costs(self.parameters(rows)).double()
+        return torch.where(torch.isfinite(found), found, math.inf)
+
+    def __call__(self, rows: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """``(R,)`` weighted costs and their ``(R, K)`` gradients.
+
+        Args:
+            weights: ``(R, B)`` or ``(B,)`` weight of every sequence; None takes the mean.
+        """
+        stacked = {
+            name: value.detach().clone().requires_grad_()
+            for name, value in self.parameters(rows).items()
+        }
+        each = self._costs(stacked)
+        if weights is None:
+            cost = each.mean(1)
+        else:
+            # a sequence without weight must not spoil the sum where it blows up
+            cost = torch.where(weights > 0, each * weights.to(each), 0.0).sum(1)
+        parts = torch.autograd.grad(cost.sum(), list(stacked.values()))
+        gradient = torch.cat([part.reshape(len(rows), -1) for part in parts], 1)
+        return cost.detach().double(), gradient.double()
+
+    def _costs(self, stacked: Mapping[str, Tensor]) -> Tensor:
+        found = self.solver.ensemble(self.system, stacked, self.batch)
+        return sequence_costs(found, self.batch, self.convention)
+
+
+def _bounds(system: System) -> dict[str, tuple[float, float]]:
+    found = {}
+    for i, term in enumerate(system.terms):
+        assert isinstance(term, Term)
+        for name, interval in term.bounds.items():
+            found[f"terms.{i}.{name}"] = (interval.low, interval.high)
+    return found
