@@ -32,3 +32,7 @@ class SimulationError(NNodeError):
 
 class CheckpointError(NNodeError):
     """A checkpoint is missing, damaged or of another format."""
+
+
+class StudyError(NNodeError):
+    """Tasks of a study failed, or its worker processes cannot run; what is done is kept."""

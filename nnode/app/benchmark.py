@@ -20,9 +20,9 @@ from rich.table import Table
 
 from nnode.app.benchmark_engines import ENGINES, Call, Engine, torch_call
 from nnode.app.benchmark_problems import SHAPES, Problem, pose
-from nnode.app.sweep import write_json
 from nnode.calibrate.cost import squared_error
 from nnode.errors import ConfigError, SimulationError
+from nnode.files import write_json
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 
 #: A measurement repeats its call for at least so long, s.

@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 
 from nnode.app.saved import merge_saved
-from nnode.app.sweep import write_json
 from nnode.app.train import build_solver, set_threads, source_hashes, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
@@ -22,6 +21,7 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import NOT_PREPARATION, open_data
 from nnode.data.store import Store
 from nnode.errors import ConfigError
+from nnode.files import write_json
 
 PARTS = ("auto", "heldout", "train", "unseen", "all")
 

@@ -17,19 +17,12 @@ from rich.console import Console
 from rich.table import Table
 
 from nnode.calibrate.distributed import World
+from nnode.files import write_json
 
 RESULT = "result.json"
 
 #: The sweep of this process: its folder, and the results that lay there before.
 _sweep: dict[Path, dict[Path, int]] = {}
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write JSON so that the file is never half there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=True) + "\n")
-    os.replace(temporary, path)
 
 
 def record_failure(folder: Path, error: str) -> None:

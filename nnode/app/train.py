@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
 from nnode.app.saved import merge_saved, plain_config, refuse_changes, shell_override
-from nnode.app.sweep import RESULT, write_json
+from nnode.app.sweep import RESULT
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
@@ -34,6 +34,7 @@ from nnode.data.sequence import Batch
 from nnode.data.split import split
 from nnode.data.store import Store
 from nnode.errors import ConfigError
+from nnode.files import write_json
 from nnode.models import System, build_model
 from nnode.plots import force_figure
 from nnode.solvers import Solver, TorchdiffeqSolver, substeps

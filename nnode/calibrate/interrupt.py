@@ -55,3 +55,14 @@ class InterruptGuard:
         trace: TracebackType | None,
     ) -> None:
         self._restore()
+
+
+class BreakingGuard(InterruptGuard):
+    """Inside the context, the first SIGINT or SIGTERM raises KeyboardInterrupt at once.
+
+    For work that may be broken off anywhere; :attr:`requested` tells which signal it was.
+    """
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        super()._handle(number, frame)
+        raise KeyboardInterrupt

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nnode.errors import ConfigError
+from nnode.files import replacing
 
 #: Okabe and Ito's palette without its yellow, which is too pale for lines on white.
 #: Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
@@ -94,16 +93,11 @@ def save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ConfigError(f"figures are saved as PNG: expected a path ending in .png, got {path}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(temporary, format="png", dpi=DPI)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=DPI)
     except OSError as error:
         raise ConfigError(
             f"figure {path} could not be written ({error}); choose a folder that can be written to"
         ) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
     return path

@@ -1,0 +1,42 @@
+"""Files that are never half there."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A name beside ``path`` to write to; what was written takes its place at the end.
+
+    Missing folders are made. After an error ``path`` is as it was before, and nothing is left.
+
+    Raises:
+        OSError: the folder cannot be made or written to.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file in UTF-8; returns its path."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_json(path: Path, content: dict[str, Any], indent: int | None = 2) -> Path:
+    """Write JSON; NaN and infinities are kept, as Python's own reader takes them."""
+    text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=True)
+    return write_text(path, text + "\n")

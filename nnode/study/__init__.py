@@ -1,0 +1,1 @@
+"""The paper's studies on the real recordings: tasks, statistics, pages."""

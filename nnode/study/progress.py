@@ -1,0 +1,76 @@
+"""How far a study's tasks are, with the time left: a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from types import TracebackType
+
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from nnode.calibrate import progress
+
+log = logging.getLogger(__name__)
+
+
+class TaskProgress:
+    """Counts tasks, and tells the time left by their expected costs; use as a context manager.
+
+    Args:
+        title: of the work.
+        total: number of tasks, those that were done before included.
+        done: how many were done before.
+        cost: of those that are not done, in any unit.
+    """
+
+    def __init__(self, title: str, total: int, done: int, cost: float) -> None:
+        self.title, self.total, self.done = title, total, done
+        self._cost, self._spent = cost, 0.0
+        self._start = self._last_line = time.monotonic()
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[text]}"),
+                TimeElapsedColumn(),
+            )
+            self._task = self._bar.add_task(title, total=cost, text=self._text())
+
+    def __enter__(self) -> TaskProgress:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def advance(self, cost: float) -> None:
+        """One task more is done."""
+        self.done += 1
+        self._spent += cost
+        self.tick()
+
+    def tick(self) -> None:
+        """Show what is known now; called often."""
+        now = time.monotonic()
+        if self._bar:
+            self._bar.update(self._task, completed=self._spent, text=self._text())
+        elif now - self._last_line >= progress.LINE_EVERY:
+            self._last_line = now
+            log.info("%s: %s", self.title, self._text())
+
+    def _text(self) -> str:
+        count = f"{self.done} of {self.total} tasks"
+        if not self._spent:
+            return count
+        passed = time.monotonic() - self._start
+        left = passed * max(self._cost - self._spent, 0.0) / self._spent
+        return f"{count}, {left:.0f} s left"
