@@ -1,0 +1,268 @@
+"""A study's page: text, tables and figures as one HTML file, as Markdown, and as CSV."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markdown_it import MarkdownIt
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from nnode.errors import ConfigError
+from nnode.files import write_text
+from nnode.plots.style import save
+from nnode.study import tables
+
+#: Folder of the figures beside the page.
+FIGURES = "figures"
+
+#: Pixels of a style sheet in an inch.
+_PIXELS = 96
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+@dataclass
+class Heading:
+    """Begins a section; level 2 is the highest, below the page's title."""
+
+    text: str
+    level: int = 2
+
+
+@dataclass
+class Text:
+    """Paragraphs, lists, links, code and emphasis in Markdown; no headings, images or HTML."""
+
+    markdown: str
+
+
+@dataclass
+class TableBlock:
+    """A table, and the file ``<name>.csv`` with its numbers in full.
+
+    Attributes:
+        name: of the file; ``[text](#table-<name>)`` refers to the table.
+        frame: what is shown; its index labels the rows.
+        caption: in Markdown; says what to see, and the units.
+        bold: which cells are set in bold.
+        digits: after the point, for all columns or by column.
+        full: what the CSV holds, where that is more than what is shown.
+    """
+
+    name: str
+    frame: pd.DataFrame
+    caption: str
+    bold: pd.DataFrame | None = None
+    digits: dict[str, int] | int = tables.DIGITS
+    full: pd.DataFrame | None = None
+
+    def grid(self) -> tables.Grid:
+        """The table as text."""
+        return tables.grid(self.frame, digits=self.digits, bold=self.bold)
+
+    def csv(self) -> str:
+        """The table in full."""
+        return tables.csv(self.frame if self.full is None else self.full)
+
+
+@dataclass
+class FigureBlock:
+    """A figure, and the file ``figures/<name>.png``.
+
+    Attributes:
+        name: of the file; ``[text](#figure-<name>)`` refers to the figure.
+        figure: drawn by :mod:`nnode.plots`.
+        caption: in Markdown; says what to see.
+        alt: what the figure shows, in words, for those who cannot see it.
+    """
+
+    name: str
+    figure: Figure
+    caption: str
+    alt: str
+
+
+@dataclass
+class Provenance:
+    """How a page was made, by what: goes to the page's foot. Several add up."""
+
+    facts: dict[str, str]
+
+
+Block = Heading | Text | TableBlock | FigureBlock | Provenance
+
+
+def write_page(
+    blocks: list[Block], folder: Path, *, title: str, subtitle: str = "", stem: str = "study"
+) -> list[Path]:
+    """Write ``<stem>.html``, ``<stem>.md``, a CSV per table and a PNG per figure.
+
+    The HTML needs no other file and no network: style, figures and the tables' CSV are in it.
+    The Markdown refers to the CSV and PNG files beside it. Each file is replaced as a whole, the
+    pages last.
+
+    Args:
+        blocks: the page in its order; headings begin sections.
+        folder: made where it is missing.
+        subtitle: one sentence in Markdown below the title.
+
+    Returns:
+        The paths: HTML, Markdown, then the tables and figures in their order.
+
+    Raises:
+        ValueError: two blocks of the same name, a name that is no file name, a figure without
+            alternative text.
+        ConfigError: the folder cannot be written to.
+    """
+    _check(blocks)
+    paths = []
+    try:
+        for block in blocks:
+            if isinstance(block, TableBlock):
+                paths.append(write_text(folder / f"{block.name}.csv", block.csv()))
+            elif isinstance(block, FigureBlock):
+                paths.append(save(block.figure, folder / FIGURES / f"{block.name}.png"))
+        markdown = write_text(folder / f"{stem}.md", _markdown(blocks, title, subtitle))
+        html = write_text(folder / f"{stem}.html", _html(blocks, folder, title, subtitle))
+    except OSError as error:
+        raise ConfigError(
+            f"the page cannot be written to {folder} ({error}); choose another folder"
+        ) from error
+    return [html, markdown, *paths]
+
+
+def _check(blocks: list[Block]) -> None:
+    named = [block for block in blocks if isinstance(block, TableBlock | FigureBlock)]
+    for kind in (TableBlock, FigureBlock):
+        names = Counter(block.name.casefold() for block in named if isinstance(block, kind))
+        twice = [name for name, count in names.items() if count > 1]
+        if twice:
+            raise ValueError(f"several of the page's {kind.__name__} are named {', '.join(twice)}")
+    for block in named:
+        if not _NAME.fullmatch(block.name):
+            raise ValueError(f"{block.name!r} cannot be used as a file name")
+        if isinstance(block, FigureBlock) and not block.alt.strip():
+            raise ValueError(f"figure {block.name} has no alternative text")
+    for heading in (block for block in blocks if isinstance(block, Heading)):
+        if not 2 <= heading.level <= 4:
+            raise ValueError(f"heading {heading.text!r} has level {heading.level}, expected 2 to 4")
+
+
+def _facts(blocks: list[Block]) -> dict[str, str]:
+    found = [block.facts for block in blocks if isinstance(block, Provenance)]
+    return {name: fact for facts in found for name, fact in facts.items()}
+
+
+def _markdown(blocks: list[Block], title: str, subtitle: str) -> str:
+    parts = [f"# {title}"]
+    if subtitle:
+        parts.append(subtitle)
+    for block in blocks:
+        match block:
+            case Heading(text, level):
+                parts.append(f"{'#' * level} {text}")
+            case Text(markdown):
+                parts.append(markdown.strip())
+            case TableBlock():
+                parts.append(f'<a id="table-{block.name}"></a>{block.caption.strip()}')
+                parts.append(_markdown_table(block))
+                parts.append(f"[{block.name}.csv]({block.name}.csv)")
+            case FigureBlock():
+                alt = re.sub(r"\s+", " ", block.alt).replace("[", "(").replace("]", ")").strip()
+                parts.append(f"![{alt}]({FIGURES}/{block.name}.png)")
+                parts.append(f'<a id="figure-{block.name}"></a>{block.caption.strip()}')
+    facts = _facts(blocks)
+    if facts:
+        parts.append("---")
+        parts.append("\n".join(f"- {name}: {fact}" for name, fact in facts.items()))
+    return "\n\n".join(parts) + "\n"
+
+
+def _markdown_table(block: TableBlock) -> str:
+    grid = block.grid()
+    names = [tables.one_name(name) for name in block.frame.columns]
+    labels = [cell.text for cell in grid.head[-1]][: len(grid.head[-1]) - len(names)]
+    sides = ["---:" if cell.right else "---" for cell in grid.head[-1][len(labels) :]]
+    lines = [labels + names, ["---"] * len(labels) + sides]
+    for row, cells in grid.rows:
+        lines.append(
+            [_piped(cell.text) for cell in row]
+            + [f"**{_piped(c.text)}**" if c.bold else _piped(c.text) for c in cells]
+        )
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _piped(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
+    text = MarkdownIt("commonmark", {"html": False}).disable(["image", "heading", "lheading"])
+    taken: Counter[str] = Counter()
+    parts: list[dict[str, Any]] = []
+    contents: list[dict[str, Any]] = []
+    for block in blocks:
+        match block:
+            case Heading(words, level):
+                slug = _slug(words, taken)
+                parts.append({"kind": "heading", "text": words, "level": level, "id": slug})
+                if level <= 3:
+                    contents.append(parts[-1])
+            case Text(markdown):
+                parts.append({"kind": "text", "html": Markup(text.render(markdown))})
+            case TableBlock():
+                parts.append(
+                    {
+                        "kind": "table",
+                        "name": block.name,
+                        "caption": Markup(text.renderInline(block.caption.strip())),
+                        "grid": block.grid(),
+                        "csv": _base64(block.csv().encode()),
+                    }
+                )
+            case FigureBlock():
+                width, height = (round(_PIXELS * side) for side in block.figure.get_size_inches())
+                parts.append(
+                    {
+                        "kind": "figure",
+                        "name": block.name,
+                        "caption": Markup(text.renderInline(block.caption.strip())),
+                        "alt": block.alt.strip(),
+                        "png": _base64((folder / FIGURES / f"{block.name}.png").read_bytes()),
+                        "width": width,
+                        "height": height,
+                    }
+                )
+    environment = Environment(
+        loader=PackageLoader("nnode.study", "template"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html").render(
+        title=title,
+        subtitle=Markup(text.renderInline(subtitle)),
+        parts=parts,
+        contents=contents,
+        facts=_facts(blocks),
+    )
+
+
+def _slug(words: str, taken: Counter[str]) -> str:
+    """A heading's address, as Markdown's readers make it, unique on the page."""
+    slug = re.sub(r"[^\w\- ]", "", words.lower()).strip().replace(" ", "-") or "section"
+    taken[slug] += 1
+    return slug if taken[slug] == 1 else f"{slug}-{taken[slug] - 1}"
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

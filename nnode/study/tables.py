@@ -1,0 +1,160 @@
+"""Numbers of a table as text: for HTML, for Markdown, and in full as CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+#: Digits after the point where nothing else is asked for.
+DIGITS = 2
+
+#: From here on numbers are written with a power of ten.
+_LARGE = 1e7
+
+NOTHING = "–"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell as text; ``span`` columns wide."""
+
+    text: str
+    bold: bool = False
+    right: bool = False
+    span: int = 1
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table as text: rows of the head, and of each row its labels and its cells."""
+
+    head: list[list[Cell]]
+    rows: list[tuple[list[Cell], list[Cell]]]
+
+
+def number(value: Any, digits: int = DIGITS) -> str:
+    """A value as text: fixed digits, a true minus, a dash for what is missing.
+
+    Numbers that the fixed digits would show as nought, and very large ones, are written with two
+    significant digits.
+    """
+    if value is None or value is pd.NA or value is pd.NaT:
+        return NOTHING
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, Integral):
+        text = str(int(value))
+    elif isinstance(value, Real):
+        x = float(value)
+        if math.isnan(x):
+            return NOTHING
+        if math.isinf(x):
+            text = "∞" if x > 0 else "-∞"
+        elif x and (abs(x) < 0.5 * 10.0**-digits or abs(x) >= _LARGE):
+            mantissa, _, power = f"{x:.2g}".partition("e")
+            text = f"{mantissa}e{int(power)}" if power else mantissa
+        else:
+            text = f"{x:.{digits}f}"
+    else:
+        return str(value)
+    return text.replace("-", "−")
+
+
+def grid(
+    frame: pd.DataFrame, *, digits: Mapping[str, int] | int, bold: pd.DataFrame | None
+) -> Grid:
+    """A frame as text; its index becomes the labels of the rows.
+
+    A nameless index that only counts the rows is left out.
+
+    Args:
+        frame: of numbers, strings, or both.
+        digits: after the point, for all columns or by column.
+        bold: of the same shape; true cells are set in bold.
+
+    Raises:
+        ValueError: ``bold`` has other rows or columns than the frame.
+    """
+    if bold is not None and not (
+        bold.index.equals(frame.index) and bold.columns.equals(frame.columns)
+    ):
+        raise ValueError("bold must have the rows and columns of the frame")
+    labels = _labels(frame)
+    columns = []
+    for place, name in enumerate(frame.columns):
+        wanted = digits if isinstance(digits, int) else digits.get(name, DIGITS)
+        values = list(frame.iloc[:, place])
+        right = all(_like_number(value) for value in values)
+        fat = [False] * len(values) if bold is None else [bool(b) for b in bold.iloc[:, place]]
+        columns.append(
+            [Cell(number(value, wanted), b, right) for value, b in zip(values, fat, strict=True)]
+        )
+    beside = [[Cell(_label(v)) for v in labels.iloc[:, i]] for i in range(labels.shape[1])]
+    rows = [
+        ([column[i] for column in beside], [column[i] for column in columns])
+        for i in range(len(frame))
+    ]
+    return Grid(_head(frame, list(labels.columns), columns), rows)
+
+
+def _label(value: Any) -> str:
+    """A row's label: fixed digits are for the cells."""
+    return f"{value:g}".replace("-", "−") if isinstance(value, float) else number(value)
+
+
+def _labels(frame: pd.DataFrame) -> pd.DataFrame:
+    """The index as columns, those without a name with an empty one."""
+    index = frame.index
+    if isinstance(index, pd.RangeIndex) and index.name is None:
+        return pd.DataFrame(index=index)
+    labels = index.to_frame(index=False)
+    labels.columns = pd.Index([str(name) if name is not None else "" for name in index.names])
+    return labels
+
+
+def _head(frame: pd.DataFrame, labels: list[str], columns: list[list[Cell]]) -> list[list[Cell]]:
+    """One row per level of the columns; neighbours of the same name share a cell."""
+    depth = frame.columns.nlevels
+    names = [name if isinstance(name, tuple) else (name,) for name in frame.columns]
+    right = [bool(column) and column[0].right for column in columns]
+    head = []
+    for level in range(depth):
+        last = level == depth - 1
+        row = [Cell(label if last else "") for label in labels]
+        if last:
+            row += [Cell(str(n[level]), right=r) for n, r in zip(names, right, strict=True)]
+        else:
+            for above, group in groupby(names, key=lambda n: n[: level + 1]):
+                row.append(Cell(str(above[-1]), span=len(list(group))))
+        head.append(row)
+    return head
+
+
+def _like_number(value: Any) -> bool:
+    """Whether a value stands well at the right: a number, or text that begins like one."""
+    if isinstance(value, str):
+        return value.lstrip("+-−±≤≥<>~ ")[:1].isdigit() or value in ("", NOTHING)
+    return value is None or isinstance(value, Real) or value is pd.NA
+
+
+def csv(frame: pd.DataFrame) -> str:
+    """A frame in full: one line of names, numbers that read back as the same ones."""
+    labels = _labels(frame)
+    body = frame.reset_index(drop=True)
+    body.columns = pd.Index([one_name(name) for name in frame.columns])
+    whole = pd.concat([labels.reset_index(drop=True), body], axis=1)
+    return str(whole.to_csv(index=False))
+
+
+def one_name(name: Any) -> str:
+    """A column's name; the levels of a nested one side by side."""
+    if not isinstance(name, tuple):
+        return str(name)
+    return " ".join(str(part) for part in name if str(part))
