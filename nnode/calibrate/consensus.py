@@ -30,6 +30,8 @@ class ConsensusBased(Optimizer):
         dt: step of the dynamics.
         project: moves the parameters into the admissible set.
         seed: of start and diffusion.
+        evaluate: all particles ``(P, K)`` at once to their ``(P,)`` costs; without it, a closure
+            computes them one after the other.
 
     Source:
         Pinnau, Totzeck, Tse & Martin (2017); CBX, https://pdips.github.io/CBXpy.
@@ -46,6 +48,7 @@ class ConsensusBased(Optimizer):
         dt: float = 0.1,
         project: Callable[[], None] | None = None,
         seed: int = 0,
+        evaluate: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         for name, value, good in (
             ("particles", particles, particles >= 2),
@@ -59,7 +62,7 @@ class ConsensusBased(Optimizer):
                 raise ValueError(f"{name}={value} is outside its range")
         super().__init__(params, {"lr": dt})
         self._alpha, self._drift, self._sigma, self._dt = alpha, drift, sigma, dt
-        self._project = project
+        self._project, self._evaluate = project, evaluate
         self._generator = torch.Generator().manual_seed(seed)
         start = self._get()
         noise = self._normal((particles, start.size))
@@ -87,14 +90,12 @@ class ConsensusBased(Optimizer):
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:  # type: ignore[override]
         """Evaluate all particles and move them once; returns the best cost so far."""
-        if closure is None:
-            raise ValueError("consensus-based optimisation needs a closure that returns the cost")
         for i, particle in enumerate(self._x):
             self._set(particle)
             if self._project is not None:
                 self._project()
             self._x[i] = self._get()
-        costs = np.array([self._cost(particle, closure) for particle in self._x])
+        costs = self._costs(closure)
         costs = np.where(np.isfinite(costs), costs, np.inf)
         least = int(costs.argmin())
         if costs[least] < self._best_cost:
@@ -122,9 +123,16 @@ class ConsensusBased(Optimizer):
         self._set(self._best)
         return torch.tensor(self._best_cost, dtype=torch.float64)
 
-    def _cost(self, particle: np.ndarray, closure: Callable[[], Tensor]) -> float:
-        self._set(particle)
-        return float(closure())
+    def _costs(self, closure: Callable[[], Tensor] | None) -> np.ndarray:
+        if self._evaluate is not None:
+            return self._evaluate(torch.from_numpy(self._x.copy())).double().numpy()
+        if closure is None:
+            raise ValueError("consensus-based optimisation needs a closure that returns the cost")
+        found = []
+        for particle in self._x:
+            self._set(particle)
+            found.append(float(closure()))
+        return np.array(found)
 
     def state_dict(self) -> dict[str, Any]:
         """Particles, best one and generator; everything that resuming needs."""

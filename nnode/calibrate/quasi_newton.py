@@ -28,12 +28,14 @@ class Minima:
         rows: ``(R, K)`` parameters.
         costs: ``(R,)``; inf where not even the start could be simulated.
         gradients: ``(R, K)``.
+        inverses: ``(R, K, K)`` approximations of the inverse Hessians.
         evaluations: calls of the ensemble, the same for all runs.
     """
 
     rows: Tensor
     costs: Tensor
     gradients: Tensor
+    inverses: Tensor
     evaluations: int
 
     @property
@@ -50,6 +52,7 @@ def minimise(
     *,
     iterations: int = 150,
     tolerance: float = 1e-7,
+    inverse: Tensor | None = None,
 ) -> Minima:
     """Minimise R costs, each from a start of its own, within a box.
 
@@ -62,11 +65,13 @@ def minimise(
         low, high: ``(K,)`` the box.
         iterations: evaluations at most.
         tolerance: ends when within 20 evaluations no cost fell by more than this share.
+        inverse: ``(K, K)`` inverse Hessian to start from, as found by an earlier minimisation
+            of nearly the same cost; None starts from the steepest descent.
 
     Source:
         Nocedal & Wright, Numerical Optimization, 2nd ed., sections 6.1 and 16.7.
     """
-    runs = _Runs(evaluate, start, low, high)
+    runs = _Runs(evaluate, start, low, high, inverse)
     earlier = runs.cost
     done = 0
     for done in range(1, iterations + 1):
@@ -79,7 +84,7 @@ def minimise(
             ):
                 break
             earlier = runs.cost
-    return Minima(runs.x, runs.cost, runs.gradient, done + 1)
+    return Minima(runs.x, runs.cost, runs.gradient, runs.inverse, done + 1)
 
 
 def optimality_residual(
@@ -97,7 +102,14 @@ def optimality_residual(
 class _Runs:
     """State of all runs: points, costs, gradients, inverse Hessians, steps."""
 
-    def __init__(self, evaluate: Evaluate, start: Tensor, low: Tensor, high: Tensor) -> None:
+    def __init__(
+        self,
+        evaluate: Evaluate,
+        start: Tensor,
+        low: Tensor,
+        high: Tensor,
+        inverse: Tensor | None = None,
+    ) -> None:
         self.evaluate, self.low, self.high = evaluate, low, high
         self.x = start.clamp(low, high)
         cost, gradient = evaluate(self.x)
@@ -106,8 +118,9 @@ class _Runs:
         self.gradient = torch.where(usable[:, None], gradient, 0.0)
         runs, size = start.shape
         self.unit = torch.eye(size, dtype=start.dtype)
-        self.inverse = self.unit.repeat(runs, 1, 1)
-        self.fresh = torch.ones(runs, dtype=torch.bool)
+        self.inverse = (self.unit if inverse is None else inverse).repeat(runs, 1, 1)
+        # without curvature yet: the first step is cut, the first curvature scales the rest
+        self.fresh = torch.full((runs,), inverse is None)
         self.length = torch.ones(runs, dtype=start.dtype)
         self.refused = torch.zeros(runs, dtype=torch.long)
         self.direction = self._direction()

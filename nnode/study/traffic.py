@@ -1,0 +1,156 @@
+"""Section 5 of the paper: five models on ten recordings, and what the paper leaves open."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from nnode.data.options import EsimasOptions, Faults
+from nnode.data.prepare import prepare
+from nnode.data.store import Store
+from nnode.errors import ConfigError
+from nnode.study import traffic_tasks as tasks
+from nnode.study.options import TrafficStudyOptions
+from nnode.study.page import Block
+from nnode.study.runner import Task, run_tasks
+from nnode.study.traffic_page import blocks
+from nnode.study.traffic_results import Study
+
+TITLE = "Traffic: five models on ten recordings"
+SUBTITLE = (
+    "Section 5 of Göttlich & Totzeck, *Optimal control for interacting particle systems driven "
+    "by neural networks*, on the same recordings, printed numbers beside ours."
+)
+
+LAWS = ("lin", "log")
+NETWORKS = ("n2", "n4", "n10")
+MODELS = (*LAWS, *NETWORKS)
+#: Relative time of a gradient.
+_TIMES = {"lin": 1.0, "log": 1.2, "n2": 1.5, "n4": 2.0, "n10": 3.5}
+#: A recording is searched with up to so many times the starts of the largest one.
+_MOST = 12
+#: Other steps at which solutions are evaluated, s.
+STEPS = [0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001]
+
+
+def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
+    """Compute what is missing and make the page.
+
+    Raises:
+        ConfigError: an option out of its range.
+        DataError: recordings that cannot be read.
+        StudyError: tasks failed.
+    """
+    for name in ("restarts", "iterations", "folds", "descent_steps", "particles"):
+        least = 2 if name in ("folds", "particles") else 1
+        if getattr(options, name) < least:
+            raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
+    if options.quick:
+        options = replace(
+            options, restarts=4, iterations=60, folds=2, bootstrap=10, descent_steps=40,
+            particles=10, consensus_steps=20,
+        )  # fmt: skip
+    stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
+    assert options.workers is not None
+    found = run_tasks(
+        list(_tasks(options, stores)),
+        folder,
+        workers=options.workers,
+        fingerprint=_fingerprint(stores),
+        title="traffic study",
+    )
+    return blocks(Study(options, stores, found))
+
+
+def _prepared(options: TrafficStudyOptions, policy: str, folder: Path) -> Store:
+    chosen = EsimasOptions(
+        name="esimas", source=options.source, download=options.download, faults=Faults(policy)
+    )
+    return prepare(chosen, folder / "data" / policy)
+
+
+def _fingerprint(stores: dict[str, Store]) -> str:
+    content = {policy: store.manifest["files"] for policy, store in stores.items()}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _sizes(store: Store) -> dict[str, int]:
+    """Measured positions of followers by recording: what a gradient's time goes with."""
+    sizes: dict[str, int] = {}
+    for entry in store.index:
+        size = (entry["n_agents"] - 1) * entry["n_samples"]
+        sizes[entry["recording"]] = sizes.get(entry["recording"], 0) + size
+    return sizes
+
+
+def _tasks(options: TrafficStudyOptions, stores: dict[str, Store]) -> Iterator[Task]:
+    for policy, store in stores.items():
+        sizes = _sizes(store)
+        largest = max(sizes.values())
+        for name, size in sizes.items():
+            # as much time for a small recording as for the largest: it has as many minima
+            share = min(_MOST, largest / size)
+            for model in MODELS:
+                yield from _of_model(options, policy, str(store.folder), name, model, size, share)
+
+
+def _of_model(
+    options: TrafficStudyOptions, policy: str, folder: str, name: str, model: str, size: int,
+    share: float,
+) -> Iterator[Task]:  # fmt: skip
+    where = {"folder": folder, "recording_name": name, "model": model, "dt": options.dt}
+    where["seed"] = options.seed
+    time = _TIMES[model] * size
+    boxes = (None, options.box) if model in NETWORKS else (None,)
+    for box in boxes:
+        suffix = "" if box is None else "-box"
+        # laws have two parameters: few starts find what there is
+        starts = options.restarts if box is None and model in NETWORKS else options.restarts / 4
+        search: dict[str, Any] = {
+            **where,
+            "box": box,
+            "restarts": max(2, round(starts * share)),
+            "iterations": options.iterations,
+        }
+        yield Task(
+            f"fit-{policy}-{name}-{model}{suffix}",
+            tasks.fit,
+            {**search, "bootstrap": options.bootstrap if box is None else 0, "steps": STEPS},
+            cost=3 * time,
+        )
+        yield Task(
+            f"heldout-{policy}-{name}-{model}{suffix}",
+            tasks.cross_validate,
+            {**search, "restarts": max(2, options.restarts // 6), "folds": options.folds},
+            cost=3 * time,
+        )
+    if policy == "drop":
+        return
+    yield Task(
+        f"descent-{name}-{model}",
+        tasks.descend,
+        {
+            **where,
+            "restarts": 2,
+            "steps": options.descent_steps,
+            "lr": options.descent_lr,
+            "batch_size": options.batch_size,
+        },
+        cost=2 * time,
+    )
+    yield Task(
+        f"consensus-{name}-{model}",
+        tasks.agree,
+        {**where, "particles": options.particles, "steps": options.consensus_steps},
+        cost=time,
+    )
+    if model in LAWS:
+        yield Task(f"scan-{name}-{model}", tasks.scan, _scan(where, options.quick), cost=time)
+
+
+def _scan(where: dict[str, Any], quick: bool) -> dict[str, Any]:
+    return {k: v for k, v in where.items() if k != "seed"} | {"points": 21 if quick else 101}

@@ -1,0 +1,138 @@
+"""One traffic model on some sequences: starts, search, and what a solution says."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.calibrate.ensemble import EnsembleCost
+from nnode.calibrate.quasi_newton import Minima, minimise
+from nnode.data.sequence import Sequence, collate
+from nnode.data.split import components
+from nnode.data.store import Store
+from nnode.models.build import build_model
+from nnode.models.system import System
+from nnode.plots.traffic import follow_law
+from nnode.solvers.fused.engine import FusedSolver
+
+#: Step of the first search, s; the best of its finds are then followed at the study's own step.
+COARSE = 0.02
+#: Gaps (m) at which laws are compared, as in the paper's figure.
+GAPS = tuple(float(gap) for gap in range(2, 51))
+#: Finds of the first search that are followed further: in float32, then in float64.
+FOLLOWED, FINISHED = 6, 2
+#: Starts are drawn within: v0 (m/s) and L (m) of the laws; factor on the weights of networks.
+SPEEDS, LENGTHS, WIDEN = (15.0, 35.0), (2.0, 10.0), 5.0
+
+
+def model_options(model: str, box: float | None = None) -> dict[str, Any]:
+    """Options of lin, log, n2, n4 or n10 as the paper starts them."""
+    common = {"name": model, "leader": "constant", "v0": 30.0}
+    if model in ("lin", "log"):
+        return {**common, "term": model, "L": 5.0, "L_min": 2.0}
+    return {**common, "term": "network_speed", "hidden": int(model[1:]), "box": box}
+
+
+@lru_cache(maxsize=4)
+def _recordings(folder: str) -> dict[str, list[Sequence]]:
+    found: dict[str, list[Sequence]] = {}
+    for sequence in Store(folder):
+        found.setdefault(sequence.recording, []).append(sequence)
+    return found
+
+
+def recording(folder: str, name: str) -> list[Sequence]:
+    """The sequences of one recording in a prepared folder, in the order of the store."""
+    return _recordings(folder)[name]
+
+
+def groups(folder: str, name: str) -> np.ndarray:
+    """``(B,)`` group of each sequence of a recording: those that may share vehicles."""
+    index = [entry for entry in Store(folder).index if entry["recording"] == name]
+    return components(index, gap=5.0)
+
+
+class Problem:
+    """One model on some sequences, at any step and precision."""
+
+    def __init__(self, sequences: list[Sequence], model: str, box: float | None = None) -> None:
+        self.options = model_options(model, box)
+        self.batch = collate(sequences)
+
+    def cost(self, dt: float, dtype: torch.dtype) -> EnsembleCost:
+        """The cost with steps of ``dt`` (s)."""
+        return EnsembleCost(self.system(dtype=dtype), self.batch.to(dtype=dtype), FusedSolver(dt))
+
+    def system(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
+        """The model at its random start."""
+        return build_model(self.options, seed, dtype)
+
+    def starts(self, number: int, seed: int, wide: bool = True) -> Tensor:
+        """``(R, K)`` starts: the first as the paper's, then more widely spread ones.
+
+        Networks start uniform on [-1, 1] in one half of the runs, on up to five times that in
+        the other; laws anywhere in a plausible range.
+        """
+        cost = self.cost(COARSE, torch.float64)
+        rows = torch.stack([cost.row(self.system(1000 * seed + r)) for r in range(number)])
+        draw = torch.Generator().manual_seed(seed)
+        share = torch.rand(number, 2, generator=draw, dtype=torch.float64)
+        if not wide:
+            return rows
+        if self.options["term"] != "network_speed":
+            place = {name.rsplit(".")[-1]: i for i, name in enumerate(cost.names)}
+            for i, (name, (low, high)) in enumerate((("v0", SPEEDS), ("L", LENGTHS))):
+                rows[1:, place[name]] = low + (high - low) * share[1:, i]
+        elif self.options["box"] is None:
+            inner = torch.ones(rows.shape[1], dtype=torch.bool)
+            inner[cost.names.index("terms.0.v0")] = False
+            factor = torch.where(torch.arange(number) < number // 2, 1.0, WIDEN ** share[:, 0])
+            rows[:, inner] *= factor[:, None]
+        return rows
+
+    def search(
+        self, starts: Tensor, dt: float, iterations: int, weights: Tensor | None = None
+    ) -> tuple[Minima, Tensor]:
+        """Minimise from all starts; also the ``(R,)`` costs at ``dt`` after the first search.
+
+        Steep laws make Euler's method unstable at coarse steps, so that a find of the first
+        search is judged at ``dt`` alone.
+        """
+        coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
+
+        def weigh(cost: EnsembleCost, rows: Tensor) -> Tensor:
+            each = cost.costs(rows)
+            if weights is None:
+                return each.mean(1)
+            return torch.where(weights > 0, each * weights, 0.0).sum(1)
+
+        low, high = coarse.low, coarse.high
+        found = minimise(lambda r: coarse(r, weights), starts, low, high, iterations=iterations)
+        judged = weigh(fine, found.rows)
+        best = judged.argsort()[:FOLLOWED]
+        near = minimise(
+            lambda r: fine(r, weights), found.rows[best], low, high, iterations=iterations // 2
+        )
+        exact = self.cost(dt, torch.float64)
+        last = near.rows[near.costs.argsort()[:FINISHED]]
+        end = minimise(lambda r: exact(r, weights), last, low, high, iterations=iterations // 2)
+        return end, judged
+
+
+def speeds(system: System) -> list[float]:
+    """Speed (m/s) at :data:`GAPS`."""
+    law = follow_law(system)
+    with torch.no_grad():
+        return law.speed(torch.tensor(GAPS, dtype=law.v0.dtype)).tolist()
+
+
+def named(cost: EnsembleCost, row: Tensor) -> dict[str, Any]:
+    """A row as nested lists by parameter; names without the term they belong to."""
+    return {
+        name.removeprefix("terms.0."): value[0].double().tolist()
+        for name, value in cost.parameters(row[None]).items()
+    }
