@@ -37,6 +37,7 @@ from nnode.models.options import (
     NetworkSpeedOptions,
     SocialForceOptions,
 )
+from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
 
 
 @dataclass
@@ -97,12 +98,20 @@ class BenchmarkConfig:
     benchmark: BenchmarkOptions = field(default_factory=BenchmarkOptions)
 
 
+@dataclass
+class StudyConfig:
+    """``scripts/study.py``: the paper's studies on the real recordings."""
+
+    study: Any = MISSING
+
+
 SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
     (None, "evaluate_schema"): EvaluateConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "benchmark_schema"): BenchmarkConfig,
+    (None, "study_schema"): StudyConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
@@ -118,6 +127,8 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "adam_schema"): AdamOptions,
     ("optimizer", "lbfgs_schema"): LbfgsOptions,
     ("optimizer", "cbo_schema"): ConsensusOptions,
+    ("study", "traffic_study_schema"): TrafficStudyOptions,
+    ("study", "crowd_study_schema"): CrowdStudyOptions,
 }
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import resource
 import sys
 import time
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -23,10 +20,14 @@ from nnode.app.benchmark_problems import SHAPES, Problem, pose
 from nnode.calibrate.cost import squared_error
 from nnode.errors import ConfigError, SimulationError
 from nnode.files import write_json
+from nnode.machine import machine
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 
 #: A measurement repeats its call for at least so long, s.
 _LEAST = 0.05
+
+#: Packages whose versions the results name.
+PACKAGES = ("torch", "torchdiffeq", "numba", "numpy", "jax", "diffrax")
 
 
 def benchmark(config: DictConfig, folder: Path) -> None:
@@ -69,7 +70,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                 _print(found[-1])
     write_json(
         folder / "benchmark.json",
-        {"machine": _machine(), "dtype": options.dtype.value, "problems": found},
+        {"machine": machine(PACKAGES), "dtype": options.dtype.value, "problems": found},
     )
     print(f"results: {folder / 'benchmark.json'}")
 
@@ -200,24 +201,3 @@ def _print(row: dict[str, Any]) -> None:
             for n in (1, 2)
         ]
         console.print(f"{ensemble['restarts']} restarts cost {', '.join(parts)}")
-
-
-def _machine() -> dict[str, Any]:
-    versions = {"python": platform.python_version()}
-    for package in ("torch", "torchdiffeq", "numba", "numpy", "jax", "diffrax"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "absent"
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        names = [line for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        processor = names[0].split(":", 1)[1].strip() if names else processor
-    return {
-        "processor": processor,
-        "cores": os.cpu_count(),
-        "system": platform.platform(),
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "versions": versions,
-    }

@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -122,6 +123,8 @@ def calls_in_processes(
                 try:
                     outcome = worker.connection.recv()
                 except (EOFError, OSError):
+                    if guard.requested is not None:
+                        break  # whoever stops this process may have stopped all of them
                     crew.remove(worker)
                     outcome = Outcome(error=worker.bury())
                     if waiting:
@@ -191,6 +194,8 @@ def _inherited() -> Iterator[None]:
     """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
+    # started with the first process otherwise, and then it lifts the block
+    resource_tracker.ensure_running()
     block = getattr(signal, "pthread_sigmask", None)
     mask = block(signal.SIG_BLOCK, {signal.SIGINT}) if block else set()
     try:

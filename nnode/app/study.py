@@ -1,0 +1,111 @@
+"""The paper's studies: ``scripts/study.py``."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import signal
+import sys
+import time
+from datetime import datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+import nnode
+from nnode.calibrate.interrupt import BreakingGuard, Interrupted
+from nnode.errors import ConfigError
+from nnode.machine import cores, machine
+from nnode.study.options import StudyOptions
+from nnode.study.page import Block, Provenance, write_page
+
+log = logging.getLogger(__name__)
+
+#: The module of each study; imported when it is asked for.
+STUDIES = {"traffic": "nnode.study.traffic", "crowd": "nnode.study.crowd"}
+
+#: Folder of quick studies inside the study's own: they must not replace full results.
+QUICK = "quick"
+
+_PACKAGES = ("torch", "numba", "numpy", "scipy", "pandas", "matplotlib")
+
+
+class Study(Protocol):
+    """A module that makes a page.
+
+    Attributes:
+        TITLE: of the page.
+        SUBTITLE: one sentence in Markdown.
+    """
+
+    TITLE: str
+    SUBTITLE: str
+
+    @staticmethod
+    def run(options: StudyOptions, folder: Path) -> list[Block]:
+        """Compute what is not kept in ``folder`` yet, and make the page's blocks.
+
+        Args:
+            options: checked; ``workers`` is a number.
+            folder: of this study; its results are kept there.
+        """
+        ...
+
+
+def study(config: DictConfig, folder: Path) -> None:
+    """Run a study, write its page, tables and figures, and print where they are.
+
+    Raises:
+        ConfigError: an unknown study, or options that it cannot work with.
+        Interrupted: a signal asked to stop; what is done is kept.
+    """
+    options = cast(StudyOptions, OmegaConf.to_object(config.study))
+    if options.name not in STUDIES:
+        raise ConfigError(
+            f"study.name={options.name} is unknown, expected one of {', '.join(STUDIES)}"
+        )
+    options.workers = cores() if options.workers is None else options.workers
+    if options.workers < 1:
+        raise ConfigError(f"study.workers={options.workers} must be at least 1")
+    folder = folder / QUICK if options.quick else folder
+    start = time.monotonic()
+    with BreakingGuard() as guard:
+        try:
+            module = cast(Study, import_module(STUDIES[options.name]))
+            blocks = module.run(options, folder)
+            made = _made(time.monotonic() - start, options.workers)
+            paths = write_page(
+                [*blocks, made],
+                folder,
+                title=module.TITLE + (" (quick)" if options.quick else ""),
+                subtitle=module.SUBTITLE,
+            )
+        except KeyboardInterrupt:
+            number = guard.requested or signal.SIGINT
+            raise Interrupted(
+                f"stopped by {signal.Signals(number).name}: what is done is kept in {folder}; "
+                "the same command goes on from there",
+                number,
+            ) from None
+    for path, what in zip(paths, ("page", "as Markdown"), strict=False):
+        print(f"{what}: {path}")
+    print(f"tables: {sum(p.suffix == '.csv' for p in paths)} CSV files in {folder}")
+    print(f"time: {time.monotonic() - start:.1f} s")
+
+
+def _made(seconds: float, workers: int) -> Provenance:
+    """How this run made the page."""
+    here = machine(_PACKAGES)
+    versions = {"nnode": nnode.__version__, **here["versions"]}
+    return Provenance(
+        {
+            "Command": shlex.join(["python", *sys.argv]),
+            "Date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+            "Time": f"{seconds:.0f} s in this run with {workers} worker process(es); results that "
+            "were kept before are not computed again",
+            "Machine": f"{here['processor']}, {here['cores']} cores, {here['system']}",
+            "Versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
+        }
+    )

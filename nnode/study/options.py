@@ -1,0 +1,39 @@
+"""Options of the studies, as dataclasses that the configuration is checked against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from omegaconf import MISSING
+
+
+@dataclass
+class StudyOptions:
+    """What all studies share."""
+
+    name: str = MISSING
+    source: str | None = None  # folder with the raw files; null downloads
+    download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
+    quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
+    workers: int | None = None  # processes; null: one per core
+    seed: int = 0  # of start parameters and of resampling
+
+
+@dataclass
+class TrafficStudyOptions(StudyOptions):
+    """Five models on the ten ESIMAS recordings."""
+
+    name: str = "traffic"
+    restarts: int = 16  # start parameters per model and recording
+    dt: float = 0.02  # Euler step, s
+    bootstrap: int = 1000  # resamples of the sequences
+
+
+@dataclass
+class CrowdStudyOptions(StudyOptions):
+    """Social force and networks on two-way flows in a corridor."""
+
+    name: str = "crowd"
+    restarts: int = 8  # start parameters per model and horizon
+    horizons: list[float] = field(default_factory=lambda: [1.0, 2.0, 3.0, 5.0])  # s
+    bootstrap: int = 200  # resamples of blocks of time
