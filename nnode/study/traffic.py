@@ -51,7 +51,7 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
     if options.quick:
         options = replace(
-            options, restarts=4, iterations=60, folds=2, bootstrap=10, descent_steps=40,
+            options, restarts=4, iterations=60, folds=2, bootstrap=10, descent_steps=50,
             particles=10, consensus_steps=20,
         )  # fmt: skip
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
@@ -110,6 +110,8 @@ def _of_model(
         suffix = "" if box is None else "-box"
         # laws have two parameters: few starts find what there is
         starts = options.restarts if box is None and model in NETWORKS else options.restarts / 4
+        if policy == "drop":
+            starts /= 2
         search: dict[str, Any] = {
             **where,
             "box": box,
@@ -127,7 +129,12 @@ def _of_model(
         yield Task(
             f"heldout-{policy}-{name}-{model}{suffix}",
             tasks.cross_validate,
-            {**search, "restarts": max(2, options.restarts // 6), "folds": options.folds},
+            {
+                **search,
+                "restarts": max(2, options.restarts // 4),
+                "iterations": max(20, options.iterations * 2 // 3),
+                "folds": options.folds,
+            },
             cost=3 * time,
         )
     if policy == "drop":
@@ -139,6 +146,7 @@ def _of_model(
             **where,
             "restarts": 2,
             "steps": options.descent_steps,
+            "updates_dt": options.descent_dt,
             "lr": options.descent_lr,
             "batch_size": options.batch_size,
         },

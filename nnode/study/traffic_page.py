@@ -217,8 +217,8 @@ def _lower(
             nearest = int(np.abs(np.array(scan["lengths"]) - printed_length).argmin())
             line += (
                 f". A grid over all v0 and L finds no less than {scan['cost']:.2f}, and with the "
-                f"printed L no less than {scan['by_length'][nearest]:.2f}: with the cost and the data "
-                "as they are described, the printed value is not reached by any parameters"
+                f"printed L no less than {scan['by_length'][nearest]:.2f}: with the cost and the "
+                "data as they are described, the printed value is not reached by any parameters"
             )
         else:
             one = study.one("fit", name, model)
