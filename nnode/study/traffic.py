@@ -51,7 +51,7 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
     if options.quick:
         options = replace(
-            options, restarts=4, iterations=60, folds=2, bootstrap=10, descent_steps=50,
+            options, restarts=4, iterations=45, folds=2, bootstrap=10, descent_steps=50,
             particles=10, consensus_steps=20,
         )  # fmt: skip
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
@@ -67,8 +67,10 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
 
 
 def _prepared(options: TrafficStudyOptions, policy: str, folder: Path) -> Store:
+    # one folder for both policies, so that nothing is fetched twice
+    download = options.download or str(folder / "data" / "raw")
     chosen = EsimasOptions(
-        name="esimas", source=options.source, download=options.download, faults=Faults(policy)
+        name="esimas", source=options.source, download=download, faults=Faults(policy)
     )
     return prepare(chosen, folder / "data" / policy)
 

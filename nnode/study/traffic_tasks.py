@@ -64,13 +64,15 @@ def fit(
     if bootstrap:
         rng = np.random.default_rng(seed)
         weights = torch.from_numpy(group_weights(groups(folder, recording_name), bootstrap, rng))
-        result["bootstrap"] = _bootstrap(problem, best, found.inverses[found.best], weights, dt)
+        result["bootstrap"] = _bootstrap(
+            problem, best, found.inverses[found.best], weights, dt, iterations // 3
+        )
     result["seconds"] = time.perf_counter() - begin
     return result
 
 
 def _bootstrap(
-    problem: Problem, row: Tensor, inverse: Tensor, weights: Tensor, dt: float
+    problem: Problem, row: Tensor, inverse: Tensor, weights: Tensor, dt: float, iterations: int
 ) -> Result:
     """Local refits to resampled sequences: what their spread says about the parameters."""
     # the coarse step is ten times cheaper, and does where it hardly changes the solution's cost
@@ -79,7 +81,7 @@ def _bootstrap(
     cost = problem.cost(step, torch.float32)
     refits = minimise(
         lambda rows: cost(rows, weights), row.expand(len(weights), -1), cost.low, cost.high,
-        iterations=50, inverse=inverse,
+        iterations=iterations, inverse=inverse,
     )  # fmt: skip
     rows = refits.rows[torch.isfinite(refits.costs)]
     system, exact = problem.system(), problem.cost(step, torch.float64)
