@@ -37,9 +37,9 @@ LIBRARY = r"\b(call\w*|movabsq|bl|adrp)\s[^\n]*\b(exp2?|expm1|log1p|log2?|pow)f?
 CALLED = r"\b(call\w*|movabsq|bl)\s[^\n]*\b_ZN5nnode7solvers5fused\w*_(math|polynomials)"
 
 
-def is_vector_code(text: str) -> bool:
-    """Whether assembly divides several numbers at once, twice at least, and calls nothing."""
-    packed = len(re.findall(PACKED[platform.machine()], text)) >= 2
+def is_vector_code(text: str, loops: int = 2) -> bool:
+    """Whether assembly divides several numbers at once, in so many places, and calls nothing."""
+    packed = len(re.findall(PACKED[platform.machine()], text)) >= loops
     return packed and not re.search(LIBRARY, text) and not re.search(CALLED, text)
 
 
