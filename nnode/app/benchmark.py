@@ -18,6 +18,7 @@ from nnode.app.benchmark_floor import evaluations, floor_call
 from nnode.app.benchmark_memory import peak_memory
 from nnode.app.benchmark_problems import SHAPES, Problem, pose
 from nnode.app.benchmark_report import per_person, print_per_person, print_problem
+from nnode.app.benchmark_start import warm_start
 from nnode.calibrate.cost import squared_error
 from nnode.errors import ConfigError, SimulationError
 from nnode.files import write_json
@@ -85,6 +86,8 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                 # those of ``steps`` are the ones of ``paper``, but for their length
                 if shape.domain == "traffic" and name != "steps":
                     row["ensemble"] = _ensemble(problem, options.restarts, options.repeats)
+                if name in ("paper", "crowd") and "fused_1" in chosen:
+                    row["warm_start"] = warm_start(problem)
                 found.append({"shape": name, **row})
                 print_problem(found[-1])
                 results["scale"] = per_person([r for r in found if r["shape"] == "scale"])

@@ -43,6 +43,8 @@ def print_problem(row: dict[str, Any]) -> None:
             for n in (1, 2)
         ]
         console.print(f"{ensemble['restarts']} restarts cost {', '.join(parts)}")
+    if "warm_start" in row:
+        console.print(f"first gradient of a new process, kept code: {row['warm_start']:.3g} s")
     if floor:
         line = (
             f"arithmetic alone: {floor['evaluations']:,} softplus values and derivatives take "

@@ -167,21 +167,19 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch) -> None:  # type:
 
 
 SCRIPT = """
-import json, sys, time
+import json, sys
 import numpy as np, torch
 from nnode.data.sequence import Sequence, collate
 from nnode.models import NetworkSpeed, Traffic
 x = np.cumsum(np.full((3, 4, 1), 12.0), 1) + np.arange(3.0)[:, None, None]
 batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)])
 model = Traffic([NetworkSpeed(4)])
-start = time.perf_counter()
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-took = time.perf_counter() - start
 from nnode.solvers.fused import _generate, laws
 module = _generate.compiled(laws.kernel_of(model.terms[0]))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
-print(json.dumps({"took": took, "hits": hits}))
+print(json.dumps({"hits": hits}))
 """
 
 
@@ -198,5 +196,4 @@ def test_a_second_process_does_not_compile(tmp_path) -> None:  # type: ignore[no
         )
         runs.append(json.loads(done.stdout))
     assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
-    assert runs[1]["took"] < 2.0  # s
     assert len(list((tmp_path / "fused").glob("*.py"))) == 1
