@@ -54,15 +54,15 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
     if options.quick:
         options = replace(
-            options, restarts=4, iterations=45, folds=2, bootstrap=10, descent_steps=50,
-            particles=10, consensus_steps=20,
+            options, restarts=4, iterations=30, folds=2, bootstrap=10, descent_steps=30,
+            particles=10, consensus_steps=10,
         )  # fmt: skip
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
     assert options.workers is not None
     how: dict[str, Any] = {"workers": options.workers, "fingerprint": _fingerprint(stores)}
     first = list(_tasks(options, stores))
     found = run_tasks(first, folder, title="traffic study", **how)
-    again = _wider(first, found)
+    again = [] if options.quick else _wider(first, found)
     if again:
         wider = run_tasks(again, folder, title="wider search", **how)
         found |= {_replaces(key, found, one): one for key, one in wider.items()}
@@ -138,7 +138,9 @@ def _of_model(
     for box in boxes:
         suffix = "" if box is None else "-box"
         # laws have two parameters: few starts find what there is
-        starts = options.restarts if box is None and model in NETWORKS else options.restarts / 4
+        starts = options.restarts / 4
+        if box is None and model in NETWORKS:
+            starts = options.restarts * _TIMES["n4"] / _TIMES[model]
         if policy == "drop":
             starts /= 2
         search: dict[str, Any] = {
