@@ -40,10 +40,15 @@ def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -
         )  # fmt: skip
         mean = float(np.nanmean(y))
         ax.axhline(mean, color=style["color"], linestyle=style["linestyle"], linewidth=1)
-        handles.append(Line2D([], [], **style, markersize=4.5, label=f"{model}, mean {mean:.0f}"))
+        handles.append(
+            Line2D([], [], **style, markersize=4.5, label=f"{model}: mean {mean:.0f} km/h")
+        )
     ax.set_xticks(place, [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)])
     dress(ax, x="recording", y="leader's speed v0 (km/h)")
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=len(handles), frameon=False,
+        fontsize=SMALL_FONT, handlelength=2.6, columnspacing=1.2,
+    )  # fmt: skip
     return figure
 
 
@@ -69,7 +74,7 @@ def law_panels(
     models: list[str] = []
     for n, (name, table) in enumerate(speeds.items()):
         ax = axes.flat[n]
-        models = list(table)
+        models = [str(model) for model in table.columns]
         for i, model in enumerate(models):
             style = {**curve_style(i), "marker": ""}
             ax.plot(gaps, table[model].clip(-1e3, 1e3), linewidth=1.2, **style)

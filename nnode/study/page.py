@@ -188,8 +188,8 @@ def _markdown(blocks: list[Block], title: str, subtitle: str) -> str:
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [tables.one_name(name) for name in block.frame.columns]
-    labels = [cell.text for cell in grid.head[-1]][: len(grid.head[-1]) - len(names)]
+    names = [_piped(tables.one_name(name)) for name in block.frame.columns]
+    labels = [_piped(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]]
     sides = ["---:" if cell.right else "---" for cell in grid.head[-1][len(labels) :]]
     lines = [labels + names, ["---"] * len(labels) + sides]
     for row, cells in grid.rows:

@@ -116,12 +116,14 @@ def _of_model(
             "restarts": max(2, round(starts * share)),
             "iterations": options.iterations,
         }
-        yield Task(
-            f"fit-{policy}-{name}-{model}{suffix}",
-            tasks.fit,
-            {**search, "bootstrap": options.bootstrap if box is None else 0, "steps": STEPS},
-            cost=3 * time,
-        )
+        if box is None or policy == "keep":
+            draws = options.bootstrap if box is None else 0
+            yield Task(
+                f"fit-{policy}-{name}-{model}{suffix}",
+                tasks.fit,
+                {**search, "bootstrap": draws, "steps": STEPS},
+                cost=3 * time,
+            )
         yield Task(
             f"heldout-{policy}-{name}-{model}{suffix}",
             tasks.cross_validate,

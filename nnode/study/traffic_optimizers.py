@@ -7,7 +7,7 @@ import pandas as pd
 
 from nnode.plots.study_traffic import descents
 from nnode.study.page import Block, FigureBlock, Heading, TableBlock, Text
-from nnode.study.traffic_results import AVERAGE, ORDER, Study
+from nnode.study.traffic_results import AVERAGE, ORDER, Study, cell
 
 #: A cost gradient takes the time of about so many simulations, which the figure counts.
 GRADIENT = 3
@@ -27,7 +27,7 @@ def optimizer_blocks(study: Study) -> list[Block]:
         }
     )
     table.index.name = "model"
-    ahead = [m for m in ORDER if table.loc[m, "consensus"] < table.loc[m, "ADADELTA"]]
+    ahead = [m for m in ORDER if cell(table, m, "consensus") < cell(table, m, "ADADELTA")]
     spent = options.particles * options.consensus_steps
     paid = GRADIENT * 2 * options.descent_steps
     text = (

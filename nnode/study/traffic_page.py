@@ -23,6 +23,7 @@ from nnode.study.traffic_results import (
     ORDER,
     Study,
     averaged,
+    cell,
     least,
     printed_costs,
     printed_lengths,
@@ -83,22 +84,22 @@ def _summary(study: Study) -> list[Block]:
         )
         rows[model] = {
             "printed": printed.AVERAGE_COSTS[model],
-            "here": costs.loc[model, AVERAGE],
+            "here": cell(costs, model, AVERAGE),
             "95 % low": low,
             "95 % high": high,
-            "paper's optimiser": study.costs("descent").loc[model, AVERAGE],
-            "consensus": study.costs("consensus").loc[model, AVERAGE],
+            "paper's optimiser": cell(study.costs("descent"), model, AVERAGE),
+            "consensus": cell(study.costs("consensus"), model, AVERAGE),
             "weights in box": box.get(model, np.nan),
-            "faults dropped": study.costs(policy="drop").loc[model, AVERAGE],
+            "faults dropped": cell(study.costs(policy="drop"), model, AVERAGE),
         }
     table = pd.DataFrame(rows).T
     table.index.name = "model"
-    best = table["here"].idxmin()
-    below = [m for m in ORDER if table.loc[m, "here"] < table.loc[m, "printed"]]
+    best = str(table["here"].idxmin())
+    below = [m for m in ORDER if cell(table, m, "here") < cell(table, m, "printed")]
     said = "all five models" if len(below) == len(ORDER) else ", ".join(below) or "no model"
     text = (
         f"Averaged over ten recordings, {said} reach a lower cost here than printed; the least "
-        f"is {best}'s, {table.loc[best, 'here']:.2f} m² s. The intervals come from resampling "
+        f"is {best}'s, {cell(table, best, 'here'):.2f} m² s. The intervals come from resampling "
         "groups of sequences that may share vehicles."
     )
     bold = pd.DataFrame(False, index=table.index, columns=table.columns)
@@ -152,7 +153,7 @@ def _lengths(study: Study) -> list[Block]:
     table = _both(ours, printed_lengths())
     ends = pd.concat({"95 % low": low, "95 % high": high}).swaplevel()
     full = pd.concat([table, ends]).sort_index(level=0, sort_remaining=False)
-    bound = [n for n in study.recordings() if ours.loc["lin", n] <= 2.0 + 1e-6]
+    bound = [n for n in study.recordings() if cell(ours, "lin", n) <= 2.0 + 1e-6]
     note = f" Lin ends at the lower bound of 2 m in {', '.join(bound)}." if bound else ""
     return [
         Heading("Car lengths"),
@@ -170,7 +171,7 @@ def _costs(study: Study) -> list[Block]:
         (model, name)
         for model in ORDER
         for name in study.recordings()
-        if theirs.loc[model, name] < ours.loc[model, name] - 0.005
+        if cell(theirs, model, name) < cell(ours, model, name) - 0.005
     ]
     found: list[Block] = [
         Heading("Costs"),
@@ -207,17 +208,17 @@ def _lower(
     lines = []
     for model, name in lower:
         line = (
-            f"- {model}, {name}: printed {theirs.loc[model, name]:.2f}, here "
-            f"{ours.loc[model, name]:.2f}"
+            f"- {model}, {name}: printed {cell(theirs, model, name):.2f}, here "
+            f"{cell(ours, model, name):.2f}"
         )
         if model in LAWS:
             scan = study.one("scan", name, model)
-            printed_length = printed_lengths().loc[model, name]
+            printed_length = cell(printed_lengths(), model, name)
             nearest = int(np.abs(np.array(scan["lengths"]) - printed_length).argmin())
             line += (
                 f". A grid over all v0 and L finds no less than {scan['cost']:.2f}, and with the "
-                f"printed L no less than {scan['by_length'][nearest]:.2f}: the printed cost is "
-                "not a value of this cost on these sequences"
+                f"printed L no less than {scan['by_length'][nearest]:.2f}: with the cost and the data "
+                "as they are described, the printed value is not reached by any parameters"
             )
         else:
             one = study.one("fit", name, model)
@@ -234,7 +235,7 @@ def _speeds(study: Study) -> list[Block]:
     low, high = (end * KMH for end in study.interval("v0", ORDER))
     table = averaged(speeds)
     table.index.name = "model"
-    means = ", ".join(f"{m} {table.loc[m, AVERAGE]:.0f}" for m in ORDER)
+    means = ", ".join(f"{m} {cell(table, m, AVERAGE):.0f}" for m in ORDER)
     fastest = table[AVERAGE].idxmax()
     return [
         Heading("Leaders' speeds"),
@@ -274,7 +275,7 @@ def _laws(study: Study) -> list[Block]:
         ),
         TableBlock(
             "laws",
-            long.xs(20.0, level="gap"),
+            long[long.index.get_level_values("gap") == 20.0].droplevel("gap"),
             "The speeds (m/s) at a gap of 20 m; the CSV holds all gaps.",
             full=long,
         ),
@@ -299,7 +300,7 @@ def _heldout(study: Study) -> list[Block]:
     wild = [
         m
         for m in NETWORKS
-        if table.loc[("keep", m), "mean"] > 2 * table.loc[("keep", "lin"), "mean"]
+        if cell(table, ("keep", m), "mean") > 2 * cell(table, ("keep", "lin"), "mean")
     ]
     tame = [m for m in contestants if m not in wild]
     best = table.loc["keep"].loc[tame, "mean"].idxmin()
@@ -346,7 +347,7 @@ def _significance(study: Study) -> TableBlock:
         }
     ).T
     table.index.name = "pair"
-    sure = [name for name in table.index if table.loc[name, "p, Holm"] < 0.05]
+    sure = [name for name in table.index if cell(table, name, "p, Holm") < 0.05]
     return TableBlock(
         "significance",
         table,

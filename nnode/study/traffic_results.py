@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -130,6 +130,11 @@ def _cost(one: dict[str, Any]) -> float:
     if "cost" in one:
         return float(one["cost"])
     return float("nan") if one["costs"] is None else float(np.mean(one["costs"]))
+
+
+def cell(table: pd.DataFrame, row: Any, column: str) -> float:
+    """One number of a table."""
+    return float(cast(Any, table.loc[row, column]))
 
 
 def averaged(table: pd.DataFrame) -> pd.DataFrame:

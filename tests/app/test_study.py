@@ -1,0 +1,123 @@
+"""The study script: options, one folder per study, interruption, continuation."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from nnode.app import study
+from nnode.app.cli import check_overrides
+from nnode.config import register
+from nnode.errors import ConfigError
+from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
+from tests.app.conftest import ROOT, environment
+
+CONF = ROOT / "conf"
+
+#: The script with another study in the place of the traffic's.
+CODE = """
+import sys
+from nnode.app import study
+from nnode.app.cli import run
+if __name__ == "__main__":
+    sys.argv[0] = "scripts/study.py"
+    study.STUDIES["traffic"] = "tests.study.tiny"
+    run("study", study.study)
+"""
+
+
+def start(*overrides: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", CODE, *overrides],
+        cwd=ROOT,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["study=trafic"], "study=trafic is unknown, expected one of crowd, traffic"),
+        (["study.qick=true"], r"did you mean study\.quick"),
+        (["study=traffic", "study.horizons=[1]"], r"option study\.horizons is unknown"),
+        (["study=crowd", "study.horizons=[one]"], "could not be converted to Float"),
+        (["study.quick=maybe"], "study.quick=maybe is refused"),
+        (["study.restarts=many"], "could not be converted to Integer"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) -> None:
+    register()
+    with pytest.raises(ConfigError, match=message):
+        check_overrides(overrides, CONF, "study")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("traffic", TrafficStudyOptions), ("crowd", CrowdStudyOptions)]
+)
+def test_every_study_composes_in_a_folder_without_time(name: str, kind: type) -> None:
+    register()
+    check_overrides([f"study={name}", "study.quick=true", "study.workers=3"], CONF, "study")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("study", [f"study={name}"], return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        assert config.hydra.run.dir == f"runs/study/{name}"
+    assert isinstance(OmegaConf.to_object(config.study), kind)
+    assert name in study.STUDIES
+
+
+def test_what_no_study_can_work_with_is_refused(tmp_path: Path) -> None:
+    for change, message in (
+        ({"workers": 0}, "study.workers=0 must be at least 1"),
+        ({"name": "rail"}, "study.name=rail is unknown, expected one of traffic, crowd"),
+    ):
+        options = OmegaConf.structured(TrafficStudyOptions(**change))
+        with pytest.raises(ConfigError, match=message):
+            study.study(OmegaConf.create({"study": options}), tmp_path)
+
+
+def test_interrupted_and_asked_for_again(tmp_path: Path) -> None:
+    command = ["study=traffic", "study.workers=1", f"hydra.run.dir={tmp_path}"]
+    process = start(*command)
+    sign = tmp_path / "sign-a"
+    while process.poll() is None and not sign.exists():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGINT, errors
+    assert "stopped by SIGINT: 2 of 4 tasks are kept" in errors
+    assert "Traceback" not in errors
+    (tmp_path / "awake").write_text("")
+    process = start(*command)
+    shown, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert (tmp_path / "calls").read_text().split() == ["1", "2"]
+    for line in (f"page: {tmp_path / 'study.html'}", f"as Markdown: {tmp_path / 'study.md'}"):
+        assert line in shown.splitlines()
+    assert list(pd.read_csv(tmp_path / "squares.csv")["y"]) == [1.0, 4.0]
+    page = (tmp_path / "study.md").read_text()
+    assert page.startswith("# Squares\n\nOf *two* numbers.\n")
+    assert f"- Command: python scripts/study.py {' '.join(command)}" in page
+    assert "torch" in page
+
+
+def test_quick_results_have_a_folder_of_their_own(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(study.STUDIES, "traffic", "tests.study.tiny")
+    (tmp_path / "quick").mkdir()
+    (tmp_path / "quick" / "awake").write_text("")
+    options = OmegaConf.structured(TrafficStudyOptions(quick=True, workers=1))
+    study.study(OmegaConf.create({"study": options}), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["quick"]
+    assert (tmp_path / "quick" / "study.md").read_text().startswith("# Squares (quick)\n")
+    assert f"tables: 1 CSV files in {tmp_path / 'quick'}" in capsys.readouterr().out

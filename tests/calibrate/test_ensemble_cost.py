@@ -1,0 +1,106 @@
+"""Costs and gradients of many runs against one run at a time through torchdiffeq."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.calibrate.cost import Convention, sequence_costs
+from nnode.calibrate.ensemble import EnsembleCost
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.models.build import build_model
+from nnode.models.system import System
+from nnode.solvers import FusedSolver, TorchdiffeqSolver
+
+DT = 0.02
+N2 = {
+    "name": "n2",
+    "term": "network_speed",
+    "hidden": 2,
+    "v0": 20.0,
+    "leader": "constant",
+    "box": 0.9,
+}
+LIN = {"name": "lin", "term": "lin", "v0": 20.0, "L": 4.0, "L_min": 2.0, "leader": "constant"}
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    draw = np.random.default_rng(0)
+    items = []
+    for n, samples in ((3, 6), (4, 4)):
+        t = 0.2 * np.arange(samples)
+        x = 14.0 * np.arange(n) + 18 * t[:, None] + 0.3 * draw.standard_normal((samples, n))
+        items.append(Sequence(name=f"s/{n}", recording="s", time=t, x=x[:, :, None]))
+    return collate(items).to(dtype=torch.float64)
+
+
+def one_by_one(system: System, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Costs by sequence, and the gradient of their mean, by another solver."""
+    system.zero_grad()
+    found = sequence_costs(TorchdiffeqSolver("euler", "discrete", DT)(system, batch), batch)
+    found.mean().backward()
+    grads = [p.grad.flatten() for p in system.parameters() if p.grad is not None]
+    return found.detach(), torch.cat(grads)
+
+
+@pytest.mark.parametrize("options", [N2, LIN], ids=["n2", "lin"])
+def test_as_single_runs(options: dict, batch: Batch) -> None:  # type: ignore[type-arg]
+    cost = EnsembleCost(build_model(options), batch, FusedSolver(DT))
+    draw = torch.Generator().manual_seed(1)
+    rows = torch.stack([cost.row(build_model(options, seed)) for seed in range(3)])
+    rows = rows * (1 + 0.05 * torch.rand(rows.shape, generator=draw, dtype=torch.float64))
+    value, gradient = cost(rows)
+    each = cost.costs(rows)
+    for r in range(3):
+        system = cost.fill_(build_model(options), rows[r])
+        torch.testing.assert_close(cost.row(system), rows[r])
+        costs, slope = one_by_one(system, batch)
+        torch.testing.assert_close(each[r], costs, rtol=1e-10, atol=0)
+        torch.testing.assert_close(value[r], costs.mean(), rtol=1e-10, atol=0)
+        torch.testing.assert_close(gradient[r], slope, rtol=1e-8, atol=1e-10)
+
+
+def test_weights_choose_sequences(batch: Batch) -> None:
+    cost = EnsembleCost(build_model(LIN), batch, FusedSolver(DT))
+    rows = cost.row(build_model(LIN)).expand(2, -1)
+    value, gradient = cost(rows, torch.tensor([[1.0, 0.0], [0.25, 0.75]], dtype=torch.float64))
+    each = cost.costs(rows)[0]
+    assert value[0] == pytest.approx(float(each[0]))
+    assert value[1] == pytest.approx(float(0.25 * each[0] + 0.75 * each[1]))
+    assert not torch.allclose(gradient[0], gradient[1])
+
+
+def test_conventions_differ_by_the_sampling_interval(batch: Batch) -> None:
+    row = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).row(build_model(LIN))[None]
+    found = [
+        EnsembleCost(build_model(LIN), batch, FusedSolver(DT), convention).costs(row)
+        for convention in (Convention.integral, Convention.sum)
+    ]
+    torch.testing.assert_close(found[0], 0.2 * found[1])
+
+
+def test_the_admissible_set_comes_from_the_model(batch: Batch) -> None:
+    law = EnsembleCost(build_model(LIN), batch, FusedSolver(DT))
+    limits = dict(
+        zip(law.names, zip(law.low.tolist(), law.high.tolist(), strict=True), strict=True)
+    )
+    assert limits["terms.0.L"] == (2.0, math.inf)
+    assert limits["terms.0.v0"] == (-math.inf, math.inf)
+    net = EnsembleCost(build_model(N2), batch, FusedSolver(DT))
+    assert len(net.low) == 1 + 2 + 2 + 2 + 1
+    assert sorted(set(net.high.tolist())) == [0.9, math.inf]
+
+
+def test_a_run_that_blows_up_costs_infinity_and_spares_the_others(batch: Batch) -> None:
+    cost = EnsembleCost(build_model(LIN), batch, FusedSolver(DT))
+    good = cost.row(build_model(LIN))
+    bad = good.clone()
+    bad[cost.names.index("terms.0.v0")] = 1e300
+    each = cost.costs(torch.stack([good, bad]))
+    assert torch.isfinite(each[0]).all()
+    assert torch.isinf(each[1]).all()
+    torch.testing.assert_close(each[0], cost.costs(good[None])[0])
