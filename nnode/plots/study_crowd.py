@@ -27,7 +27,7 @@ def horizon_costs(
     unit = costs.iloc[0].to_numpy(float)
     place = np.arange(len(horizons), dtype=float)
     for i, model in enumerate(costs.index):
-        shift = 0.05 * (i - (len(costs) - 1) / 2)
+        shift = 0.03 * (i - (len(costs) - 1) / 2)
         y = costs.loc[model].to_numpy(float) / unit
         ends = np.stack(
             [y - low.loc[model].to_numpy(float) / unit, high.loc[model].to_numpy(float) / unit - y]
@@ -63,7 +63,7 @@ def forces_by_distance(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Figure:
         style = {**curve_style(i), "marker": ""}
         handles.append(Line2D([], [], **style, linewidth=1.8, label=f"{model}, best start"))
         if len(tables) > 1:
-            label = f"{model}, the other {len(tables) - 1} starts"
+            label = f"{model}, other starts ({len(tables) - 1})"
             handles.append(Line2D([], [], **style, linewidth=0.7, alpha=0.6, label=label))
         for ax, way in zip(axes, titles, strict=True):
             for n, table in enumerate(tables):

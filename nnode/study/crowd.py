@@ -27,7 +27,7 @@ SUBTITLE = (
 #: Resamples in one task.
 CHUNK = 10
 #: Relative times of the tasks.
-_COSTS = {"sf": 5.0, "nn": 12.0, "wall": 12.0}
+_COSTS = {"sf": 3.0, "nn": 20.0, "wall": 10.0}
 
 
 def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
@@ -66,19 +66,13 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
 def _checked(options: CrowdStudyOptions) -> CrowdStudyOptions:
     if options.quick:
         options = replace(
-            options, horizons=options.horizons[:3:2], restarts=2, folds=2, bootstrap=10,
-            iterations=[15, 25],
+            options, horizons=options.horizons[:3:2], restarts=1, folds=2, bootstrap=10, steps=2,
         )  # fmt: skip
-    for name, least in (("restarts", 1), ("folds", 2), ("bootstrap", 2)):
+    for name, least in (("restarts", 1), ("folds", 2), ("bootstrap", 2), ("steps", 1)):
         if getattr(options, name) < least:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
     if not options.horizons or min(options.horizons) <= 0:
         raise ConfigError(f"study.horizons={options.horizons}: expected positive times in s")
-    if len(options.iterations) != 2 or min(options.iterations) < 1:
-        raise ConfigError(
-            f"study.iterations={options.iterations}: expected two whole numbers of at least 1, on "
-            "the first samples of sequences and on whole ones"
-        )
     return replace(options, horizons=sorted(set(options.horizons)))
 
 
@@ -90,7 +84,7 @@ def _fingerprint(stores: dict[tuple[str, float], Store]) -> str:
 def starts(restarts: int, kind: str, scope: str, first: bool) -> int:
     """Starts of one model at the first horizon; fewer, the best ones, go on to longer ones."""
     if scope == ALL:
-        number = restarts if kind != "wall" else max(1, restarts // 4)
+        number = restarts if kind != "wall" else max(1, restarts // 2)
         return number if first else max(1, number // 2)
     return max(1, restarts // 4) if first and kind == "nn" else 1
 
@@ -133,7 +127,7 @@ def _fits(study: Crowd, kind: str, scope: str, number: int) -> list[Task]:
         "scope": scope,
         "folds": options.folds,
         "span": list(study.span),
-        "iterations": list(options.iterations),
+        "steps": options.steps,
     }
     return [
         Task(
@@ -161,7 +155,7 @@ def _after(study: Crowd, horizon: float) -> list[Task]:
                 "last": min(first + CHUNK, options.bootstrap),
                 "seed": options.seed,
             },
-            cost=6.0,
+            cost=5.0,
         )
         for first in range(0, options.bootstrap, CHUNK)
     ]

@@ -7,17 +7,16 @@ therefore begins with the first samples of every sequence and follows the minimu
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import least_squares, minimize
 from torch import Tensor
 
 from nnode.calibrate.ensemble import EnsembleCost
+from nnode.calibrate.least_squares import Minimum, least_squares, trajectory_residuals
 from nnode.data.sequence import Batch
-from nnode.errors import SimulationError
 from nnode.models.build import build_model
 from nnode.models.crowd import NetworkForce
 from nnode.models.options import CrowdOptions, NetworkForceOptions, SocialForceOptions
@@ -35,27 +34,12 @@ NAMES = ("A", "k", "kappa")
 
 #: Samples after which the horizon grows; the sequence's own length ends the list.
 GROWTH = {"sf": (4, 8, 13, 26, 51), "nn": (6, 13)}
-
-#: Pairs of steps and gradient changes that the networks' optimiser remembers.
-MEMORY = 30
-
-#: Residual (m s^1/2) of a simulation that blew up: far worse than any other.
-BLOWN_UP = 1e3
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A calibrated model.
-
-    Attributes:
-        row: ``(K,)`` parameters.
-        J: mean cost of a training sequence, m² s.
-        evaluations: simulations of all training sequences, with a gradient or without.
-    """
-
-    row: np.ndarray
-    J: float
-    evaluations: int
+#: Steps at most each time before the horizon grows.
+SHORT_STEPS = {"sf": 8, "nn": 3}
+#: Networks bear rounding to single precision and are twice as fast in it; A is too small for it.
+DTYPE = {"sf": torch.float64, "nn": torch.float32}
+#: Parameters below this size are varied as if they had it.
+LEAST = {"sf": 1e-3, "nn": 0.1}
 
 
 def new_system(model: str, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
@@ -77,90 +61,42 @@ def row_of(system: System) -> np.ndarray:
     return torch.nn.utils.parameters_to_vector(system.parameters()).detach().double().numpy()
 
 
-def _growing(model: str, samples: int) -> list[int]:
-    return [*(n for n in GROWTH[model] if n < samples), samples]
-
-
-def fit_social_force(
-    batch: Batch, start: np.ndarray, *, grow: bool = True, weights: np.ndarray | None = None,
-    evaluations: int = 40,
-) -> Fit:  # fmt: skip
-    """Levenberg and Marquardt's method within A, k, kappa >= 0.
+def calibrate(
+    model: str, batch: Batch, start: np.ndarray, *, people: bool = True, grow: bool = True,
+    weights: np.ndarray | None = None, steps: int = 30,
+) -> Minimum:  # fmt: skip
+    """Levenberg and Marquardt's method within the model's bounds.
 
     Args:
-        batch: training sequences, float64.
-        start: ``(3,)`` A, k, kappa.
-        grow: begin with the first samples; False for starts next to the minimum.
-        weights: ``(B,)`` weight of each sequence, of sum 1; None takes the mean.
-        evaluations: accepted or refused steps per length.
-
-    Source:
-        Branch, Coleman & Li, SIAM J. Sci. Comput. 21 (1999), as in SciPy.
-    """
-    share = torch.full((len(batch),), 1 / len(batch)) if weights is None else torch.tensor(weights)
-    row, number, solver = np.maximum(start, 1e-9), 0, FusedSolver()
-    for samples in _growing("sf", batch.n_samples) if grow else [batch.n_samples]:
-        part = cut(batch, samples)
-        factor = (share.to(part.x) * part.dt)[None, :, None, None].sqrt()
-        seen = part.valid[1:]
-
-        def residuals(values: np.ndarray) -> np.ndarray:
-            nonlocal number
-            number += 1
-            try:
-                with torch.no_grad():
-                    away = (solver(system_of("sf", values), part).x - part.x)[1:]  # noqa: B023
-            except SimulationError:
-                return np.full(2 * int(seen.sum()), BLOWN_UP)  # noqa: B023
-            return (away * factor)[seen].flatten().numpy()  # noqa: B023
-
-        # half the sum of squares is the cost
-        found = least_squares(
-            residuals, row, bounds=(0, np.inf), x_scale="jac", max_nfev=evaluations,
-            ftol=1e-7, xtol=1e-7, gtol=1e-12,
-        )  # fmt: skip
-        row = np.maximum(found.x, 1e-9)
-    return Fit(found.x, float(found.cost), number)
-
-
-def fit_network(
-    batch: Batch, start: np.ndarray, *, people: bool = True, grow: bool = True,
-    iterations: tuple[int, int] = (40, 100),
-) -> Fit:  # fmt: skip
-    """L-BFGS in float32, with so long a memory that it is nearly BFGS.
-
-    Args:
+        model: ``sf`` or ``nn``.
         batch: training sequences.
-        start: ``(K,)`` weights of both networks.
-        people: False keeps people from acting on each other: the output weights of their
-            network are zero and stay so, the wall network alone is calibrated.
-        grow: begin with the first samples.
-        iterations: evaluations on shorter sequences, and on the whole ones.
+        start: ``(K,)`` parameters.
+        people: False keeps people of ``nn`` from acting on each other: the output weights of
+            their network are zero and stay so, the network of the walls alone is calibrated.
+        grow: begin with the first samples of every sequence.
+        weights: ``(B,)`` weight of each sequence, of sum 1; None takes the mean.
+        steps: on whole sequences, at most.
+
+    Returns:
+        All parameters of the model and its training cost, m² s.
     """
-    system = system_of("nn", start)
+    system = system_of(model, start)
     if not people:
         silence(system)
+    dtype = DTYPE[model]
+    system.to(dtype)
     number = 0
-    system.to(torch.float32)
-    for samples in _growing("nn", batch.n_samples) if grow else [batch.n_samples]:
-        part = cut(batch, samples).to(dtype=torch.float32)
-        cost = EnsembleCost(system, part, FusedSolver())
-        limit = iterations[1] if samples == batch.n_samples else iterations[0]
-
-        def value(row: np.ndarray) -> tuple[float, np.ndarray]:
-            nonlocal number
-            number += 1
-            J, gradient = cost(torch.from_numpy(row)[None])  # noqa: B023
-            if not bool(torch.isfinite(J).all() and torch.isfinite(gradient).all()):
-                return BLOWN_UP**2, np.zeros_like(row)
-            return float(J[0]), gradient[0].numpy()
-
-        found = minimize(
-            value, cost.row(system).numpy(), jac=True, method="L-BFGS-B",
-            options={"maxiter": limit, "maxcor": MEMORY, "ftol": 1e-7, "gtol": 0.0},
+    lengths = [n for n in GROWTH[model] if n < batch.n_samples] if grow else []
+    for samples in (*lengths, batch.n_samples):
+        limit = steps if samples == batch.n_samples else min(steps, SHORT_STEPS[model])
+        cost = EnsembleCost(system, cut(batch, samples).to(dtype=dtype), FusedSolver())
+        found = least_squares(
+            trajectory_residuals(cost, weights), cost.row(system).numpy(), cost.low.numpy(),
+            cost.high.numpy(), steps=limit, least=LEAST[model],
         )  # fmt: skip
-        cost.fill_(system, torch.from_numpy(found.x))
-    return Fit(row_of(system), float(found.fun), number)
+        cost.fill_(system, torch.from_numpy(found.row))
+        number += found.evaluations
+    return replace(found, row=row_of(system), evaluations=number)
 
 
 def silence(system: System) -> None:

@@ -13,7 +13,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.solvers.base import Trajectory
 from nnode.solvers.fused.engine import FusedSolver
 from nnode.study.crowd_data import Place, chosen, parts, sequences, time_groups, turned
-from nnode.study.crowd_fit import costs, fit_network, fit_social_force, new_system, row_of
+from nnode.study.crowd_fit import calibrate, costs, new_system, row_of
 from nnode.study.printed_crowd import PARAMETERS
 from nnode.study.statistics import group_weights
 
@@ -23,13 +23,14 @@ Result = dict[str, Any]
 #: the walls alone.
 KINDS = {"sf": "sf", "nn": "nn", "wall": "nn"}
 
-#: Evaluations of a refit that starts at the minimum of the sequences before resampling.
-REFIT = 4
+#: Steps at most of the social force, which mostly needs fewer, and of a refit that starts at the
+#: minimum of the sequences before resampling.
+SF_STEPS, REFIT = 30, 4
 
 
 def fit(
     kind: str, folder: str, scope: str, folds: int, span: list[float], seed: int,
-    start: list[float] | None, iterations: list[int],
+    start: list[float] | None, steps: int,
 ) -> Result:  # fmt: skip
     """Calibrate one model from one start, and evaluate it on what was held out.
 
@@ -39,18 +40,17 @@ def fit(
         span: first and last time of the recording, s.
         seed: of the random start, as the paper draws it.
         start: parameters found at a shorter horizon, to go on from; None starts afresh.
-        iterations: of the networks, on shorter sequences and on the whole ones.
+        steps: of the networks, see :func:`nnode.study.crowd_fit.calibrate`.
     """
     place = Place(folder, scope, folds)
     train, held = parts(place, (span[0], span[1]))
     batch, model = chosen(folder, train), KINDS[kind]
     begin = row_of(new_system(model, seed)) if start is None else np.array(start)
     fresh = start is None
-    if kind == "sf":
-        found = fit_social_force(batch, begin, grow=fresh)
-    else:
-        limits = (iterations[0], iterations[1])
-        found = fit_network(batch, begin, people=kind == "nn", grow=fresh, iterations=limits)
+    found = calibrate(
+        model, batch, begin, people=kind != "wall", grow=fresh,
+        steps=SF_STEPS if kind == "sf" else steps,
+    )  # fmt: skip
     each = costs(model, found.row, batch)
     return {
         "row": found.row.tolist(),
@@ -74,8 +74,8 @@ def resample(folder: str, row: list[float], draws: int, first: int, last: int, s
     for weights in group_weights(time_groups(every), draws, rng)[first:last]:
         drawn = np.flatnonzero(weights)
         batch = collate(every[i] for i in drawn)
-        found = fit_social_force(
-            batch, np.array(row), grow=False, weights=weights[drawn], evaluations=REFIT
+        found = calibrate(
+            "sf", batch, np.array(row), grow=False, weights=weights[drawn], steps=REFIT
         )
         rows.append(found.row.tolist())
     return {"rows": rows}

@@ -45,5 +45,5 @@ class CrowdStudyOptions(StudyOptions):
     restarts: int = 8  # start parameters per model; the better half goes on to longer horizons
     horizons: list[float] = field(default_factory=lambda: [1.0, 2.0, 3.0, 5.0])  # s
     folds: int = 4  # blocks of time, each held out once
-    iterations: list[int] = field(default_factory=lambda: [40, 100])  # on short, whole sequences
+    steps: int = 4  # of the networks by Levenberg and Marquardt's method, at each length
     bootstrap: int = 100  # resamples of stretches of time
