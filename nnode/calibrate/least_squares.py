@@ -23,9 +23,13 @@ Residuals = Callable[[np.ndarray], Tensor | None]
 
 #: Damping: at the start, its factors after a step that was taken or refused, and its end.
 DAMPING, EASE, STIFFEN, STUCK = 1e-3, 0.2, 4.0, 1e8
+#: Steps at most with corrected derivatives before they are computed anew.
+CORRECTIONS = 4
 #: A step with corrected derivatives that lowers the cost by less than this share is the last
 #: before they are computed anew.
 WORTH = 1e-3
+#: Share of the first cost that is rounding.
+NOTHING = 1e-13
 #: Difference of a parameter, relative to its size, by precision; and the least size that counts.
 DIFFERENCE = {torch.float32: 1e-3, torch.float64: 1e-6}
 
@@ -86,15 +90,15 @@ def least_squares(
     """Minimise the sum of squared residuals within a box.
 
     Derivatives are forward differences, corrected by Broyden's formula for as long as this
-    pays. Parameters at a bound that the gradient presses against
-    are held fixed; damping is relative to the curvature of each parameter.
+    pays. Parameters at a bound that the gradient presses against are held fixed; damping is
+    relative to the curvature of each parameter.
 
     Args:
         start: ``(K,)``; moved into the box.
         low, high: ``(K,)`` the box.
         steps: computations of all derivatives at most.
-        tolerance: ends when the steps from one computation of the derivatives to the next lower the
-            cost by less than this share.
+        tolerance: ends when the cost falls by less than this share from one computation of the
+            derivatives to the next.
         least: parameters smaller than this are varied as if they had this size.
 
     Raises:
@@ -108,33 +112,32 @@ def least_squares(
     if now is None:
         raise SimulationError("the start of a least-squares calibration cannot be simulated")
     cost, number, damping, taken = _square(now), 1, DAMPING, 0
+    nothing = NOTHING * cost
     for _ in range(steps):
         columns = _derivatives(residuals, row, now, high, least)
         number += len(row)
         before = cost
-        # several steps with the same derivatives, corrected by what each step shows
-        fresh, refused = True, False
-        while not refused:
+        for correction in range(1 + CORRECTIONS):
             gradient, curvature = _normal(columns, now)
+            found, value = None, math.inf
             while damping < STUCK:
                 trial = _step(row, gradient, curvature, damping, low, high)
                 found = residuals(trial)
                 number += 1
                 value = math.inf if found is None else _square(found)
-                if found is not None and value < cost:
+                # corrected derivatives may be wrong: rather compute them anew than stiffen
+                if value < cost or correction:
                     break
                 damping *= STIFFEN
-                if not fresh:
-                    break
             if found is None or value >= cost:
-                refused = True
-                continue
+                break
             _correct(columns, trial - row, found - now)
-            enough = cost - value > WORTH * cost
+            worth = cost - value > WORTH * cost
             row, now, cost = trial, found, value
-            taken, damping, fresh = taken + 1, max(damping * EASE, 1e-9), False
-            refused = not enough
-        if before - cost < tolerance * before:
+            taken, damping = taken + 1, max(damping * EASE, 1e-9)
+            if not worth or cost <= nothing:
+                break
+        if before - cost < tolerance * before or cost <= nothing:
             break
         damping = min(damping, 1.0)
     return Minimum(row, cost, number, taken)
