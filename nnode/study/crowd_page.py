@@ -69,8 +69,8 @@ def _summary(study: Crowd) -> list[Block]:
     ]
     if sums["relaxation"] < min(printed.COSTS.values()):
         lines.append(
-            "Both printed costs lie above that of no interaction here, so that sequences or "
-            "velocities were not processed as described; the comparison of models is ours."
+            "Both printed costs lie above that of no interaction here, so that the paper's "
+            "sequences or velocities must differ from those cut here as it describes."
         )
     parameters = study.parameters()
     for name in NAMES:
