@@ -276,6 +276,47 @@ def _heldout(study: Crowd) -> list[Block]:
             "baseline.",
         ),
         Text("Paired by sequence:\n\n" + "\n".join(f"- {line}" for line in comparisons)),
+        *_blocks(study),
+    ]
+
+
+def _least(table: pd.DataFrame) -> pd.DataFrame:
+    """Which of the calibrated models has the least cost in each row."""
+    models = [LABELS[m] for m in MODELS]
+    bold = pd.DataFrame(False, table.index, table.columns)
+    for name in models:
+        bold[name] = table[name] == table[models].min(axis=1)
+    return bold
+
+
+def _blocks(study: Crowd) -> list[Block]:
+    """In which block of time a model fails."""
+    table = study.blocks()
+    above = (table[LABELS["nn"]] > table[LABELS["sf"]]).to_numpy()
+    people = table["people"]
+    mean = people.groupby(level="horizon").transform("mean").to_numpy()
+    told = [
+        f"block {block} at {horizon} ({number:.0f} people)"
+        for (horizon, block), number in zip(table.index[above], people[above], strict=True)
+    ]
+    text = "NN is below SF in every block of time at every length."
+    if told:
+        text = f"NN is above SF in {', '.join(told)}."
+    if told and bool((people.to_numpy() < mean)[above].all()):
+        text += (
+            " These blocks hold fewer people than the others: what the networks learned in the "
+            "crowd does not carry over to the filling or emptying corridor."
+        )
+    return [
+        Text(text),
+        TableBlock(
+            "crowd_blocks",
+            table,
+            "Mean held-out cost of a sequence (m² s) by block of time. Least of the calibrated "
+            "models in bold.",
+            bold=_least(table),
+            digits={**dict.fromkeys(map(str, table), 4), "people": 1},
+        ),
     ]
 
 
@@ -291,10 +332,6 @@ def _others(study: Crowd) -> list[Block]:
             f"{int((sf < none)[at].sum())}, NN below no interaction in "
             f"{int((nn < none)[at].sum())}."
         )
-    bold = pd.DataFrame(False, table.index, table.columns)
-    models = [LABELS[m] for m in MODELS]
-    for name in models:
-        bold[name] = table[name] == table[models].min(axis=1)
     return [
         Heading("Other runs"),
         Text(
@@ -308,7 +345,7 @@ def _others(study: Crowd) -> list[Block]:
             table,
             "Mean cost of a sequence (m² s) in runs of other widths and densities. Least of the "
             "calibrated models in bold.",
-            bold=bold,
+            bold=_least(table),
             digits={**dict.fromkeys(map(str, table), 3), "people": 1},
         ),
     ]

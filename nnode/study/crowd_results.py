@@ -201,6 +201,25 @@ class Crowd:
             }
         )
 
+    def blocks(self) -> pd.DataFrame:
+        """Held-out cost of each block of time, m² s; rows by horizon and block."""
+        rows = {}
+        for horizon in self.horizons:
+            people = {e["name"]: e["n_agents"] for e in self.stores["main", horizon].index}
+            for number, scope in enumerate(self.folds, 1):
+                held = {m: pd.Series(self.chosen(m, scope, horizon).heldout) for m in MODELS}
+                names = held["sf"].index
+                simple = self.all_costs("relaxation", horizon)[names]
+                rows[(f"{horizon:g} s", f"{number}")] = {
+                    "sequences": len(names),
+                    "people": float(np.mean([people[name] for name in names])),
+                    **{LABELS[m]: float(held[m].mean()) for m in MODELS},
+                    LABELS["relaxation"]: float(simple.mean()),
+                }
+        table = pd.DataFrame(rows).T
+        table.index.names = ["horizon", "block"]
+        return table.astype({"sequences": int})
+
     def other_runs(self) -> pd.DataFrame:
         """Mean cost of a sequence in other runs; rows by horizon and run, m² s."""
         rows = {}

@@ -231,6 +231,7 @@ def test_the_quick_study_writes_its_page_and_continues(real_data, tmp_path):
     expected = {
         "crowd_parameters", "crowd_costs", "crowd_horizons", "crowd_heldout_runs",
         "crowd_restarts", "settings_sf", "settings_nn", "parameters", "crowd_data",
+        "crowd_blocks", "settings_nn_along",
     }  # fmt: skip
     assert set(tables) == expected
     assert np.isfinite(tables["crowd_costs"].frame["here (m² s)"]).all()
