@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := runs/demo
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test lint study clean
 
 setup: $(VENV)/.installed
 
@@ -35,6 +35,15 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The paper's studies on the real recordings (downloaded, or from NNODE_DATA), pages into docs/.
+study: setup
+	for name in traffic crowd; do \
+	  $(BIN)/python scripts/study.py study=$$name || exit $$?; \
+	  rm -rf docs/studies/$$name && mkdir -p docs/studies/$$name && \
+	  cp -r runs/study/$$name/study.html runs/study/$$name/study.md runs/study/$$name/*.csv \
+	    runs/study/$$name/figures docs/studies/$$name/ || exit $$?; \
+	done
 
 clean:
 	rm -rf $(VENV) runs/demo build *.egg-info

@@ -84,11 +84,14 @@ class PlotForcesConfig:
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`nnode.app.benchmark`."""
 
-    shapes: list[str] = field(default_factory=lambda: ["paper", "stress", "crowd", "scale"])
+    shapes: list[str] = field(
+        default_factory=lambda: ["paper", "stress", "steps", "crowd", "people", "scale"]
+    )
     engines: list[str] | None = None  # null times all that cover a problem
     repeats: int = 5
     restarts: int = 16  # of the ensemble
     dtype: Precision = Precision.float32
+    redraw: str | None = None  # a benchmark.json to draw, and time nothing
 
 
 @dataclass

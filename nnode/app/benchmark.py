@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import resource
-import sys
+import json
 import time
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -12,32 +12,45 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from nnode.app.benchmark_engines import ENGINES, Call, Engine, torch_call
+from nnode.app.benchmark_floor import evaluations, floor_call
+from nnode.app.benchmark_memory import peak_memory
 from nnode.app.benchmark_problems import SHAPES, Problem, pose
+from nnode.app.benchmark_report import per_person, print_per_person, print_problem
+from nnode.app.benchmark_start import warm_start
 from nnode.calibrate.cost import squared_error
 from nnode.errors import ConfigError, SimulationError
 from nnode.files import write_json
 from nnode.machine import machine
+from nnode.plots.performance import performance_figure
+from nnode.plots.style import save
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
+
+#: Packages whose versions are recorded.
+PACKAGES = ("torch", "torchdiffeq", "numba", "numpy", "jax", "diffrax")
 
 #: A measurement repeats its call for at least so long, s.
 _LEAST = 0.05
-
-#: Packages whose versions the results name.
-PACKAGES = ("torch", "torchdiffeq", "numba", "numpy", "jax", "diffrax")
+#: Name of the arithmetic alone among the calls that are timed.
+_FLOOR = "floor"
 
 
 def benchmark(config: DictConfig, folder: Path) -> None:
-    """Time the engines, print a table and write ``benchmark.json``.
+    """Time the engines, print tables, and write ``benchmark.json`` and ``benchmark.png``.
+
+    The results are written again after every problem. The figure needs two problems that differ
+    in the number of steps, or of people. With ``redraw`` nothing is timed.
 
     Raises:
-        ConfigError: unknown shapes or engines, or no repeat.
-        SimulationError: an engine disagrees with the exact solution; nothing was timed.
+        ConfigError: unknown shapes or engines, no repeat, or results that cannot be drawn.
+        SimulationError: an engine disagrees with the exact solution of a problem; it is not
+            timed, nor is any later one.
     """
     options = config.benchmark
+    if options.redraw is not None:
+        _redraw(Path(options.redraw), folder)
+        return
     for name, chosen, known in (
         ("shapes", options.shapes, SHAPES),
         ("engines", options.engines or [], ENGINES),
@@ -54,6 +67,12 @@ def benchmark(config: DictConfig, folder: Path) -> None:
     torch.set_num_threads(1)
     dtype = getattr(torch, options.dtype.value)
     found: list[dict[str, Any]] = []
+    results = {
+        "machine": machine(PACKAGES),
+        "dtype": options.dtype.value,
+        "problems": found,
+        "scale": per_person(found),
+    }
     for name in options.shapes:
         for shape in SHAPES[name]:
             for model in shape.models:
@@ -64,15 +83,42 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                     if key in (options.engines or ENGINES) and engine.covers(problem)
                 }
                 row = _measure(problem, chosen, options.repeats)
-                if shape.domain == "traffic":
+                # those of ``steps`` are the ones of ``paper``, but for their length
+                if shape.domain == "traffic" and name != "steps":
                     row["ensemble"] = _ensemble(problem, options.restarts, options.repeats)
+                if name in ("paper", "crowd") and "fused_1" in chosen:
+                    row["warm_start"] = warm_start(problem)
                 found.append({"shape": name, **row})
-                _print(found[-1])
-    write_json(
-        folder / "benchmark.json",
-        {"machine": machine(PACKAGES), "dtype": options.dtype.value, "problems": found},
-    )
+                print_problem(found[-1])
+                results["scale"] = per_person([r for r in found if r["shape"] == "scale"])
+                write_json(folder / "benchmark.json", results)
+    print_per_person(results["scale"])
     print(f"results: {folder / 'benchmark.json'}")
+    _draw(results, folder)
+
+
+def _draw(results: dict[str, Any], folder: Path) -> bool:
+    """Draw the results where there is something to draw; whether there is."""
+    figure = performance_figure(results)
+    if figure is not None:
+        print(f"figure: {save(figure, folder / 'benchmark.png')}")
+    return figure is not None
+
+
+def _redraw(path: Path, folder: Path) -> None:
+    """Draw results of an earlier run."""
+    try:
+        drawn = _draw(json.loads(path.read_text(encoding="utf-8")), folder)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"benchmark.redraw={path} cannot be read ({error!r}); expected the benchmark.json "
+            "of an earlier run"
+        ) from error
+    if not drawn:
+        raise ConfigError(
+            f"benchmark.redraw={path} has nothing to draw; expected at least two problems of the "
+            "shape steps, or of people and scale"
+        )
 
 
 def _exact(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +131,7 @@ def _exact(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check(
-    name: str, engine: Engine, call: Call, exact: tuple[np.ndarray, np.ndarray]
+    name: str, engine: Engine, call: Call, exact: tuple[np.ndarray, np.ndarray], label: str
 ) -> dict[str, Any]:
     """Call an engine for the first time, and refuse it where it disagrees."""
     start = time.perf_counter()
@@ -95,9 +141,9 @@ def _check(
     error = float(np.linalg.norm(gradient - exact[1]) / np.linalg.norm(exact[1]))
     if not (away <= engine.state_tolerance and error <= engine.tolerance):
         raise SimulationError(
-            f"engine {name} differs from the exact solution by {away:.3g} in the states and by "
-            f"{error:.3g} in the gradient, at most {engine.state_tolerance:g} and "
-            f"{engine.tolerance:g} are expected; nothing was timed"
+            f"engine {name} differs from the exact solution of {label} by {away:.3g} in the "
+            f"states and by {error:.3g} in the gradient, at most {engine.state_tolerance:g} and "
+            f"{engine.tolerance:g} are expected; this problem was not timed"
         )
     return {"first_call": first, "state_error": away, "gradient_error": error}
 
@@ -109,14 +155,20 @@ def _once(call: Any, times: int) -> float:
     return (time.perf_counter() - start) / times
 
 
-def _rounds(calls: dict[str, Any], repeats: int) -> dict[str, list[float]]:
-    """Seconds per call, all engines in turn, so that a busy moment hits all of them."""
-    times = {name: max(1, round(_LEAST / _once(call, 1))) for name, call in calls.items()}
-    taken: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats):
+def _rounds(calls: dict[str, Any], repeats: int) -> dict[str, dict[str, Any]]:
+    """Seconds per call, all engines in turn, so that a busy moment hits all of them; memory."""
+    times, found = {}, {}
+    taken: dict[str, list[float]] = {}
+    for name, call in calls.items():
+        trial, found[name] = peak_memory(partial(_once, call, 1))
+        times[name] = max(1, round(_LEAST / trial))
+        # a long call needs no second one to be a measurement
+        taken[name] = [trial] if trial >= _LEAST else []
+    for number in range(1, repeats + 1):
         for name, call in calls.items():
-            taken[name].append(_once(call, times[name]))
-    return taken
+            if len(taken[name]) < number:
+                taken[name].append(_once(call, times[name]))
+    return {name: {**_summary(taken[name]), **found[name]} for name in calls}
 
 
 def _summary(taken: list[float]) -> dict[str, Any]:
@@ -126,20 +178,32 @@ def _summary(taken: list[float]) -> dict[str, Any]:
 def _measure(problem: Problem, engines: dict[str, Engine], repeats: int) -> dict[str, Any]:
     exact = _exact(problem)
     calls = {name: engine.prepare(problem) for name, engine in engines.items()}
-    checks = {name: _check(name, engines[name], call, exact) for name, call in calls.items()}
-    taken = _rounds(calls, repeats)
-    rows = {
-        name: {**_summary(taken[name]), **checks[name], "exact": engines[name].exact}
-        for name in engines
+    checks = {
+        name: _check(name, engines[name], call, exact, problem.label)
+        for name, call in calls.items()
     }
-    return {
+    # in turn with the engines, so that both meet the same machine
+    floor = floor_call(problem)
+    timed: dict[str, Any] = dict(calls)
+    if floor is not None:
+        floor()  # compiles
+        timed[_FLOOR] = floor
+    taken = _rounds(timed, repeats)
+    peaks = [taken[name]["peak_memory_MB"] for name in engines]
+    row = {
         "problem": problem.label,
+        "model": problem.model,
+        "sequences": problem.shape.sequences,
         "agents": problem.shape.agents,
         "steps": problem.shape.steps,
-        "engines": rows,
-        "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        / (1024 if sys.platform != "darwin" else 1024**2),
+        "engines": {
+            name: {**taken[name], **checks[name], "exact": engines[name].exact} for name in engines
+        },
+        "peak_memory_MB": None if None in peaks else max(peaks, default=None),
     }
+    if floor is not None:
+        row["floor"] = {"evaluations": evaluations(problem), **taken[_FLOOR]}
+    return row
 
 
 def _ensemble(problem: Problem, restarts: int, repeats: int) -> dict[str, Any]:
@@ -168,36 +232,7 @@ def _ensemble(problem: Problem, restarts: int, repeats: int) -> dict[str, Any]:
         together()
         taken = _rounds({"single": single, "together": together}, repeats)
         found[f"threads_{threads}"] = {
-            **{key: _summary(value) for key, value in taken.items()},
-            "single_runs": median(taken["together"]) / median(taken["single"]),
+            **taken,
+            "single_runs": taken["together"]["median"] / taken["single"]["median"],
         }
     return found
-
-
-def _print(row: dict[str, Any]) -> None:
-    table = Table(title=f"{row['shape']}, {row['problem']}")
-    engines = row["engines"]
-    heads = ("engine", "median (ms)", "min … max (ms)", "first call (s)", "gradient error")
-    fused = engines.get("fused_1")
-    for head in (*heads, *(("times fused_1",) if fused else ())):
-        table.add_column(head, justify="left" if head == "engine" else "right")
-    for name, engine in engines.items():
-        cells = [
-            name,
-            f"{1e3 * engine['median']:.4g}",
-            f"{1e3 * engine['min']:.4g} … {1e3 * engine['max']:.4g}",
-            f"{engine['first_call']:.3g}",
-            f"{engine['gradient_error']:.1e}",
-        ]
-        if fused:
-            cells.append(f"{engine['median'] / fused['median']:.3g}")
-        table.add_row(*cells)
-    console = Console(width=120)
-    console.print(table)
-    ensemble = row.get("ensemble")
-    if ensemble:
-        parts = [
-            f"{ensemble[f'threads_{n}']['single_runs']:.3g} single runs with {n} thread(s)"
-            for n in (1, 2)
-        ]
-        console.print(f"{ensemble['restarts']} restarts cost {', '.join(parts)}")

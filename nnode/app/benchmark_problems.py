@@ -40,15 +40,22 @@ class Shape:
         return self.samples * self.per
 
 
+def _hall(people: int) -> Shape:
+    return Shape("crowd", ("sf",), 1, people, 25, 1, 0.04)
+
+
 _LAWS = ("lin", "log", "n4")
 SHAPES: dict[str, tuple[Shape, ...]] = {
     # the recordings of the paper: sampled at 5 frames/s, 1.2 s
     "paper": (Shape("traffic", _LAWS, 34, 4, 6, 100, 0.002),),
     "stress": (Shape("traffic", ("n4",), 100, 10, 50, 100, 0.002),),
-    "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
-    "scale": tuple(
-        Shape("crowd", ("sf",), 1, people, 25, 1, 0.04) for people in (500, 1000, 2000, 5000, 10000)
+    "steps": tuple(
+        Shape("traffic", ("n4",), 34, 4, samples, 100, 0.002) for samples in (1, 3, 10, 30, 100)
     ),
+    "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
+    # one hall: few enough people for every engine, then as many as cell lists allow
+    "people": tuple(_hall(people) for people in (50, 100, 200)),
+    "scale": tuple(_hall(people) for people in (500, 1000, 2000, 5000, 10000)),
 }
 
 
@@ -66,8 +73,9 @@ class Problem:
         """One line for a table."""
         shape = self.shape
         who = "cars" if shape.domain == "traffic" else "people"
+        many = "sequence" if shape.sequences == 1 else "sequences"
         return (
-            f"{self.model}: {shape.sequences} sequences, {shape.agents} {who}, "
+            f"{self.model}: {shape.sequences} {many}, {shape.agents} {who}, "
             f"{shape.steps} steps of {shape.step:g} s"
         )
 

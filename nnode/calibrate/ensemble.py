@@ -85,10 +85,7 @@ class EnsembleCost:
         Args:
             weights: ``(R, B)`` or ``(B,)`` weight of every sequence; None takes the mean.
         """
-        stacked = {
-            name: value.detach().clone().requires_grad_()
-            for name, value in self.parameters(rows).items()
-        }
+        stacked = _leaves(self.parameters(rows))
         each = self._costs(stacked)
         if weights is None:
             cost = each.mean(1)
@@ -96,12 +93,32 @@ class EnsembleCost:
             # a sequence without weight must not spoil the sum where it blows up
             cost = torch.where(weights > 0, each * weights.to(each), 0.0).sum(1)
         parts = torch.autograd.grad(cost.sum(), list(stacked.values()))
-        gradient = torch.cat([part.reshape(len(rows), -1) for part in parts], 1)
-        return cost.detach().double(), gradient.double()
+        gradient = torch.cat([part.reshape(len(rows), -1) for part in parts], 1).double()
+        if weights is not None:
+            usable = torch.isfinite(cost) & ~torch.isfinite(gradient).all(1)
+            for r in usable.nonzero().flatten().tolist():
+                gradient[r] = self._without_the_rest(rows[r], weights.expand(each.shape)[r])
+        return cost.detach().double(), gradient
+
+    def _without_the_rest(self, row: Tensor, weights: Tensor) -> Tensor:
+        """``(K,)`` gradient of one run, simulated without the sequences that have no weight.
+
+        The derivative of a simulation that blows up is not a number, even times 0.
+        """
+        places = weights.nonzero().flatten()
+        batch = self.batch.select(places.tolist())
+        part = EnsembleCost(self.system, batch, self.solver, self.convention)
+        each = part._costs(stacked := _leaves(self.parameters(row[None])))
+        total = (each * weights[places].to(each)).sum()
+        return torch.cat([g.flatten() for g in torch.autograd.grad(total, list(stacked.values()))])
 
     def _costs(self, stacked: Mapping[str, Tensor]) -> Tensor:
         found = self.solver.ensemble(self.system, stacked, self.batch)
         return sequence_costs(found, self.batch, self.convention)
+
+
+def _leaves(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().clone().requires_grad_() for name, value in parameters.items()}
 
 
 def _bounds(system: System) -> dict[str, tuple[float, float]]:

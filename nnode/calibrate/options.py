@@ -64,6 +64,8 @@ class FusedOptions(SolverOptions):
 
     name: str = "fused"
     threads: int = 1
+    cutoff: float | None = None  # m, crowds: who is farther away is not felt; null: see below
+    cutoff_error: float = 1e-10  # without cutoff: largest social force left out, in units of A
 
 
 @dataclass

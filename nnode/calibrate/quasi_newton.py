@@ -99,6 +99,11 @@ def optimality_residual(
     return away.amax(1) / costs
 
 
+def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """``(R, K, K)`` times ``(R, K)``."""
+    return (matrices @ vectors[:, :, None])[:, :, 0]
+
+
 class _Runs:
     """State of all runs: points, costs, gradients, inverse Hessians, steps."""
 
@@ -151,7 +156,7 @@ class _Runs:
         good = taken & (product > 1e-12 * step.norm(dim=1) * change.norm(dim=1))
         rate = torch.where(good, 1.0 / product, 0.0)
         first = good & self.fresh
-        quadratic = torch.einsum("ri,rij,rj->r", change, self.inverse, change)
+        quadratic = (change * _times(self.inverse, change)).sum(1)
         scale = torch.where(first, product / quadratic, 1.0)
         inverse = self.inverse * scale[:, None, None]
         self.fresh &= ~first
@@ -164,7 +169,7 @@ class _Runs:
             (self.x >= self.high) & (self.gradient < 0)
         )
         free = (~pressed).to(self.x.dtype)
-        found = -torch.einsum("rij,rj->ri", self.inverse, self.gradient * free) * free
+        found = -_times(self.inverse, self.gradient * free) * free
         size = found.norm(dim=1, keepdim=True)
         most = torch.where(self.fresh, FIRST, LONGEST).to(size)[:, None]
         return torch.where(size > most, found * most / size, found)

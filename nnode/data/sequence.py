@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -185,6 +185,18 @@ class Batch:
                 value = value.to(device, dtype if value.is_floating_point() else None)
             moved[field.name] = value
         return Batch(**moved)
+
+    def select(self, places: list[int]) -> Batch:
+        """The sequences at some places, padded as before."""
+        second = ("x", "v", "valid")
+        chosen: dict[str, Any] = {"dt": self.dt}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                chosen[field.name] = value[:, places] if field.name in second else value[places]
+            elif isinstance(value, tuple):
+                chosen[field.name] = tuple(value[i] for i in places) if value else ()
+        return Batch(**chosen)
 
 
 def collate(sequences: Iterable[Sequence]) -> Batch:

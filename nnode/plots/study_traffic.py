@@ -46,7 +46,7 @@ def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -
     ax.set_xticks(place, [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)])
     dress(ax, x="recording", y="leader's speed v0 (km/h)")
     figure.legend(
-        handles=handles, loc="outside upper center", ncols=len(handles), frameon=False,
+        handles=handles, loc="outside upper center", ncols=3, frameon=False,
         fontsize=SMALL_FONT, handlelength=2.6, columnspacing=1.2,
     )  # fmt: skip
     return figure
@@ -116,7 +116,7 @@ def descents(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
         for i, values in enumerate(found.values()):
             style = {**curve_style(i), "marker": ""}
             ax.plot(values[:, 0], values[:, 1], **style, linewidth=1.3)
-        ax.set(xscale="log", yscale="log")
+        ax.set(xscale="log", yscale="log", ylim=(1e-3, None))
         first = ax is axes.flat[0]
         y = "average J above the least (m² s)" if first else ""
         dress(ax, x="simulations", y=y, title=model)

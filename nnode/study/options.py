@@ -24,13 +24,14 @@ class TrafficStudyOptions(StudyOptions):
     """Five models on the ten ESIMAS recordings."""
 
     name: str = "traffic"
-    restarts: int = 48  # starts of a network on the largest recording; smaller ones get more
+    restarts: int = 32  # starts of a network on the largest recording; smaller ones get more
     iterations: int = 150  # evaluations of the first search
     dt: float = 0.002  # Euler step, s
     box: float = 1.0  # bound on the weights where its effect is studied
     bootstrap: int = 100  # resamples of the sequences
     folds: int = 5  # of cross-validation
-    descent_steps: int = 400  # updates of the paper's optimiser
+    descent_steps: int = 2000  # updates of the paper's optimiser
+    descent_dt: float = 0.01  # Euler step during its updates, s
     descent_lr: float = 1.0  # factor on them
     batch_size: int = 32  # sequences in its mini-batches
     particles: int = 40  # of consensus-based optimisation

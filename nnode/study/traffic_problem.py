@@ -24,7 +24,7 @@ COARSE = 0.02
 #: Gaps (m) at which laws are compared, as in the paper's figure.
 GAPS = tuple(float(gap) for gap in range(2, 51))
 #: Finds of the first search that are followed further: in float32, then in float64.
-FOLLOWED, FINISHED = 6, 2
+FOLLOWED, FINISHED = 4, 2
 #: Starts are drawn within: v0 (m/s) and L (m) of the laws; factor on the weights of networks.
 SPEEDS, LENGTHS, WIDEN = (15.0, 35.0), (2.0, 10.0), 5.0
 
@@ -94,33 +94,49 @@ class Problem:
             rows[:, inner] *= factor[:, None]
         return rows
 
-    def search(
-        self, starts: Tensor, dt: float, iterations: int, weights: Tensor | None = None
-    ) -> tuple[Minima, Tensor]:
+    def search(self, starts: Tensor, dt: float, iterations: int) -> tuple[Minima, Tensor]:
         """Minimise from all starts; also the ``(R,)`` costs at ``dt`` after the first search.
 
         Steep laws make Euler's method unstable at coarse steps, so that a find of the first
         search is judged at ``dt`` alone.
         """
         coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
-
-        def weigh(cost: EnsembleCost, rows: Tensor) -> Tensor:
-            each = cost.costs(rows)
-            if weights is None:
-                return each.mean(1)
-            return torch.where(weights > 0, each * weights, 0.0).sum(1)
-
         low, high = coarse.low, coarse.high
-        found = minimise(lambda r: coarse(r, weights), starts, low, high, iterations=iterations)
-        judged = weigh(fine, found.rows)
+        found = minimise(coarse, starts, low, high, iterations=iterations)
+        judged = fine.costs(found.rows).mean(1)
         best = judged.argsort()[:FOLLOWED]
-        near = minimise(
-            lambda r: fine(r, weights), found.rows[best], low, high, iterations=iterations // 2
-        )
+        near = minimise(fine, found.rows[best], low, high, iterations=iterations // 2)
         exact = self.cost(dt, torch.float64)
         last = near.rows[near.costs.argsort()[:FINISHED]]
-        end = minimise(lambda r: exact(r, weights), last, low, high, iterations=iterations // 2)
-        return end, judged
+        return minimise(exact, last, low, high, iterations=iterations // 2), judged
+
+    def search_folds(self, fold: np.ndarray, starts: Tensor, dt: float, iterations: int) -> Tensor:
+        """``(F, K)`` best finds without the sequences of each fold, all folds side by side.
+
+        Args:
+            fold: ``(B,)`` fold of each sequence, counted from 0.
+            starts: ``(R, K)``, the same for every fold.
+        """
+        number = int(fold.max()) + 1
+        kept = torch.from_numpy(np.arange(number)[:, None] != fold).double()
+        weights = (kept / kept.sum(1, keepdim=True)).repeat_interleave(len(starts), 0)
+        coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
+        low, high = coarse.low, coarse.high
+        found = minimise(
+            lambda r: coarse(r, weights), starts.repeat(number, 1), low, high,
+            iterations=iterations,
+        )  # fmt: skip
+        each = fine.costs(found.rows)
+        judged = torch.where(weights > 0, each * weights, 0.0).sum(1).reshape(number, -1)
+        few = min(FINISHED, len(starts))
+        best = judged.argsort(1)[:, :few] + len(starts) * torch.arange(number)[:, None]
+        chosen = best.flatten()
+        near = minimise(
+            lambda r: fine(r, weights[chosen]), found.rows[chosen], low, high,
+            iterations=iterations // 2,
+        )  # fmt: skip
+        last = near.costs.reshape(number, few).argmin(1) + few * torch.arange(number)
+        return near.rows[last]
 
 
 def speeds(system: System) -> list[float]:

@@ -106,7 +106,7 @@ class Study:
         for key, one in self.found.items():
             if "parameters" not in one:
                 continue
-            kind = key.split("-")[0]
+            kind = key.split("-")[0].replace("wider", "fit")
             faults = key.split("-")[1] if kind == "fit" else "keep"
             for name, value in one["parameters"].items():
                 for index, number in np.ndenumerate(np.array(value)):

@@ -64,13 +64,15 @@ def fit(
     if bootstrap:
         rng = np.random.default_rng(seed)
         weights = torch.from_numpy(group_weights(groups(folder, recording_name), bootstrap, rng))
-        result["bootstrap"] = _bootstrap(problem, best, found.inverses[found.best], weights, dt)
+        result["bootstrap"] = _bootstrap(
+            problem, best, found.inverses[found.best], weights, dt, iterations // 3
+        )
     result["seconds"] = time.perf_counter() - begin
     return result
 
 
 def _bootstrap(
-    problem: Problem, row: Tensor, inverse: Tensor, weights: Tensor, dt: float
+    problem: Problem, row: Tensor, inverse: Tensor, weights: Tensor, dt: float, iterations: int
 ) -> Result:
     """Local refits to resampled sequences: what their spread says about the parameters."""
     # the coarse step is ten times cheaper, and does where it hardly changes the solution's cost
@@ -79,7 +81,7 @@ def _bootstrap(
     cost = problem.cost(step, torch.float32)
     refits = minimise(
         lambda rows: cost(rows, weights), row.expand(len(weights), -1), cost.low, cost.high,
-        iterations=50, inverse=inverse,
+        iterations=iterations, inverse=inverse,
     )  # fmt: skip
     rows = refits.rows[torch.isfinite(refits.costs)]
     system, exact = problem.system(), problem.cost(step, torch.float64)
@@ -111,17 +113,15 @@ def cross_validate(
         return {"model": model, "recording": recording_name, "box": box, "costs": None}
     place = np.random.default_rng(seed).permutation(number) % min(folds, number)
     fold = place[group]
-    costs = np.empty(len(sequences))
+    problem = Problem(sequences, model, box)
+    rows = problem.search_folds(fold, problem.starts(restarts, seed + 1), dt, iterations)
+    each = problem.cost(dt, torch.float64).costs(rows).numpy()
+    costs = each[fold, np.arange(len(sequences))]
     common, kept = np.empty(len(sequences)), np.empty(len(sequences))
     for k in range(int(fold.max()) + 1):
         out = np.flatnonzero(fold == k)
-        train = [s for s, f in zip(sequences, fold, strict=True) if f != k]
-        problem = Problem(train, model, box)
-        found, _ = problem.search(problem.starts(restarts, seed + 1), dt, iterations)
-        test = Problem([sequences[i] for i in out], model, box)
-        cost = test.cost(dt, torch.float64)
-        costs[out] = cost.costs(found.rows[[found.best]])[0].numpy()
-        common[out], kept[out] = _simple(problem.batch, test, dt)
+        train = problem.batch.select(np.flatnonzero(fold != k).tolist())
+        common[out], kept[out] = _simple(train, problem.batch.select(out.tolist()), problem, dt)
     return {
         "model": model,
         "recording": recording_name,
@@ -134,32 +134,35 @@ def cross_validate(
     }
 
 
-def _simple(train: Batch, test: Problem, dt: float) -> tuple[np.ndarray, np.ndarray]:
+def _simple(
+    train: Batch, test: Batch, problem: Problem, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Costs of the baselines, the common speed taken from the training sequences."""
-    system, solver = test.system(), FusedSolver(dt)
+    system, solver = problem.system(), FusedSolver(dt)
     speed = best_common_speed([train])
     with torch.no_grad():
         found = [
-            sequence_costs(simulate(test.batch), test.batch).numpy()
+            sequence_costs(simulate(test), test).numpy()
             for simulate in (no_interaction(system, solver, speed), constant_velocity(system))
         ]
     return found[0], found[1]
 
 
 def descend(
-    folder: str, recording_name: str, model: str, restarts: int, steps: int, dt: float, lr: float,
-    batch_size: int, seed: int,
+    folder: str, recording_name: str, model: str, restarts: int, steps: int, dt: float,
+    updates_dt: float, lr: float, batch_size: int, seed: int,
 ) -> Result:  # fmt: skip
     """The paper's optimiser, noisy ADADELTA with projection, several runs side by side.
 
     Args:
         steps: updates.
+        dt, updates_dt: Euler steps (s) of the final evaluation, and of updates and history.
         lr: factor on the update, 1 in the paper.
         batch_size: sequences in a mini-batch, the same for all runs; 0 takes all.
     """
     sequences = recording(folder, recording_name)
     problem = Problem(sequences, model)
-    cost = problem.cost(dt, torch.float32)
+    cost = problem.cost(updates_dt, torch.float32)
     rows = problem.starts(restarts, seed, wide=False).requires_grad_()
     optimizer = NoisyAdadelta([rows], lr=lr, seed=seed)
     rng = np.random.default_rng(seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,11 +14,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from nnode.app import benchmark
+from nnode.app import benchmark, benchmark_floor, benchmark_memory
 from nnode.app.benchmark_engines import ENGINES
+from nnode.app.benchmark_memory import peak_memory
 from nnode.app.benchmark_problems import SHAPES, Shape, pose
 from nnode.config import BenchmarkConfig
 from nnode.errors import ConfigError, SimulationError
+from tests.solvers.fused.test_generate import PACKED, is_vector_code
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -47,7 +50,129 @@ def test_all_engines(small, tmp_path) -> None:  # type: ignore[no-untyped-def]
         for engine in problem["engines"].values():
             assert 0 < engine["min"] <= engine["median"] <= engine["max"]
             assert len(engine["all"]) == 1
+            assert engine["peak_memory_MB"] <= problem["peak_memory_MB"]
     assert found["problems"][0]["ensemble"]["threads_1"]["single_runs"] > 0
+    # softplus of 4 neurons for 2 followers in 3 sequences and 20 steps, and none in other laws
+    floors = [problem.get("floor", {}).get("evaluations") for problem in found["problems"]]
+    assert floors == [None, 4 * 2 * 3 * 20, None, None]
+    assert not (tmp_path / "benchmark.png").exists()  # one number of steps, one of people
+
+
+@pytest.fixture
+def series(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    steps = tuple(Shape("traffic", ("n4",), 2, 3, n, 5, 0.02) for n in (1, 2))
+    # so long and so many that somebody meets somebody; a gradient of zero has no relative error
+    people = tuple(Shape("crowd", ("sf",), 1, n, 25, 1, 0.04) for n in (50, 100))
+    for name, shapes in (("steps", steps), ("scale", people)):
+        monkeypatch.setitem(SHAPES, name, shapes)
+
+
+def test_a_series_is_drawn(series, tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
+    chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", "fused_1"]}
+    benchmark.benchmark(options(**chosen), tmp_path)
+    found = json.loads((tmp_path / "benchmark.json").read_text())
+    scale = found["scale"]["fused_1"]
+    assert scale["people"] == [50, 100]
+    medians = [row["engines"]["fused_1"]["median"] for row in found["problems"][2:]]
+    np.testing.assert_allclose(scale["seconds"], [medians[0] / 1250, medians[1] / 2500])
+    assert scale["ratio"] == max(scale["seconds"]) / min(scale["seconds"])
+    assert "fused_1: one step of one person takes" in capsys.readouterr().out
+    drawn = (tmp_path / "benchmark.png").read_bytes()
+    again = tmp_path / "again"
+    benchmark.benchmark(options(redraw=str(tmp_path / "benchmark.json")), again)
+    assert (again / "benchmark.png").read_bytes() == drawn
+    assert not (again / "benchmark.json").exists()
+
+
+def test_what_was_timed_before_an_error_is_kept(series, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    right = ENGINES["loop"]
+
+    def prepare(problem):  # type: ignore[no-untyped-def]
+        if problem.shape.agents == 100:
+            raise KeyboardInterrupt
+        return right.prepare(problem)
+
+    monkeypatch.setitem(ENGINES, "loop", replace(right, prepare=prepare))
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.benchmark(options(shapes=["scale"], engines=["loop"]), tmp_path)
+    found = json.loads((tmp_path / "benchmark.json").read_text())
+    assert [row["agents"] for row in found["problems"]] == [50]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "cannot be read.*FileNotFoundError"),
+        ("{", "cannot be read.*expected the benchmark.json of an earlier run"),
+        ('{"rows": 3}', "cannot be read.*problems"),
+        ('{"problems": []}', "has nothing to draw; expected at least two problems"),
+    ],
+)
+def test_results_that_cannot_be_drawn(text: str | None, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "old.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        benchmark.benchmark(options(redraw=str(path)), tmp_path)
+
+
+def test_pytorch_solves_what_fits() -> None:
+    reach = {
+        (name, shape.agents): ENGINES["odeint"].covers(pose(shape, shape.models[0], torch.float32))
+        for name, shapes in SHAPES.items()
+        for shape in shapes
+    }
+    assert {key for key, covered in reach.items() if not covered} == {
+        ("scale", people) for people in (1000, 2000, 5000, 10000)
+    }
+
+
+def test_memory_is_that_of_the_call() -> None:
+    def call(megabytes: int) -> int:
+        return len(np.ones(megabytes * 125_000))
+
+    peak_memory(lambda: call(300))
+    result, found = peak_memory(lambda: call(100))
+    assert result == 12_500_000
+    if found["memory_MB"] is None:
+        pytest.skip("the system does not tell")
+    assert found["memory_MB"] == pytest.approx(100, abs=10)
+    assert found["peak_memory_MB"] > 100
+
+
+def test_memory_where_the_system_does_not_tell(monkeypatch, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(benchmark_memory, "_PROCESS", tmp_path / "missing")
+    result, found = peak_memory(lambda: 7)
+    assert result == 7
+    assert found["memory_MB"] is None
+    assert found["peak_memory_MB"] is None or found["peak_memory_MB"] > 10
+
+
+def test_the_floor_is_the_arithmetic_of_a_network() -> None:
+    (stress,) = SHAPES["stress"]
+    # 9 followers in 100 sequences, 4 neurons, 5000 steps
+    assert benchmark_floor.evaluations(pose(stress, "n4", torch.float32)) == 18_000_000
+    assert benchmark_floor.floor_call(pose(stress, "lin", torch.float32)) is None
+    x = np.linspace(-9, 9, 64)
+    found = x.copy()
+    benchmark_floor.rows(found, 2)
+    for _ in range(2):
+        x = np.log1p(np.exp(x)) - 1 / (1 + np.exp(-x))
+    np.testing.assert_allclose(found, x, rtol=1e-13)
+
+
+@pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_the_floor_is_vector_code(kind: type) -> None:
+    # a scalar loop would put it ten times too high, and flatter the engines
+    x = np.ones(64, kind)
+    benchmark_floor.rows(x, 1)
+    (text,) = (
+        benchmark_floor.rows.inspect_asm(s)
+        for s in benchmark_floor.rows.signatures
+        if s[0].dtype.name == np.dtype(kind).name
+    )
+    assert is_vector_code(text, loops=1)
 
 
 def test_an_engine_that_is_wrong_is_refused(small, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]

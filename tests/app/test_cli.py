@@ -10,8 +10,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from nnode.app.cli import check_overrides, user_overrides
 from nnode.app.saved import shell_override
+from nnode.app.train import build_solver
+from nnode.calibrate.options import FusedOptions
 from nnode.config import register
 from nnode.errors import ConfigError
+from nnode.solvers import FusedSolver
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
@@ -37,6 +40,7 @@ def _schemas() -> None:
         (["data.split.heldout=abc"], "could not be converted to Float"),
         (["+trainer.extra=1"], "option trainer.extra is unknown"),
         (["solver=fused", "solver.gradient=adjoint"], "option solver.gradient is unknown"),
+        (["solver=fused", "solver.cutoff=far"], "could not be converted to Float"),
         (["solver.gradient=exact"], r"expected one of \[adjoint, discrete\]"),
         (["model=lin,n5"], "model=n5 is unknown"),
         (["seed=1,two"], "seed=two is refused"),
@@ -59,6 +63,8 @@ def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) 
         ["model=sf", "data=hermes", "optimizer=adam", "optimizer.lr=0.1", "seed=range(3)"],
         ["data=vehicles", "data.path='a, b.csv'", "data.columns={vehicle: id, x: pos}"],
         ["experiment=paper_traffic", "solver.dt=null"],
+        ["solver=fused", "solver.cutoff=2.5"],
+        ["solver=fused", "solver.cutoff=null", "solver.cutoff_error=1e-6"],
     ],
 )
 def test_right_options_pass(overrides: list[str]) -> None:
@@ -71,6 +77,14 @@ def test_every_group_of_every_script_composes(name: str) -> None:
         for file in sorted((CONF / group).glob("*.yaml")):
             if name == "train" or group == "data":
                 check_overrides([f"{group}={file.stem}"], CONF, name)
+
+
+def test_the_fused_solver_gets_its_options() -> None:
+    solver = build_solver(FusedOptions(dt=0.01, threads=2, cutoff=2.5, cutoff_error=1e-6))
+    assert isinstance(solver, FusedSolver)
+    assert vars(solver) == {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6}
+    with pytest.raises(ConfigError, match=r"solver\.cutoff_error=2 must be"):
+        build_solver(FusedOptions(cutoff_error=2))
 
 
 def test_flags_are_told_from_overrides() -> None:

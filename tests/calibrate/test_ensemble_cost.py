@@ -104,3 +104,34 @@ def test_a_run_that_blows_up_costs_infinity_and_spares_the_others(batch: Batch) 
     assert torch.isfinite(each[0]).all()
     assert torch.isinf(each[1]).all()
     torch.testing.assert_close(each[0], cost.costs(good[None])[0])
+
+
+def test_a_sequence_without_weight_cannot_spoil_a_gradient(
+    batch: Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    single = batch.to(dtype=torch.float32)
+    wild = single.select([0, 1])
+    wild.x[0, 1, 0] = -3.4e38  # a gap that the network makes infinite
+    system = build_model(N2, dtype=torch.float32)
+    spoiled = EnsembleCost(system, wild, FusedSolver(DT))
+    called = []
+    honest = EnsembleCost._without_the_rest
+    monkeypatch.setattr(
+        EnsembleCost, "_without_the_rest", lambda *args: called.append(1) or honest(*args)
+    )
+    row = spoiled.row(system)[None]
+    value, gradient = spoiled(row, torch.tensor([[1.0, 0.0]], dtype=torch.float64))
+    assert called
+    alone, slope = EnsembleCost(system, single.select([0]), FusedSolver(DT))(row)
+    torch.testing.assert_close(value, alone)
+    torch.testing.assert_close(gradient, slope, rtol=1e-5, atol=1e-5)
+
+
+def test_selected_sequences_cost_the_same(batch: Batch) -> None:
+    row = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).row(build_model(LIN))[None]
+    each = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).costs(row)
+    for i in (0, 1):
+        part = batch.select([i])
+        assert part.names == (batch.names[i],)
+        one = EnsembleCost(build_model(LIN), part, FusedSolver(DT)).costs(row)
+        torch.testing.assert_close(one[:, 0], each[:, i])

@@ -6,10 +6,14 @@ import sys
 from functools import cache
 from types import ModuleType
 
-from nnode.solvers.fused import _math, _rows
+from nnode.models import traffic
+from nnode.solvers.fused import _math, _polynomials, _rows
 from nnode.solvers.fused._cache import digest, keep
 from nnode.solvers.fused._templates import TEMPLATE
 from nnode.solvers.fused.laws import LawKernel
+
+#: Compiled into every law besides its own functions; the laws take a number from ``traffic``.
+_COMPILED_IN = (_math, _polynomials, _rows, traffic)
 
 
 def source(kernel: LawKernel) -> str:
@@ -45,12 +49,8 @@ def source(kernel: LawKernel) -> str:
 
 def _digest(text: str, kernel: LawKernel) -> str:
     """Of the text, of every file whose code is compiled into it, and of the tools."""
-    modules = {
-        _math.__name__,
-        _rows.__name__,
-        kernel.share.__module__,
-        kernel.pull.__module__,
-    }
+    modules = {module.__name__ for module in _COMPILED_IN}
+    modules |= {kernel.share.__module__, kernel.pull.__module__}
     return digest(text.encode(), [sys.modules[name] for name in sorted(modules)])
 
 

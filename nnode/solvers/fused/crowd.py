@@ -11,14 +11,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
-from nnode.errors import ConfigError
 from nnode.models.crowd import InteractionForce, NetworkForce, Relaxation, SocialForce
 from nnode.models.scene import Scene
 from nnode.models.system import Crowd, System
 from nnode.solvers.fused._plan import run_all
 from nnode.solvers.fused.crowd_cache import load
 from nnode.solvers.fused.crowd_laws import LANES, SIZE
-from nnode.solvers.fused.neighbours import cutoff_distance
+from nnode.solvers.fused.neighbours import check_cutoff, cutoff_distance
 
 #: From so many people on, social forces use cell lists. They are faster for 50 already; smaller
 #: crowds, and so most recordings, are exact to rounding instead.
@@ -42,6 +41,11 @@ def supports(system: System, batch: Batch | None = None) -> bool:
         if batch.destination.requires_grad or batch.walls.requires_grad:
             return False  # both are constants here
     return all(tensor.device.type == "cpu" for tensor in tensors)
+
+
+def without_partners(system: System) -> bool:
+    """Whether nobody meets anybody in this model, so that a cutoff changes nothing."""
+    return isinstance(system, Crowd) and all(isinstance(t, Relaxation) for t in system.terms)
 
 
 def _force(system: System) -> InteractionForce:
@@ -268,18 +272,9 @@ def _distances(
     social: SocialForce | None, cutoff: float | None, cutoff_error: float, people: int
 ) -> tuple[float, ...]:
     """Cutoffs of pairs and of walls, m; none where everybody meets everybody."""
+    check_cutoff(cutoff, cutoff_error, 2 * social.r if social else 0.0)
     if cutoff is not None:
-        least = 2 * social.r if social else 0.0
-        if not cutoff > least:
-            raise ConfigError(
-                f"solver.cutoff={cutoff} m must be larger than {least:g} m"
-                + (", the distance of people who touch" if social else "")
-            )
         return cutoff, cutoff
-    if not 0 <= cutoff_error < 1:
-        raise ConfigError(
-            f"solver.cutoff_error={cutoff_error} must be at least 0 and below 1, for example 1e-10"
-        )
     if social is None or cutoff_error == 0 or people < LISTS_FROM:
         return ()
     reaches = (2 * social.r, social.r)

@@ -14,6 +14,7 @@ import nnode.models.crowd
 from nnode.solvers.fused import (
     _cache,
     _math,
+    _polynomials,
     _rows,
     crowd_laws,
     crowd_network,
@@ -22,7 +23,16 @@ from nnode.solvers.fused import (
 )
 from nnode.solvers.fused._cache import keep
 
-_COMPILED_IN = (_math, _rows, crowd_laws, crowd_network, crowd_rows, neighbours, nnode.models.crowd)
+_COMPILED_IN = (
+    _math,
+    _polynomials,
+    _rows,
+    crowd_laws,
+    crowd_network,
+    crowd_rows,
+    neighbours,
+    nnode.models.crowd,
+)
 
 
 def digest(text: bytes) -> str:

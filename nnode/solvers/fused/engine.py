@@ -12,7 +12,7 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.fused import crowd, fallback, traffic
+from nnode.solvers.fused import crowd, fallback, neighbours, traffic
 
 
 class FusedSolver:
@@ -33,20 +33,41 @@ class FusedSolver:
     Args:
         dt: step, s; None takes the domain's default, as TorchdiffeqSolver.
         threads: at most so many threads compute blocks of simulations.
+        cutoff: m; in crowds, pairs, and people and wall points, that are farther apart do not
+            interact, whatever the number of people. It must be larger than the distance 2 r of
+            people who touch. For a force network it changes the model, since nothing makes such
+            a force decay. None derives it from ``cutoff_error`` for social forces of many
+            people, and lets everybody meet everybody otherwise.
+        cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
+            left out, in units of A. The acceleration of one person is then off by less than
+            ``cutoff_error`` A / m through people, and as much through walls; see
+            :func:`nnode.solvers.fused.neighbours.cutoff_distance`. 0 lets everybody meet
+            everybody.
 
     Raises:
-        ConfigError: fewer than one thread, or a step that does not divide.
+        ConfigError: fewer than one thread, a cutoff that is not positive, or an error outside
+            [0, 1).
     """
 
-    def __init__(self, dt: float | None = None, threads: int = 1) -> None:
+    def __init__(
+        self,
+        dt: float | None = None,
+        threads: int = 1,
+        cutoff: float | None = None,
+        cutoff_error: float = 1e-10,
+    ) -> None:
         if threads < 1:
             raise ConfigError(f"solver.threads={threads} must be a whole number of at least 1")
+        neighbours.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads
+        self.cutoff, self.cutoff_error = cutoff, cutoff_error
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         """Simulate from the first measured state, at the batch's sampling times.
 
         Raises:
+            ConfigError: a step that does not divide the sampling interval, or a cutoff for a
+                model that cannot have one.
             DataError: the batch is of another domain, or has no sampling interval.
             SimulationError: a simulated state is not a finite number.
         """
@@ -74,7 +95,7 @@ class FusedSolver:
             x and v of shape ``(K, R, B, N, D)``.
 
         Raises:
-            ConfigError: an unknown name, or shapes that do not fit.
+            ConfigError: as in a single run, an unknown name, or shapes that do not fit.
             DataError: as in a single run.
         """
         n = self._substeps(system, batch)
@@ -95,11 +116,26 @@ class FusedSolver:
     def _substeps(self, system: System, batch: Batch) -> int:
         if batch.x.shape[-1] != system.dim:
             system.scene(batch)  # says so
+        compiled = crowd.supports(system, batch)
+        if self.cutoff is not None and not compiled and not crowd.without_partners(system):
+            raise ConfigError(
+                f"solver.cutoff={self.cutoff:g} m works for crowds with one compiled force "
+                "(model=sf or model=nn) only; set it to null"
+            )
         return substeps(batch.dt, self.dt, system.domain)
 
     def _other(self, system: System, batch: Batch, n: int, parameters: list[Tensor]) -> Trajectory:
         if crowd.supports(system, batch):
-            return Trajectory(*crowd.simulate(system, batch, n, self.threads))
+            return Trajectory(
+                *crowd.simulate(
+                    system,
+                    batch,
+                    n,
+                    self.threads,
+                    cutoff=self.cutoff,
+                    cutoff_error=self.cutoff_error,
+                )
+            )
         y = fallback.simulate(system, batch, n, parameters)
         return Trajectory(*system.observe(y, batch))
 

@@ -20,6 +20,30 @@ from nnode.solvers.fused.crowd_laws import LOOP
 _WIDER = 1.0001
 
 
+def check_cutoff(cutoff: float | None, cutoff_error: float, touching: float = 0.0) -> None:
+    """Refuse what cannot be a cutoff.
+
+    Args:
+        cutoff: m, or None.
+        cutoff_error: largest force left out of one partner, in units of A.
+        touching: distance of people who touch, m; a cutoff must not leave out contacts.
+
+    Raises:
+        ConfigError: ``cutoff`` is not a number larger than ``touching``, or ``cutoff_error``
+            lies outside [0, 1).
+    """
+    if cutoff is not None and not touching < cutoff < math.inf:
+        raise ConfigError(
+            f"solver.cutoff={cutoff} m must be larger than {touching:g} m"
+            + (", the distance of people who touch" if touching else "")
+            + "; null derives it from solver.cutoff_error"
+        )
+    if not 0 <= cutoff_error < 1:
+        raise ConfigError(
+            f"solver.cutoff_error={cutoff_error} must be at least 0 and below 1, for example 1e-10"
+        )
+
+
 def cutoff_distance(reach: float, decay: float, cutoff_error: float) -> float:
     """Distance (m) beyond which a social force is left out.
 

@@ -123,11 +123,7 @@ def test_rows_longer_than_a_piece(name: str, crowd) -> None:  # type: ignore[no-
     x[1] += 0.1
     wall = np.array([[-1.0, 0.0, 0.0, 0.0]])
     item = Sequence(name="l", recording="r", time=np.array([0, 0.1]), x=x, walls=wall)
-    check(
-        Crowd(MODELS[name]()),
-        single([item]),
-        lambda model, batch: Trajectory(*compiled.simulate(model, batch, 2, cutoff_error=0)),
-    )
+    check(Crowd(MODELS[name]()), single([item]), FusedSolver(DT, cutoff_error=0))
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
@@ -250,14 +246,10 @@ def test_what_is_covered(people: list[Sequence]) -> None:
     assert not compiled.supports(Crowd(MODELS["sf"]()), batch)
 
 
-def test_refused_cutoffs(people: list[Sequence]) -> None:
-    batch = collate(people)
-    with pytest.raises(ConfigError, match=r"cutoff=0\.4 m must be larger than 0\.5 m"):
-        compiled.simulate(Crowd(MODELS["sf"]()), batch, 2, cutoff=0.4)
-    with pytest.raises(ConfigError, match="larger than 0 m"):
-        compiled.simulate(Crowd(MODELS["nn"]()), batch, 2, cutoff=0.0)
-    with pytest.raises(ConfigError, match="cutoff_error=1"):
-        compiled.simulate(Crowd(MODELS["sf"]()), batch, 2, cutoff_error=1.0)
+def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
+    message = r"solver\.cutoff=0\.4 m must be larger than 0\.5 m, the distance of people who touch"
+    with pytest.raises(ConfigError, match=message):
+        FusedSolver(DT, cutoff=0.4)(Crowd(MODELS["sf"]()), collate(people))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

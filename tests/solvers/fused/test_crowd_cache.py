@@ -14,21 +14,19 @@ from nnode.errors import ConfigError
 from nnode.solvers.fused import crowd_cache
 
 SCRIPT = """
-import json, time
+import json
 import numpy as np
 from nnode.data.sequence import Sequence, collate
 from nnode.models import Crowd, Relaxation, SocialForce
 x = np.arange(12.0).reshape(1, 6, 2) + 0.1 * np.arange(3)[:, None, None]
 batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x)])
 model = Crowd([Relaxation(), SocialForce(1.0, 1.0, 1.0)])
-start = time.perf_counter()
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-took = time.perf_counter() - start
 from nnode.solvers.fused.crowd_cache import load
 module = load("crowd_dense")
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
-print(json.dumps({"took": took, "hits": hits}))
+print(json.dumps({"hits": hits}))
 """
 
 
@@ -44,7 +42,6 @@ def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
         )
         runs.append(json.loads(done.stdout))
     assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
-    assert runs[1]["took"] < 2.0  # s
     assert len(list((tmp_path / "fused").glob("*.py"))) == 1
 
 
