@@ -127,6 +127,15 @@ def time_groups(items: Iterable[Sequence]) -> np.ndarray:
     return np.array([number[key] for key in keys])
 
 
+def mean_speed(items: Iterable[Sequence]) -> float:
+    """Mean over people of their mean speed in a sequence, m/s."""
+    return float(
+        np.concatenate(
+            [np.linalg.norm(s.x[-1] - s.x[0], axis=-1) / (s.time[-1] - s.time[0]) for s in items]
+        ).mean()
+    )
+
+
 def turned(sequence: Sequence) -> Sequence:
     """A corridor along y turned by a quarter to the right, so that people walk along x.
 

@@ -7,7 +7,7 @@ import pandas as pd
 
 from nnode.plots.study_crowd import horizon_costs
 from nnode.study import printed_crowd as printed
-from nnode.study.crowd_data import GROUP, RECORDING
+from nnode.study.crowd_data import ALL, GROUP, RECORDING
 from nnode.study.crowd_fit import NAMES
 from nnode.study.crowd_page_forces import force_blocks, restart_blocks
 from nnode.study.crowd_results import LABELS, MODELS, SIMPLE, Crowd
@@ -81,11 +81,23 @@ def _summary(study: Crowd) -> list[Block]:
             f"{row[f'{name}, high']:.3g}) at {_seconds(first)}; the printed "
             f"{printed.PARAMETERS[name]:g} is {'inside' if inside else 'outside'} the interval."
         )
+    lines.append(_nearest(study))
     for horizon in study.horizons:
         found = study.compare("nn", "sf", horizon)
         lines.append(f"Held out, {_seconds(horizon)}: {verdict('NN', 'SF', found)}.")
     lines.append(_pairs_matter(study))
     return [Heading("What comes out"), Text("\n".join(f"- {line}" for line in lines))]
+
+
+def _nearest(study: Crowd) -> str:
+    """The length at which the parameters come closest to the printed ones."""
+    told = np.array([printed.PARAMETERS[name] for name in NAMES])
+    away = {h: np.array(study.chosen("sf", ALL, h).row) / told - 1 for h in study.horizons}
+    horizon = min(away, key=lambda h: float(np.abs(away[h]).max()))
+    each = ", ".join(
+        f"{name} {value:+.0%}" for name, value in zip(NAMES, away[horizon], strict=True)
+    )
+    return f"Closest to the printed parameters are those of {_seconds(horizon)}: {each}."
 
 
 def _pairs_matter(study: Crowd) -> str:
@@ -305,17 +317,17 @@ def _blocks(study: Crowd) -> list[Block]:
     if told and bool((people.to_numpy() < mean)[above].all()):
         text += (
             " These blocks hold fewer people than the others: what the networks learned in the "
-            "crowd does not carry over to the filling or emptying corridor."
+            "crowd does not carry over to times when the corridor is emptier."
         )
     return [
         Text(text),
         TableBlock(
             "crowd_blocks",
             table,
-            "Mean held-out cost of a sequence (m² s) by block of time. Least of the calibrated "
-            "models in bold.",
+            "Mean held-out cost of a sequence (m² s) by block of time, with people's mean speed "
+            "(m/s). Least of the calibrated models in bold.",
             bold=_least(table),
-            digits={**dict.fromkeys(map(str, table), 4), "people": 1},
+            digits={**dict.fromkeys(map(str, table), 4), "people": 1, "speed": 2},
         ),
     ]
 
@@ -343,9 +355,9 @@ def _others(study: Crowd) -> list[Block]:
         TableBlock(
             "crowd_heldout_runs",
             table,
-            "Mean cost of a sequence (m² s) in runs of other widths and densities. Least of the "
-            "calibrated models in bold.",
+            "Mean cost of a sequence (m² s) in runs of other widths and densities, with people's "
+            "mean speed (m/s). Least of the calibrated models in bold.",
             bold=_least(table),
-            digits={**dict.fromkeys(map(str, table), 3), "people": 1},
+            digits={**dict.fromkeys(map(str, table), 3), "people": 1, "speed": 2},
         ),
     ]

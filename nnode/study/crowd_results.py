@@ -13,7 +13,7 @@ import pandas as pd
 from nnode.data.store import Store
 from nnode.models.system import System
 from nnode.study import printed_crowd as printed
-from nnode.study.crowd_data import ALL, sequences, time_groups
+from nnode.study.crowd_data import ALL, mean_speed, sequences, time_groups
 from nnode.study.crowd_fit import NAMES, named, system_of
 from nnode.study.crowd_tasks import KINDS
 from nnode.study.options import CrowdStudyOptions
@@ -205,14 +205,15 @@ class Crowd:
         """Held-out cost of each block of time, m² s; rows by horizon and block."""
         rows = {}
         for horizon in self.horizons:
-            people = {e["name"]: e["n_agents"] for e in self.stores["main", horizon].index}
+            every = {s.name: s for s in sequences(self.folder("main", horizon))}
             for number, scope in enumerate(self.folds, 1):
                 held = {m: pd.Series(self.chosen(m, scope, horizon).heldout) for m in MODELS}
                 names = held["sf"].index
                 simple = self.all_costs("relaxation", horizon)[names]
                 rows[(f"{horizon:g} s", f"{number}")] = {
                     "sequences": len(names),
-                    "people": float(np.mean([people[name] for name in names])),
+                    "people": float(np.mean([every[name].n_agents for name in names])),
+                    "speed": mean_speed(every[name] for name in names),
                     **{LABELS[m]: float(held[m].mean()) for m in MODELS},
                     LABELS["relaxation"]: float(simple.mean()),
                 }
@@ -224,10 +225,12 @@ class Crowd:
         """Mean cost of a sequence in other runs; rows by horizon and run, m² s."""
         rows = {}
         for horizon in self.horizons:
+            every = sequences(self.folder("others", horizon))
             for run, found in self.found[f"transfer-{horizon:g}s"].items():
                 rows[(f"{horizon:g} s", run)] = {
                     "sequences": len(found["people"]),
                     "people": float(np.mean(found["people"])),
+                    "speed": mean_speed(s for s in every if s.recording == run),
                     **{
                         LABELS[m]: float(np.mean(list(found["costs"][m].values())))
                         for m in (*MODELS, *SIMPLE[:3])
