@@ -66,7 +66,7 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
 def _checked(options: CrowdStudyOptions) -> CrowdStudyOptions:
     if options.quick:
         options = replace(
-            options, horizons=options.horizons[:3:2], restarts=1, folds=2, bootstrap=10, steps=2,
+            options, horizons=options.horizons[:3:2], restarts=1, folds=2, bootstrap=4, steps=1,
         )  # fmt: skip
     for name, least in (("restarts", 1), ("folds", 2), ("bootstrap", 2), ("steps", 1)):
         if getattr(options, name) < least:
