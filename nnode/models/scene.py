@@ -87,18 +87,14 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         points ``(B, P, 2)``, unit normals into the walkable side ``(B, P, 2)`` and the mask
         ``(B, P)`` of real points. Padding points repeat far outside.
     """
+    known: dict[bytes, tuple[Tensor, Tensor]] = {}
     rows = []
     for segments in walls.detach().cpu().double():
-        points, normals = [], []
-        for segment in segments[~segments.isnan().any(1)]:
-            start, end = segment[:2], segment[2:]
-            length = float(torch.linalg.vector_norm(end - start))
-            n = max(1, math.ceil(length / spacing - 1e-9)) + 1
-            fraction = torch.linspace(0, 1, n, dtype=torch.float64)[:, None]
-            points.append(start + fraction * (end - start))
-            along = (end - start) / max(length, 1e-12)
-            normals.append(torch.stack([-along[1], along[0]]).expand(n, 2))
-        rows.append((torch.cat(points), torch.cat(normals)) if points else (torch.empty(0, 2),) * 2)
+        # the sequences of a recording share their walls
+        key = segments.numpy().tobytes()
+        if key not in known:
+            known[key] = _points(segments, spacing)
+        rows.append(known[key])
     most = max((len(points) for points, _ in rows), default=0)
     shape = (len(rows), most, 2)
     point = torch.full(shape, 1e4, dtype=torch.float64)
@@ -110,3 +106,19 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         real[b, : len(place)] = True
     device, dtype = walls.device, walls.dtype
     return point.to(device, dtype), normal.to(device, dtype), real.to(device)
+
+
+def _points(segments: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """Points and normals ``(P, 2)`` of one simulation's walls ``(W, 4)``."""
+    points, normals = [], []
+    for segment in segments[~segments.isnan().any(1)]:
+        start, end = segment[:2], segment[2:]
+        length = float(torch.linalg.vector_norm(end - start))
+        n = max(1, math.ceil(length / spacing - 1e-9)) + 1
+        fraction = torch.linspace(0, 1, n, dtype=torch.float64)[:, None]
+        points.append(start + fraction * (end - start))
+        along = (end - start) / max(length, 1e-12)
+        normals.append(torch.stack([-along[1], along[0]]).expand(n, 2))
+    if not points:
+        return torch.empty(0, 2), torch.empty(0, 2)
+    return torch.cat(points), torch.cat(normals)

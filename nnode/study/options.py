@@ -43,6 +43,8 @@ class CrowdStudyOptions(StudyOptions):
     """Social force and networks on two-way flows in a corridor."""
 
     name: str = "crowd"
-    restarts: int = 8  # start parameters per model and horizon
+    restarts: int = 8  # start parameters per model; the better half goes on to longer horizons
     horizons: list[float] = field(default_factory=lambda: [1.0, 2.0, 3.0, 5.0])  # s
-    bootstrap: int = 200  # resamples of blocks of time
+    folds: int = 4  # blocks of time, each held out once
+    steps: int = 4  # of the networks by Levenberg and Marquardt's method, at each length
+    bootstrap: int = 100  # resamples of stretches of time

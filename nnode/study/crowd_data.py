@@ -1,0 +1,155 @@
+"""Sequences of the crowd study: horizons, blocks of time that are held out, other runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from nnode.data.options import JuelichOptions
+from nnode.data.prepare import prepare
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.store import Store
+from nnode.errors import ConfigError
+
+#: The recording that the paper calibrates on, and its walls, m.
+RECORDING, WALLS = "bi_corr_400_b_03", {"*": [0.0, 4.0]}
+#: Two-way flows of other widths and densities: corridors of 3.0 and 3.6 m.
+OTHERS = (
+    "bo-360-050-050", "bo-360-090-090", "boa-300-065-105", "bot-300-075-075", "bot-300-100-100",
+    "bot-360-160-160",
+)  # fmt: skip
+OTHER_WALLS = {"*-300-*": [0.0, 3.0], "*-360-*": [0.0, 3.6]}
+#: Part of the other corridors that is looked at, m along the walking axis.
+VIEW = [-4.0, 4.0]
+
+#: Sequences that begin within so many seconds share most of their people: resampled together.
+GROUP = 10.0
+
+#: All sequences train; or one block of time is held out (``fold-0``, ``fold-1``, ...).
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where sequences come from: a prepared folder, and which of them train.
+
+    Attributes:
+        folder: of the store.
+        scope: ``all``, or ``fold-<n>``: everything but the n-th block of time.
+        folds: number of blocks.
+    """
+
+    folder: str
+    scope: str = ALL
+    folds: int = 4
+
+
+def prepare_horizon(
+    source: str | None, download: str | None, horizon: float, folder: Path, *, others: bool = False
+) -> Store:
+    """Cut the paper's recording, or the other runs, into sequences of ``horizon`` seconds.
+
+    Only people who are tracked through a whole sequence are part of it: the longer it is, the
+    fewer and the slower they are.
+    """
+    common = {"source": source, "download": download, "t_seq": horizon}
+    if not others:
+        options = JuelichOptions(recording=RECORDING, walls=WALLS, **common)  # type: ignore[arg-type]
+    else:
+        options = JuelichOptions(
+            name="hermes", recording=list(OTHERS), frame_rate=16.0, unit="cm", walking_axis="y",
+            walls=OTHER_WALLS, view=VIEW, **common,  # type: ignore[arg-type]
+        )  # fmt: skip
+    return prepare(options, folder)
+
+
+@lru_cache(maxsize=8)
+def sequences(folder: str) -> tuple[Sequence, ...]:
+    """All sequences of a prepared folder."""
+    return tuple(Store(folder))
+
+
+def fold_of(
+    starts: np.ndarray, ends: np.ndarray, folds: int, span: tuple[float, float]
+) -> np.ndarray:
+    """``(S,)`` number of the block of time that holds a whole sequence, -1 across a border.
+
+    Args:
+        starts, ends: ``(S,)`` s.
+        span: first and last time of the recording, s; it is divided into equal blocks.
+    """
+    if folds < 2:
+        raise ConfigError(f"study.folds={folds}: expected at least 2 blocks of time")
+    width = (span[1] - span[0]) / folds
+    tiny = 1e-6 * width
+    first = np.floor((starts - span[0] + tiny) / width).astype(int)
+    last = np.floor((ends - span[0] - tiny) / width).astype(int)
+    return np.where(first == last, first.clip(0, folds - 1), -1)
+
+
+def parts(place: Place, span: tuple[float, float]) -> tuple[list[int], list[int]]:
+    """Positions of the sequences that train and of those that are held out.
+
+    Whoever shares a person with a held-out sequence does not train. The blocks are the same
+    spans of time at every horizon.
+    """
+    every = sequences(place.folder)
+    if place.scope == ALL:
+        return list(range(len(every))), []
+    number = int(place.scope.removeprefix("fold-"))
+    starts, ends = (np.array([s.time[k] for s in every]) for k in (0, -1))
+    held = np.flatnonzero(fold_of(starts, ends, place.folds, span) == number).tolist()
+    people = {agent for i in held for agent in every[i].agents}
+    out = set(held)
+    return [i for i, s in enumerate(every) if i not in out and people.isdisjoint(s.agents)], held
+
+
+def chosen(folder: str, index: Iterable[int]) -> Batch:
+    """Some sequences of a folder as one batch."""
+    every = sequences(folder)
+    return collate(every[i] for i in index)
+
+
+def cut(batch: Batch, samples: int) -> Batch:
+    """The first ``samples`` samples of every sequence; destinations stay what they are."""
+    k = min(samples, batch.n_samples)
+    return replace(batch, x=batch.x[:k], v=batch.v[:k], valid=batch.valid[:k])
+
+
+def time_groups(items: Iterable[Sequence]) -> np.ndarray:
+    """``(S,)`` number of the stretch of GROUP seconds, within its recording, of each sequence."""
+    keys = [(s.recording, int((s.time[0] + 1e-6) // GROUP)) for s in items]
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    return np.array([number[key] for key in keys])
+
+
+def mean_speed(items: Iterable[Sequence]) -> float:
+    """Mean over people of their mean speed in a sequence, m/s."""
+    return float(
+        np.concatenate(
+            [np.linalg.norm(s.x[-1] - s.x[0], axis=-1) / (s.time[-1] - s.time[0]) for s in items]
+        ).mean()
+    )
+
+
+def turned(sequence: Sequence) -> Sequence:
+    """A corridor along y turned by a quarter to the right, so that people walk along x.
+
+    Networks see directions: what they learned in one corridor holds in another one only if both
+    lie the same way.
+    """
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])  # rows times this: (x, y) to (y, -x)
+    walls = sequence.walls
+    if walls is not None:
+        walls = (walls.reshape(-1, 2, 2) @ turn).reshape(-1, 4)
+    return replace(
+        sequence,
+        x=sequence.x @ turn,
+        v=None if sequence.v is None else sequence.v @ turn,
+        destination=None if sequence.destination is None else sequence.destination @ turn,
+        walls=walls,
+    )
