@@ -194,4 +194,4 @@ def _of_model(
 
 
 def _scan(where: dict[str, Any], quick: bool) -> dict[str, Any]:
-    return {k: v for k, v in where.items() if k != "seed"} | {"points": 21 if quick else 101}
+    return {k: v for k, v in where.items() if k != "seed"} | {"points": 21 if quick else 81}

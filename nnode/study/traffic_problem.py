@@ -23,8 +23,8 @@ from nnode.solvers.fused.engine import FusedSolver
 COARSE = 0.02
 #: Gaps (m) at which laws are compared, as in the paper's figure.
 GAPS = tuple(float(gap) for gap in range(2, 51))
-#: Finds of the first search that are followed further: in float32, then in float64.
-FOLLOWED, FINISHED = 4, 2
+#: Finds of the first search that are followed further in float32; the best one then in float64.
+FOLLOWED = 4
 #: Starts are drawn within: v0 (m/s) and L (m) of the laws; factor on the weights of networks.
 SPEEDS, LENGTHS, WIDEN = (15.0, 35.0), (2.0, 10.0), 5.0
 
@@ -107,7 +107,7 @@ class Problem:
         best = judged.argsort()[:FOLLOWED]
         near = minimise(fine, found.rows[best], low, high, iterations=iterations // 2)
         exact = self.cost(dt, torch.float64)
-        last = near.rows[near.costs.argsort()[:FINISHED]]
+        last = near.rows[[near.best]]
         return minimise(exact, last, low, high, iterations=iterations // 2), judged
 
     def search_folds(self, fold: np.ndarray, starts: Tensor, dt: float, iterations: int) -> Tensor:
@@ -128,7 +128,7 @@ class Problem:
         )  # fmt: skip
         each = fine.costs(found.rows)
         judged = torch.where(weights > 0, each * weights, 0.0).sum(1).reshape(number, -1)
-        few = min(FINISHED, len(starts))
+        few = min(FOLLOWED // 2, len(starts))
         best = judged.argsort(1)[:, :few] + len(starts) * torch.arange(number)[:, None]
         chosen = best.flatten()
         near = minimise(
