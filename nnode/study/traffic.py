@@ -19,7 +19,7 @@ from nnode.study.options import TrafficStudyOptions
 from nnode.study.page import Block
 from nnode.study.runner import Task, run_tasks
 from nnode.study.traffic_page import blocks
-from nnode.study.traffic_results import Study
+from nnode.study.traffic_results import LAWS, NETWORKS, Study
 
 TITLE = "Traffic: five models on ten recordings"
 SUBTITLE = (
@@ -27,8 +27,6 @@ SUBTITLE = (
     "by neural networks*, on the same recordings, printed numbers beside ours."
 )
 
-LAWS = ("lin", "log")
-NETWORKS = ("n2", "n4", "n10")
 MODELS = (*LAWS, *NETWORKS)
 #: Relative time of a gradient.
 _TIMES = {"lin": 1.0, "log": 1.2, "n2": 1.5, "n4": 2.0, "n10": 3.5}
@@ -36,6 +34,8 @@ _TIMES = {"lin": 1.0, "log": 1.2, "n2": 1.5, "n4": 2.0, "n10": 3.5}
 _MOST = 12
 #: Keys of searches that were made again, wider, begin so in place of ``fit-``.
 WIDER = "wider-"
+#: Sampling interval of the recordings, s.
+SAMPLING = 0.2
 #: Other steps at which solutions are evaluated, s.
 STEPS = [0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001]
 
@@ -48,10 +48,7 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
         DataError: recordings that cannot be read.
         StudyError: tasks failed.
     """
-    for name in ("restarts", "iterations", "folds", "descent_steps", "particles"):
-        least = 2 if name in ("folds", "particles") else 1
-        if getattr(options, name) < least:
-            raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
+    _check(options)
     if options.quick:
         options = replace(
             options, restarts=4, iterations=30, folds=2, bootstrap=10, descent_steps=30,
@@ -67,6 +64,25 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
         wider = run_tasks(again, folder, title="wider search", **how)
         found |= {_replaces(key, found, one): one for key, one in wider.items()}
     return blocks(Study(options, stores, found))
+
+
+def _check(options: TrafficStudyOptions) -> None:
+    least = {
+        "restarts": 1, "iterations": 3, "bootstrap": 2, "folds": 2, "descent_steps": 1,
+        "batch_size": 0, "particles": 2, "consensus_steps": 1,
+    }  # fmt: skip
+    for name, low in least.items():
+        if getattr(options, name) < low:
+            raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {low}")
+    for name in ("box", "descent_lr"):
+        if not getattr(options, name) > 0:
+            raise ConfigError(f"study.{name}={getattr(options, name)} must be positive")
+    for name in ("dt", "descent_dt"):
+        step = getattr(options, name)
+        if not (0 < step <= SAMPLING and abs(SAMPLING / step - round(SAMPLING / step)) < 1e-6):
+            raise ConfigError(
+                f"study.{name}={step} s must divide the sampling interval of {SAMPLING} s"
+            )
 
 
 def _wider(tasks_: list[Task], found: dict[str, dict[str, Any]]) -> list[Task]:

@@ -15,6 +15,8 @@ from nnode.data.prepare import prepare
 from nnode.models.build import build_model
 from nnode.models.system import System
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver
+from nnode.study.crowd_data import chosen, prepare_horizon, sequences
+from nnode.study.crowd_fit import system_of
 from nnode.study.printed_traffic import RECORDINGS
 from nnode.study.traffic_problem import Problem, model_options, recording
 
@@ -81,6 +83,26 @@ def test_the_average_is_one(table: pd.DataFrame) -> None:
     pd.testing.assert_series_equal(
         table[list(RECORDINGS)].mean(axis=1), table["average"], check_names=False
     )
+
+
+@pytest.mark.parametrize(("model", "label"), [("sf", "SF"), ("nn", "NN")])
+def test_crowd_costs_follow_from_the_parameters(
+    model: str, label: str, real_data: Path, tmp_path: Path
+) -> None:
+    folder = PUBLISHED.parent / "crowd"
+    told = pd.read_csv(folder / "crowd_costs.csv", index_col=0)
+    rows = pd.read_csv(folder / "parameters.csv")
+    rows = rows[(rows.model == model) & (rows["trained on"] == "all") & (rows["horizon (s)"] == 1)]
+    prepare_horizon(str(real_data), None, 1.0, tmp_path)
+    batch = chosen(str(tmp_path), range(len(sequences(str(tmp_path)))))
+    solver = TorchdiffeqSolver("euler", "discrete")
+    found = []
+    for _, start in rows.groupby("start"):
+        system = system_of(model, start["value"].to_list())
+        with torch.no_grad():
+            found.append(float(sequence_costs(solver(system, batch), batch).mean()))
+    assert min(found) == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
+    assert 25 * min(found) == pytest.approx(told.loc[label, "here (m²)"], rel=1e-6)
 
 
 @pytest.mark.parametrize("study", ["traffic", "crowd"])

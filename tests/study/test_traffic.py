@@ -12,8 +12,11 @@ from nnode.data.options import EsimasOptions, Faults
 from nnode.data.prepare import prepare
 from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
+from nnode.errors import ConfigError
 from nnode.study import printed_traffic as printed
+from nnode.study import traffic
 from nnode.study import traffic_tasks as tasks
+from nnode.study.options import TrafficStudyOptions
 from nnode.study.traffic_problem import Problem
 
 V0, L = 24.0, 5.0
@@ -114,6 +117,25 @@ def test_a_grid_contains_the_truth(store: str) -> None:
     one = tasks.scan(store, "r", "lin", 21, 0.02)
     assert (one["v0"], one["L"]) == (pytest.approx(23.5, abs=1.6), pytest.approx(5.0, abs=0.51))
     assert min(one["by_length"]) == one["cost"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"restarts": 0}, {"folds": 1}, {"bootstrap": 0}, {"box": 0.0}, {"dt": 0.03}, {"dt": 1.0}],
+)
+def test_options_out_of_range_are_named(wrong: dict[str, float], tmp_path: Path) -> None:
+    options = TrafficStudyOptions(source="nowhere", workers=1, **wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=f"study.{next(iter(wrong))}="):
+        traffic.run(options, tmp_path)
+
+
+def test_a_wider_search_counts_where_it_is_better() -> None:
+    found = {"fit-keep-3-1_2-n2": {"cost": 21.0}}
+    better, worse = {"cost": 20.0}, {"cost": 22.0}
+    key = "wider-keep-3-1_2-n2"
+    assert traffic._replaces(key, found, worse) == key
+    assert traffic._replaces(key, found, better) == "fit-keep-3-1_2-n2"
+    assert better["before"] == 21.0
 
 
 def test_starts_begin_with_the_papers(store: str) -> None:
