@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,8 @@ from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.models.scene import Scene
 from nnode.models.term import State, Term, physical_parameters
+
+T = TypeVar("T", bound=Term)
 
 
 class System(nn.Module):
@@ -64,6 +67,10 @@ class System(nn.Module):
         if self.order == 1:
             return y, None
         return y[..., : self.dim], y[..., self.dim :]
+
+    def find(self, kind: type[T]) -> T | None:
+        """The first term of a kind, or None."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def physical(self) -> dict[str, tuple[Tensor, str]]:
         """Name to (value, unit) of the parameters that have a physical meaning."""

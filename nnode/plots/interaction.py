@@ -25,13 +25,13 @@ def interaction(system: System) -> InteractionForce:
     Raises:
         ConfigError: there is none.
     """
-    for term in system.terms:
-        if isinstance(term, InteractionForce):
-            return term
-    raise ConfigError(
-        f"a force figure needs a crowd model with an interaction force, found a {system.domain} "
-        f"model with the terms {[getattr(t, 'name', '?') for t in system.terms]}"
-    )
+    force = system.find(InteractionForce)
+    if force is None:
+        raise ConfigError(
+            "a force figure needs a crowd model with an interaction force, found a "
+            f"{system.domain} model with the terms {[t.name for t in system.terms]}"
+        )
+    return force
 
 
 @torch.no_grad()

@@ -42,13 +42,13 @@ def follow_law(system: System, name: str = "model") -> FollowTheLeader:
     Raises:
         ConfigError: there is none.
     """
-    for term in system.terms:
-        if isinstance(term, FollowTheLeader):
-            return term
-    raise ConfigError(
-        f"{name}: a speed curve needs a traffic model with a law of the gap, found a "
-        f"{system.domain} model with the terms {[getattr(t, 'name', '?') for t in system.terms]}"
-    )
+    law = system.find(FollowTheLeader)
+    if law is None:
+        raise ConfigError(
+            f"{name}: a speed curve needs a traffic model with a law of the gap, found a "
+            f"{system.domain} model with the terms {[t.name for t in system.terms]}"
+        )
+    return law
 
 
 def measured_gaps(sequences: Iterable[Sequence]) -> np.ndarray:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-import sys
 import time
-from types import TracebackType
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
-from nnode.calibrate import progress
+from nnode.calibrate.progress import OnTerminal
 
 log = logging.getLogger(__name__)
 
 
-class TaskProgress:
+class TaskProgress(OnTerminal):
     """Counts tasks, and tells the time left by their expected costs; use as a context manager.
 
     Args:
@@ -25,32 +23,16 @@ class TaskProgress:
     """
 
     def __init__(self, title: str, total: int, done: int, cost: float) -> None:
+        super().__init__(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+        )
         self.title, self.total, self.done = title, total, done
         self._cost, self._spent = cost, 0.0
-        self._start = self._last_line = time.monotonic()
-        self._bar: Progress | None = None
-        if sys.stderr.isatty():
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[text]}"),
-                TimeElapsedColumn(),
-            )
+        if self._bar:
             self._task = self._bar.add_task(title, total=cost, text=self._text())
-
-    def __enter__(self) -> TaskProgress:
-        if self._bar:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._bar:
-            self._bar.stop()
 
     def advance(self, cost: float) -> None:
         """One task more is done."""
@@ -60,11 +42,9 @@ class TaskProgress:
 
     def tick(self) -> None:
         """Show what is known now; called often."""
-        now = time.monotonic()
         if self._bar:
             self._bar.update(self._task, completed=self._spent, text=self._text())
-        elif now - self._last_line >= progress.LINE_EVERY:
-            self._last_line = now
+        elif self.line_is_due():
             log.info("%s: %s", self.title, self._text())
 
     def _text(self) -> str:
