@@ -116,10 +116,12 @@ def descents(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
         for i, values in enumerate(found.values()):
             style = {**curve_style(i), "marker": ""}
             ax.plot(values[:, 0], values[:, 1], **style, linewidth=1.3)
-        ax.set(xscale="log", yscale="log", ylim=(1e-3, None))
+        ax.set(xscale="log", yscale="log")
         first = ax is axes.flat[0]
         y = "average J above the least (m² s)" if first else ""
         dress(ax, x="simulations", y=y, title=model)
+    # what lies lower is rounding
+    axes[0, 0].set_ylim(bottom=1e-3)
     handles = [
         Line2D([], [], **{**curve_style(i), "marker": ""}, label=n) for i, n in enumerate(names)
     ]
