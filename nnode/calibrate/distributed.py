@@ -8,6 +8,7 @@ the same number everywhere, so that all take the same step without sending param
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -216,6 +217,8 @@ class World:
 def _leave() -> None:
     if dist.is_initialized():
         dist.destroy_process_group()
+        # whatever still refers to the group in a cycle would keep its threads to the very end
+        gc.collect()
 
 
 @contextmanager

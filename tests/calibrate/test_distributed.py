@@ -43,7 +43,10 @@ def together(platoons: Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
         timeout=200,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
+    # rarely PyTorch aborts while it takes down its threads, after everything has been written
+    finished = all((folder / f"process_{rank}.json").is_file() for rank in (0, 1))
+    teardown = "terminate called without an active exception" in done.stderr
+    assert done.returncode == 0 or (finished and teardown), done.stderr
     return folder
 
 
