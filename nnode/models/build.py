@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, cast
 
 import torch
 
+from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
+from nnode.models.effects import CATALOGUE
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
 
@@ -100,6 +102,42 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
         model = MODELS[term](options, torch.Generator().manual_seed(seed))
     except (ValueError, KeyError) as error:
         raise ConfigError(f"model {options.get('name', term)}: {error}") from error
+    add_effects(model, options.get("effects") or [])
     model.to(dtype)
     model.project_()
     return model
+
+
+def add_effects(model: System, chosen: Sequence[Options]) -> None:
+    """Give a model effects of the catalogue, each in its place in the sum.
+
+    Args:
+        chosen: per effect its ``name`` and any of its parameters.
+
+    Raises:
+        ConfigError: an effect that the catalogue or the model's domain does not have, or a
+            parameter that the effect does not have.
+    """
+    added = []
+    for entry in chosen:
+        if not isinstance(entry, Mapping) or "name" not in entry:
+            raise ConfigError(
+                f"model.effects has the entry {entry!r}, expected a name and parameters such as "
+                "{name: relative_speed, kappa: 0.3}"
+            )
+        values = {str(key): value for key, value in entry.items() if key != "name"}
+        name = str(entry["name"])
+        known = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain))]
+        if name not in known:
+            near = get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise ConfigError(
+                f"model.effects: there is no {model.domain} effect {name}, expected one of "
+                f"{', '.join(known)}{hint}"
+            )
+        try:
+            added.append(CATALOGUE.effects[name](**values))
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"model.effects: {name}: {error}") from error
+    for effect in sorted(added, key=lambda effect: effect.rank):
+        model.terms.append(effect)

@@ -80,7 +80,8 @@ class InteractionForce(Term):
     def components(self, state: State) -> dict[str, Tensor]:
         """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
         x, v, scene = state.x, _velocity(state), state.scene
-        force = self.pair_force(x[:, :, None] - x[:, None], v[:, :, None] - v[:, None])
+        other, speed = state.others
+        force = self.pair_force(x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None])
         apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
         acts = (scene.agent[:, None, :] & apart)[..., None]
         parts = {"pair": (force * acts).sum(2) / (self.mass * scene.count)}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -21,6 +22,8 @@ class ModelOptions:
 
     name: str = MISSING  # a label: lin, n4, sf, ...
     term: str = MISSING  # the term that is calibrated
+    # named effects beside it: [{name: relative_speed, kappa: 0.3}, ...]
+    effects: list[Any] = field(default_factory=list)
 
 
 @dataclass

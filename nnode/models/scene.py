@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -28,6 +29,9 @@ class Scene:
         wall_normal: ``(B, P, 2)`` unit normals into the walkable side.
         wall_point: ``(B, P)`` True for real wall points.
         wall_count: ``(B, 1, 1)`` number of real wall points, at least 1.
+        start: ``(B,)`` clock time of the first sample, s.
+        names: of the sequences.
+        kind, group: per sequence the agents' class and group names, or None.
     """
 
     agent: Tensor
@@ -42,6 +46,10 @@ class Scene:
     wall_normal: Tensor
     wall_point: Tensor
     wall_count: Tensor
+    start: Tensor
+    names: tuple[str, ...] = ()
+    kind: tuple[tuple[str, ...] | None, ...] = ()
+    group: tuple[tuple[str, ...] | None, ...] = ()
 
     @classmethod
     def of(cls, batch: Batch, wall_spacing: float = 0.25) -> Scene:
@@ -64,15 +72,53 @@ class Scene:
             wall_normal=normal,
             wall_point=real,
             wall_count=real.sum(1).clamp(min=1).to(batch.x.dtype)[:, None, None],
+            start=batch.start,
+            names=batch.names,
+            kind=batch.kind,
+            group=batch.group,
         )
 
     def measured_at(self, t: Tensor) -> Tensor:
         """``(B, N, D)`` measured positions at time ``t`` (s), linear between samples."""
+        position, before, after = self._around(t)
+        return torch.lerp(before, after, position.clamp(0, 1).to(before.dtype))
+
+    def measured_rate_at(self, t: Tensor) -> Tensor:
+        """``(B, N, D)`` velocity of the measured positions at time ``t`` (s), m/s: constant
+        between samples."""
+        _, before, after = self._around(t)
+        return (after - before) / self.dt
+
+    def _around(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The samples before and after ``t``, and how far ``t`` is between them."""
         position = t / self.dt
         # a hair of tolerance keeps whole sample numbers whole in any precision
         k = torch.floor(position + 1e-4).long().clamp(0, self.measured.shape[0] - 2)
-        before, after = self.measured[k], self.measured[k + 1]
-        return torch.lerp(before, after, (position - k).clamp(0, 1).to(before.dtype))
+        return position - k, self.measured[k], self.measured[k + 1]
+
+    @cached_property
+    def kinds(self) -> dict[str, Tensor]:
+        """Class name to ``(B, N)`` True for its agents; empty where no class is known."""
+        return self._masks(self.kind)
+
+    @cached_property
+    def companions(self) -> Tensor:
+        """``(B, N, N)`` True for two different agents of one social group."""
+        found = torch.zeros(*self.agent.shape, self.agent.shape[1], dtype=torch.bool)
+        for b, names in enumerate(self.group):
+            for i, name in enumerate(names or ()):
+                for j, other in enumerate(names or ()):
+                    found[b, i, j] = bool(name) and i != j and name == other
+        return found.to(self.agent.device)
+
+    def _masks(self, labels: tuple[tuple[str, ...] | None, ...]) -> dict[str, Tensor]:
+        known = sorted({name for names in labels for name in names or () if name})
+        masks = {name: torch.zeros(self.agent.shape, dtype=torch.bool) for name in known}
+        for b, names in enumerate(labels):
+            for i, name in enumerate(names or ()):
+                if name:
+                    masks[name][b, i] = True
+        return {name: mask.to(self.agent.device) for name, mask in masks.items()}
 
 
 def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:

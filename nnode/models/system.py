@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeVar
+from dataclasses import replace
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +20,9 @@ T = TypeVar("T", bound=Term)
 class System(nn.Module):
     """The right-hand side of an ordinary differential equation as a sum of terms.
 
-    A solver sees ``dy/dt = system(t, y, scene)`` with ``y`` of shape ``(B, N, order * D)``.
+    A solver sees ``dy/dt = system(t, y, scene)`` with ``y`` of shape ``(B, N, order * D + M)``:
+    positions, in second-order models velocities, and the M additional states that terms own.
+    Terms are summed in their order: each can look at the sum before it.
 
     Attributes:
         domain: ``traffic`` or ``crowd``.
@@ -55,18 +58,41 @@ class System(nn.Module):
 
     def initial(self, batch: Batch) -> Tensor:
         """``(B, N, order * D)``: the measured state at the first sample."""
-        parts = [batch.x[0], batch.v[0]][: self.order]
-        return torch.cat(parts, -1)
+        x, v = batch.x[0], batch.v[0]
+        own = [term.remember(x, v, self) for term in self._terms() if term.memory]
+        return torch.cat([*[x, v][: self.order], *own], -1)
 
     def acceleration(self, state: State) -> Tensor:
         """``(B, N, D)``: the sum of all terms, m/s (first order) or m/s² (second order)."""
-        return sum((term(state) for term in self.terms), torch.zeros_like(state.x))
+        return self._rates(state, None)[0]
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
         """Positions and, in second-order models, velocities of the states at the samples."""
         if self.order == 1:
-            return y, None
-        return y[..., : self.dim], y[..., self.dim :]
+            return y[..., : self.dim], None
+        return y[..., : self.dim], y[..., self.dim : 2 * self.dim]
+
+    def _terms(self) -> list[Term]:
+        return cast(list[Term], list(self.terms))
+
+    def _rates(self, state: State, memory: Tensor | None) -> tuple[Tensor, list[Tensor]]:
+        """The sum of the terms, and the rates of their additional states ``(B, N, M)``."""
+        total, rates, first = torch.zeros_like(state.x), [], 0
+        for term in self._terms():
+            own = None
+            if term.memory:
+                assert memory is not None
+                own = memory[..., first : first + term.memory]
+                first += term.memory
+            now = replace(state, system=self, rate=total, memory=own)
+            total = self._imposed(total + term(now), state)
+            if term.memory:
+                rates.append(term.memory_rate(now))
+        return total, rates
+
+    def _imposed(self, rate: Tensor, state: State) -> Tensor:
+        """The rates, where some agents' are known from elsewhere."""
+        return rate
 
     def find(self, kind: type[T]) -> T | None:
         """The first term of a kind, or None."""
@@ -78,8 +104,7 @@ class System(nn.Module):
 
     def project_(self) -> None:
         """Move every parameter into its admissible set."""
-        for term in self.terms:
-            assert isinstance(term, Term)
+        for term in self._terms():
             term.project_()
 
 
@@ -102,28 +127,61 @@ class Traffic(System):
         self.leader = leader
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
-        if self.leader == "constant":
-            return self.acceleration(State(t, y, None, scene))
+        place = scene.measured_at(t) if self.leader == "measured" else None
+        return self.rates_behind(t, y, scene, place)
+
+    def rates_behind(self, t: Tensor, y: Tensor, scene: Scene, place: Tensor | None) -> Tensor:
+        """The right-hand side where the leader's ``place`` (m) is given, if it is measured."""
+        x, memory = y[..., :1], y[..., 1:]
         lead = scene.leader[..., None]
-        x = torch.where(lead, scene.measured_at(t), y)
-        # the leader's state is never read: its place is known at every time
-        return self.acceleration(State(t, x, None, scene)).masked_fill(lead, 0.0)
+        if place is not None:
+            x = torch.where(lead, place, x)
+        rate, own = self._rates(State(t, x, None, scene), memory)
+        if place is not None:
+            # the leader's state is never read: its place is known at every time
+            rate = rate.masked_fill(lead, 0.0)
+        return torch.cat([rate, *own], -1) if own else rate
+
+    def _imposed(self, rate: Tensor, state: State) -> Tensor:
+        # of no account for laws of the gap, but effects look at the speed of the vehicle ahead
+        if self.leader == "constant" or len(self.terms) == 1:
+            return rate
+        speed = state.scene.measured_rate_at(state.t)
+        return torch.where(state.scene.leader[..., None], speed, rate)
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
+        x = y[..., :1]
         if self.leader == "constant":
-            return y, None
+            return x, None
         number = batch.agent.sum(1)
         lead = torch.arange(y.shape[2], device=y.device) == (number - 1)[:, None]
-        return torch.where(lead[..., None], batch.x, y), None
+        return torch.where(lead[..., None], batch.x, x), None
 
 
 class Crowd(System):
-    """Second order, two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms."""
+    """Second order, two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms.
+
+    Args:
+        neighbours: ``simulated``: people react to each other's simulated states;
+            ``measured``: each is simulated alone among the measured paths of the others.
+    """
 
     domain = "crowd"
     order = 2
     dim = 2
 
+    def __init__(
+        self, terms: Iterable[Term], wall_spacing: float = 0.25, neighbours: str = "simulated"
+    ) -> None:
+        super().__init__(terms, wall_spacing)
+        if neighbours not in ("simulated", "measured"):
+            raise ValueError(f"neighbours={neighbours} is unknown, expected simulated or measured")
+        self.neighbours = neighbours
+
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
-        x, v = y[..., :2], y[..., 2:]
-        return torch.cat([v, self.acceleration(State(t, x, v, scene))], -1)
+        x, v, memory = y[..., :2], y[..., 2:4], y[..., 4:]
+        seen = None
+        if self.neighbours == "measured":
+            seen = scene.measured_at(t), scene.measured_rate_at(t)
+        rate, own = self._rates(State(t, x, v, scene, seen=seen), memory)
+        return torch.cat([v, rate, *own], -1)

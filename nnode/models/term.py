@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from nnode.models.scene import Scene
+
+if TYPE_CHECKING:
+    from nnode.models.system import System
 
 
 @dataclass
@@ -21,12 +24,30 @@ class State:
         x: ``(B, N, D)`` positions, m.
         v: ``(B, N, D)`` velocities, m/s; None in first-order models.
         scene: everything that does not change during the simulation.
+        system: the model whose terms are summed; an effect looks there for the law it modifies.
+        rate: ``(B, N, D)`` sum of the terms before the one that looks, m/s or m/s².
+        memory: ``(B, N, M)`` the M additional states of the term that looks.
+        seen: where the others are, ``(x, v)``, for a person who looks around; None where they
+            are simulated as well.
     """
 
     t: Tensor
     x: Tensor
     v: Tensor | None
     scene: Scene
+    system: System | None = None
+    rate: Tensor | None = None
+    memory: Tensor | None = None
+    seen: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def others(self) -> tuple[Tensor, Tensor]:
+        """Positions and velocities of the others, ``(B, N, D)`` each."""
+        if self.seen is not None:
+            return self.seen
+        if self.v is None:
+            raise ValueError("a term of a second-order model needs velocities")
+        return self.x, self.v
 
 
 @dataclass(frozen=True)
@@ -52,11 +73,13 @@ class Term(nn.Module):
         name: the field's name of the effect.
         formula: the formula, in the symbols of the parameters.
         source: where the formula stands.
+        memory: number M of additional states of each agent that the term owns.
     """
 
     name: ClassVar[str]
     formula: ClassVar[str]
     source: ClassVar[str]
+    memory: ClassVar[int] = 0
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,6 +117,14 @@ class Term(nn.Module):
 
     def forward(self, state: State) -> Tensor:
         raise NotImplementedError  # pragma: no cover - every term defines its own
+
+    def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
+        """``(B, N, M)`` the additional states at the start, of positions and velocities then."""
+        raise NotImplementedError  # pragma: no cover - every term with a memory defines its own
+
+    def memory_rate(self, state: State) -> Tensor:
+        """``(B, N, M)`` time derivative of the additional states."""
+        raise NotImplementedError  # pragma: no cover - every term with a memory defines its own
 
 
 def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:

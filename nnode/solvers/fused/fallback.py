@@ -17,7 +17,6 @@ from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
 from nnode.models.system import System, Traffic
-from nnode.models.term import State
 
 #: Jacobians of one batched call may hold so many numbers.
 _ROOM = 16_000_000
@@ -48,16 +47,15 @@ class _Problem:
         """The same for many steps in one call: ``(S,)`` and ``(S, B, N, order * D)``."""
         if not self.measured:
             return torch.func.vmap(self.rate)(steps, y)
-        lead = self.scene.leader[..., None]
+        assert isinstance(self.system, Traffic)
+        system = self.system
         places = torch.stack([self.scene.measured_at(step * self.dt) for step in steps])
-        x = torch.where(lead, places, y)
 
-        def one(step: Tensor, x: Tensor) -> Tensor:
-            rate = self.dt * self.system.acceleration(State(step * self.dt, x, None, self.scene))
-            rate = rate.masked_fill(lead, 0.0)
+        def one(step: Tensor, y: Tensor, place: Tensor) -> Tensor:
+            rate = self.dt * system.rates_behind(step * self.dt, y, self.scene, place)
             return rate.where(step <= self.end, 0.0) if self.ragged else rate
 
-        return torch.func.vmap(one)(steps, x)
+        return torch.func.vmap(one)(steps, y, places)
 
 
 class _Simulate(torch.autograd.Function):

@@ -1,0 +1,113 @@
+"""What a diagnosis needs to know of a domain: how a model's residuals come about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from nnode.data.sequence import Batch
+from nnode.models.scene import Scene
+from nnode.models.system import System
+
+
+class Engine(Protocol):
+    """The residuals of models on some sequences.
+
+    A residual is a number that is zero where simulation and measurement agree: positions that
+    differ, in m, without what unknown start states explain, and whitened as far as a filter of
+    the residuals allows it. All models of a diagnosis are compared in the same residuals.
+
+    Attributes:
+        batch: the sequences.
+        sequence: ``(n,)`` position of each residual's sequence in the batch.
+        block: ``(n,)`` number of each residual's block: a part of a sequence that is taken as
+            independent of the others.
+    """
+
+    batch: Batch
+    sequence: np.ndarray
+    block: np.ndarray
+
+    def residuals(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, n)`` residuals of R runs of one model; NaN where a run blows up.
+
+        Args:
+            system: the model.
+            rows: ``(R, K)`` its parameters that are calibrated, see :func:`row_of`.
+        """
+        ...
+
+    def positions(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, n_raw)`` m: differences of positions as they are, neither whitened nor
+        otherwise changed, for the costs that are reported."""
+        ...
+
+
+def trained(system: System) -> dict[str, nn.Parameter]:
+    """The parameters that are calibrated, by name."""
+    return {name: p for name, p in system.named_parameters() if p.requires_grad}
+
+
+def row_of(system: System) -> Tensor:
+    """``(K,)`` all parameters that are calibrated, one after the other, float64."""
+    return torch.cat([p.detach().double().flatten() for p in trained(system).values()])
+
+
+@torch.no_grad()
+def fill(system: System, row: Tensor) -> System:
+    """Write a row into the system and return it."""
+    own = trained(system)
+    parts = row.split([p.numel() for p in own.values()])
+    for parameter, part in zip(own.values(), parts, strict=True):
+        parameter.copy_(part.reshape(parameter.shape))
+    return system
+
+
+@dataclass
+class Ensemble:
+    """The right-hand side of R runs of one model at once.
+
+    Attributes:
+        system: the model.
+        rows: ``(R, K)`` the runs' parameters.
+        scene: the surroundings, the same in all runs.
+    """
+
+    system: System
+    rows: Tensor
+    scene: Scene
+
+    def __post_init__(self) -> None:
+        own = trained(self.system)
+        parts = self.rows.split([p.numel() for p in own.values()], 1)
+        self._parameters = {
+            name: part.reshape(-1, *p.shape)
+            for (name, p), part in zip(own.items(), parts, strict=True)
+        }
+        self._rate = torch.func.vmap(self._one, in_dims=(0, None, 0))
+
+    def _one(self, parameters: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
+        found: Tensor = functional_call(self.system, parameters, (t, y, self.scene))
+        return found
+
+    def start(self, batch: Batch) -> Tensor:
+        """``(R, B, N, ...)`` states at the first sample."""
+        y = self.system.initial(batch)
+        return y.expand(len(self.rows), *y.shape).clone()
+
+    def rate(self, t: Tensor, y: Tensor) -> Tensor:
+        """Time derivative of the states ``(R, B, N, ...)`` at time ``t`` (s)."""
+        return self._rate(self._parameters, t, y)
+
+    def runge_kutta(self, t: Tensor, y: Tensor, h: float) -> Tensor:
+        """The states after a step of ``h`` s by the classical method of fourth order."""
+        k1 = self.rate(t, y)
+        k2 = self.rate(t + h / 2, y + h / 2 * k1)
+        k3 = self.rate(t + h / 2, y + h / 2 * k2)
+        k4 = self.rate(t + h, y + h * k3)
+        return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

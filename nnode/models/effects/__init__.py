@@ -1,0 +1,5 @@
+"""Effects that a model may lack: terms with a name, a formula, units and a source."""
+
+from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
+
+__all__ = ["CATALOGUE", "Effect", "Probe", "Setting", "Strength"]

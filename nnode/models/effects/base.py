@@ -1,0 +1,141 @@
+"""What an effect is: a term that a model may lack, with all that is needed to look for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from nnode.data.sequence import Batch, Domain
+from nnode.models.system import System
+from nnode.models.term import Interval, Term
+
+
+@dataclass(frozen=True)
+class Probe:
+    """An effect of small strength, whose trace in the simulated paths the data are searched for.
+
+    Attributes:
+        options: of the effect, with its strengths at their neutral values where it has these.
+        steps: strength to the amount by which it is varied. Each one gives one direction; the
+            directions of a probe are looked for together.
+    """
+
+    options: dict[str, Any]
+    steps: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Strength:
+    """A parameter that is neutral where there is no effect, and to which its trace is
+    proportional as long as it is weak.
+
+    Attributes:
+        neutral: its value without the effect.
+        step: a small but visible amount.
+        range: what is plausible; also the admissible set.
+        unit: of the parameter.
+    """
+
+    neutral: float
+    step: float
+    range: Interval
+    unit: str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A parameter without a neutral value: a place, a range, a time constant.
+
+    Attributes:
+        value: where a search starts that knows nothing better.
+        range: what is plausible; also the admissible set.
+        unit: of the parameter.
+    """
+
+    value: float
+    range: Interval
+    unit: str
+
+
+class Effect(Term):
+    """A named effect: a term with strengths, settings, and the traces to look for.
+
+    A subclass states its class attributes and ``forward``; all parameters are calibrated. The
+    constructor takes each parameter by keyword.
+
+    Class attributes:
+        domain: ``traffic`` or ``crowd``.
+        strengths: parameter name to :class:`Strength`; at least one.
+        settings: parameter name to :class:`Setting`.
+        rank: place in the sum of terms; one that modifies the sum before it comes later.
+        kin: name of the class of effects that data often cannot tell apart from it; empty: none.
+        separated_by: what data would.
+        consecutive: the probes are neighbouring intervals of one quantity, and an effect on
+            several of them is the sum of their traces. ``a`` and ``b`` are the interval's ends.
+        individual: every agent has a strength of its own, with mean zero over the agents; the
+            reported strength is their standard deviation.
+    """
+
+    domain: ClassVar[Domain]
+    strengths: ClassVar[dict[str, Strength]]
+    settings: ClassVar[dict[str, Setting]] = {}
+    rank: ClassVar[int] = 0
+    kin: ClassVar[str] = ""
+    separated_by: ClassVar[str] = ""
+    consecutive: ClassVar[bool] = False
+    individual: ClassVar[bool] = False
+
+    def __init__(self, **values: float) -> None:
+        super().__init__()
+        unknown = sorted(set(values) - set(self.strengths) - set(self.settings))
+        if unknown:
+            raise ValueError(
+                f"effect {self.name} has no parameter {', '.join(unknown)}; it has "
+                f"{', '.join([*self.strengths, *self.settings])}"
+            )
+        for name, strength in self.strengths.items():
+            value = values.get(name, strength.neutral)
+            self.declare(name, value, unit=strength.unit, bounds=strength.range)
+        for name, setting in self.settings.items():
+            value = values.get(name, setting.value)
+            self.declare(name, value, unit=setting.unit, bounds=setting.range)
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        """What is looked for in the data of ``batch`` by ``system``; empty: cannot act there.
+
+        By default one probe at the settings' own values.
+        """
+        steps = {name: strength.step for name, strength in cls.strengths.items()}
+        return [Probe({}, steps)]
+
+    def options(self) -> dict[str, Any]:
+        """What builds this effect again, in plain numbers."""
+        return {name: float(getattr(self, name)) for name in (*self.strengths, *self.settings)}
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """Effects by name, in the order of their place in the sum."""
+
+    effects: dict[str, type[Effect]] = field(default_factory=dict)
+
+    def add(self, effect: type[Effect]) -> type[Effect]:
+        """Make an effect known; usable as a class decorator.
+
+        Raises:
+            ValueError: its name is taken.
+        """
+        if effect.name in self.effects:
+            raise ValueError(f"there is an effect named {effect.name} already")
+        self.effects[effect.name] = effect
+        return effect
+
+    def of(self, domain: Domain) -> list[type[Effect]]:
+        """The effects of a domain."""
+        found = [effect for effect in self.effects.values() if effect.domain == domain]
+        return sorted(found, key=lambda effect: effect.rank)
+
+
+#: Every effect that models can be given by name.
+CATALOGUE = Catalogue()
