@@ -17,7 +17,8 @@ class Probe:
     Attributes:
         options: of the effect, with its strengths at their neutral values where it has these.
         steps: strength to the amount by which it is varied. Each one gives one direction; the
-            directions of a probe are looked for together.
+            directions of a probe are looked for together. Empty: the one direction is what the
+            effect with these options changes as a whole.
     """
 
     options: dict[str, Any]
@@ -65,7 +66,7 @@ class Effect(Term):
 
     Class attributes:
         domain: ``traffic`` or ``crowd``.
-        strengths: parameter name to :class:`Strength`; at least one.
+        strengths: parameter name to :class:`Strength`; may be empty, see :class:`Probe`.
         settings: parameter name to :class:`Setting`.
         rank: place in the sum of terms; one that modifies the sum before it comes later.
         kin: name of the class of effects that data often cannot tell apart from it; empty: none.
@@ -94,7 +95,9 @@ class Effect(Term):
                 f"{', '.join([*self.strengths, *self.settings])}"
             )
         for name, strength in self.strengths.items():
-            value = values.get(name, strength.neutral)
+            # a time constant has no neutral value of its own: the least plausible one stands in
+            least = min(max(strength.neutral, strength.range.low), strength.range.high)
+            value = values.get(name, least)
             self.declare(name, value, unit=strength.unit, bounds=strength.range)
         for name, setting in self.settings.items():
             value = values.get(name, setting.value)

@@ -1,0 +1,332 @@
+"""Effects in a lane that change the speed at once: places, times, classes, gaps ahead."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import PADDING_GAP, Batch
+from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
+from nnode.models.system import System, Traffic
+from nnode.models.term import Interval, State
+from nnode.models.traffic import FollowTheLeader, LighthillWhithamRichards
+
+#: A zone begins and ends over this distance, m, and a period over this time, s: their edges
+#: can then be calibrated.
+EDGE = {"m": 4.0, "s": 0.5}
+#: So many cells of a road or a time are looked at one by one.
+CELLS = 32
+
+
+def law_of(state: State) -> FollowTheLeader:
+    """The law of the gap that an effect modifies."""
+    found = None if state.system is None else state.system.find(FollowTheLeader)
+    if found is None:
+        raise ValueError("an effect in a lane needs a model with a law of the gap")
+    return found
+
+
+def gaps(x: Tensor) -> Tensor:
+    """``(B, N)`` gaps to the vehicle ahead, m, of positions ``(B, N, 1)``; the last has none."""
+    gap = torch.diff(x[..., 0])
+    return torch.cat([gap, gap.new_full((len(gap), 1), PADDING_GAP)], 1)
+
+
+def rate_of(state: State) -> Tensor:
+    """``(B, N)`` the sum of the terms before, m/s."""
+    assert state.rate is not None
+    return state.rate[..., 0]
+
+
+def for_followers(state: State, change: Tensor) -> Tensor:
+    """``(B, N, 1)`` a change of the speed ``(B, N)``, for followers only."""
+    return torch.where(state.scene.follower, change, 0.0)[..., None]
+
+
+def inside(place: Tensor, a: Tensor, b: Tensor, edge: float) -> Tensor:
+    """1 inside [a, b], 0 outside, linear over ``edge`` in between."""
+    rise = ((place - a) / edge + 0.5).clamp(0, 1)
+    return rise * ((b - place) / edge + 0.5).clamp(0, 1)
+
+
+def _cells(low: float, high: float) -> list[Probe]:
+    """Probes of neighbouring cells of [low, high]."""
+    width = (high - low) / CELLS
+    ends = [low + width * i for i in range(CELLS + 1)]
+    return [Probe({"a": a, "b": b}, {"alpha": -0.1}) for a, b in pairwise(ends)]
+
+
+_FACTOR = Strength(1.0, -0.1, Interval(0.05, 3.0), "1")
+
+
+@CATALOGUE.add
+class SpeedZone(Effect):
+    """A section of the road where everyone drives slower or faster than the law says."""
+
+    alpha: Tensor
+    a: Tensor
+    b: Tensor
+    name = "speed_zone"
+    domain = "traffic"
+    formula = "W alpha for x in [a, b]"
+    source = "variable speed limits: Hegyi, De Schutter & Hellendoorn 2005"
+    strengths = {"alpha": _FACTOR}
+    settings = {"a": Setting(0.0, Interval(), "m"), "b": Setting(100.0, Interval(), "m")}
+    rank = 10
+    consecutive = True
+    kin = "where or when"
+    separated_by = "platoons that pass the place at other times"
+
+    def forward(self, state: State) -> Tensor:
+        share = inside(state.x[..., 0], self.a, self.b, EDGE["m"])
+        return for_followers(state, (self.alpha - 1) * share * rate_of(state))
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        x = batch.x[..., 0][batch.valid]
+        return _cells(float(x.min()), float(x.max()))
+
+
+@CATALOGUE.add
+class SpeedPeriod(Effect):
+    """A time of the clock when everyone drives slower or faster than the law says."""
+
+    alpha: Tensor
+    a: Tensor
+    b: Tensor
+    name = "speed_period"
+    domain = "traffic"
+    formula = "W alpha for t in [a, b]"
+    source = "weather and light: Hranac et al. 2006 (FHWA-HOP-07-073)"
+    strengths = {"alpha": _FACTOR}
+    settings = {"a": Setting(0.0, Interval(), "s"), "b": Setting(60.0, Interval(), "s")}
+    rank = 11
+    consecutive = True
+    kin = "where or when"
+    separated_by = "platoons at the same time in other places"
+
+    def forward(self, state: State) -> Tensor:
+        share = inside(state.scene.start + state.t, self.a, self.b, EDGE["s"])
+        return for_followers(state, (self.alpha - 1) * share[:, None] * rate_of(state))
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        lasts = (batch.valid.any(-1).sum(0) - 1) * batch.dt
+        return _cells(float(batch.start.min()), float((batch.start + lasts).max()))
+
+
+@CATALOGUE.add
+class VehicleClass(Effect):
+    """Vehicles of one class drive slower or faster than the law says.
+
+    Args:
+        kind: the class.
+    """
+
+    phi: Tensor
+    name = "vehicle_class"
+    domain = "traffic"
+    formula = "W phi for vehicles of one class"
+    source = "Ossen & Hoogendoorn 2011"
+    strengths = {"phi": _FACTOR}
+    rank = 12
+    kin = "who"
+    separated_by = "more vehicles of the class"
+
+    def __init__(self, kind: str = "truck", **values: float) -> None:
+        super().__init__(**values)
+        self.kind = kind
+
+    def forward(self, state: State) -> Tensor:
+        belongs = state.scene.kinds.get(self.kind)
+        if belongs is None:
+            return torch.zeros_like(state.x)
+        return for_followers(state, (self.phi - 1) * belongs * rate_of(state))
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        counts: dict[str, int] = {}
+        for names in batch.kind:
+            for name in names or ():
+                counts[name] = counts.get(name, 0) + bool(name)
+        # the most frequent class is what the law describes
+        others = sorted((kind for kind in counts if kind), key=lambda kind: -counts[kind])[1:]
+        return [Probe({"kind": kind}, {"phi": -0.1}) for kind in others]
+
+    def options(self) -> dict[str, Any]:
+        return {"kind": self.kind, **super().options()}
+
+
+@CATALOGUE.add
+class LeaderLength(Effect):
+    """The spacing grows with the length of the vehicle ahead."""
+
+    beta: Tensor
+    name = "leader_length"
+    domain = "traffic"
+    formula = "W(gap - beta (l_{i+1} - mean l))"
+    source = "Ossen & Hoogendoorn 2011"
+    strengths = {"beta": Strength(0.0, 0.1, Interval(-2.0, 3.0), "1")}
+    rank = 33
+    kin = "who"
+    separated_by = "vehicles of more different lengths"
+
+    def forward(self, state: State) -> Tensor:
+        length = state.scene.length
+        known = torch.isfinite(length)
+        mean = torch.where(known, length, 0.0).sum() / known.sum().clamp(min=1)
+        longer = torch.where(known, length - mean, 0.0)
+        ahead = torch.cat([longer[:, 1:], torch.zeros_like(longer[:, :1])], 1)
+        gap, law = gaps(state.x), law_of(state)
+        return for_followers(state, law.speed(gap - self.beta * ahead) - law.speed(gap))
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        lengths = batch.length[torch.isfinite(batch.length)]
+        different = lengths.numel() > 1 and float(lengths.std()) > 0.1
+        return [Probe({}, {"beta": 0.1})] if different else []
+
+
+@CATALOGUE.add
+class FreeFlowSpeed(Effect):
+    """Nobody drives faster than a desired speed, however long the gap."""
+
+    v_max: Tensor
+    name = "free_flow_speed"
+    domain = "traffic"
+    formula = "min(W, v_max)"
+    source = "Newell 2002"
+    strengths = {}
+    settings = {"v_max": Setting(30.0, Interval(1.0, 60.0), "m/s")}
+    rank = 20
+
+    def forward(self, state: State) -> Tensor:
+        return for_followers(state, -(rate_of(state) - self.v_max).clamp(min=0))
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        speeds = batch.v[..., 0][batch.valid]
+        levels = np.quantile(speeds.numpy(), [0.4, 0.55, 0.7, 0.8, 0.88, 0.94])
+        return [Probe({"v_max": float(v)}, {}) for v in levels if v > 1.0]
+
+
+@CATALOGUE.add
+class MultiAnticipation(Effect):
+    """Drivers look two vehicles ahead."""
+
+    c: Tensor
+    name = "multi_anticipation"
+    domain = "traffic"
+    formula = "W + c (W(gap_{i+1}) - W(gap_i))"
+    source = "Lenz, Wagner & Sollacher 1999"
+    strengths = {"c": Strength(0.0, 0.05, Interval(-1.0, 1.0), "1")}
+    rank = 30
+    kin = "reaction to the vehicle ahead"
+    separated_by = "leaders that brake and accelerate strongly, cameras that see longer platoons"
+
+    def forward(self, state: State) -> Tensor:
+        speed = law_of(state).speed(gaps(state.x))
+        ahead = torch.cat([speed[:, 1:], speed[:, -1:]], 1)
+        follows = state.scene.follower
+        second = follows & torch.cat([follows[:, 1:], torch.zeros_like(follows[:, :1])], 1)
+        return torch.where(second, self.c * (ahead - speed), 0.0)[..., None]
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        return super().probes(batch, system) if int(batch.agent.sum(1).max()) > 2 else []
+
+
+@CATALOGUE.add
+class LeaderSpeed(Effect):
+    """The leader does not drive at a constant speed, but as it was measured."""
+
+    weight: Tensor
+    name = "leader_speed"
+    domain = "traffic"
+    formula = "v0 + weight (measured speed - v0) for the leader"
+    source = "the model option leader=measured"
+    strengths = {"weight": Strength(0.0, 0.1, Interval(-0.5, 1.5), "1")}
+    rank = 5
+
+    def forward(self, state: State) -> Tensor:
+        speed = state.scene.measured_rate_at(state.t)[..., 0]
+        change = self.weight * (speed - rate_of(state))
+        return torch.where(state.scene.leader, change, 0.0)[..., None]
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        constant = isinstance(system, Traffic) and system.leader == "constant"
+        return [Probe({}, {"weight": 0.1})] if constant else []
+
+
+@CATALOGUE.add
+class DriverHeterogeneity(Effect):
+    """Every driver has a pace of his own, with mean zero over the drivers.
+
+    Args:
+        drivers: sequence name to one deviation eta per vehicle; others drive as the law says.
+    """
+
+    sigma: Tensor
+    name = "driver_heterogeneity"
+    domain = "traffic"
+    formula = "W (1 + eta_i), eta_i ~ N(0, sigma²)"
+    source = "Ossen & Hoogendoorn 2011"
+    strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 1.0), "1")}
+    rank = 13
+    individual = True
+    kin = "who"
+    separated_by = "the same drivers for a longer time"
+
+    def __init__(self, drivers: dict[str, list[float]] | None = None, **values: float) -> None:
+        super().__init__(**values)
+        self.drivers = {str(k): [float(eta) for eta in v] for k, v in (drivers or {}).items()}
+        self.idle("sigma")  # it describes the drivers and is not in the equation
+
+    def forward(self, state: State) -> Tensor:
+        rate = rate_of(state)
+        eta = torch.zeros_like(rate)
+        for b, name in enumerate(state.scene.names):
+            own = self.drivers.get(name)
+            if own is not None:
+                eta[b, : len(own)] = torch.tensor(own, dtype=rate.dtype, device=rate.device)
+        return for_followers(state, eta * rate)
+
+    def options(self) -> dict[str, Any]:
+        return {**super().options(), "drivers": self.drivers}
+
+
+@CATALOGUE.add
+class TimeGap(Effect):
+    """The spacing grows with speed."""
+
+    h: Tensor
+    name = "time_gap"
+    domain = "traffic"
+    formula = "W with L + h ẋ_{i+1} in place of L"
+    source = "constant time headway: Pipes 1953; Treiber, Hennecke & Helbing 2000"
+    strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s")}
+    rank = 40
+    kin = "reaction to the vehicle ahead"
+    separated_by = "a wider range of speeds"
+
+    def forward(self, state: State) -> Tensor:
+        law, rate, gap = law_of(state), rate_of(state), gaps(state.x)
+        assert isinstance(law, LighthillWhithamRichards)
+        plain = law.speed(gap)
+        speed, found = rate[:, -1], [rate[:, -1]]
+        for i in range(rate.shape[1] - 2, -1, -1):
+            wider = (law.L + self.h * speed).clamp(min=0.1)
+            own = rate[:, i] + law.speed(gap[:, i] * law.L / wider) - plain[:, i]
+            speed = torch.where(state.scene.follower[:, i], own, rate[:, i])
+            found.append(speed)
+        return for_followers(state, torch.stack(found[::-1], 1) - rate)
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        known = system.find(LighthillWhithamRichards) is not None
+        return super().probes(batch, system) if known else []
