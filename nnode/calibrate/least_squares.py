@@ -121,7 +121,7 @@ def least_squares(
             gradient, curvature = _normal(columns, now)
             found, value = None, math.inf
             while damping < STUCK:
-                trial = _step(row, gradient, curvature, damping, low, high)
+                trial = box_step(row, gradient, curvature, damping, low, high)
                 found = residuals(trial)
                 number += 1
                 value = math.inf if found is None else _square(found)
@@ -175,7 +175,7 @@ def _derivatives(
     return columns
 
 
-def _step(
+def box_step(
     row: np.ndarray, gradient: np.ndarray, curvature: np.ndarray, damping: float,
     low: np.ndarray, high: np.ndarray,
 ) -> np.ndarray:  # fmt: skip

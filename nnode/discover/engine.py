@@ -42,6 +42,14 @@ class Engine(Protocol):
         """
         ...
 
+    def settle(self, system: System, row: Tensor) -> None:
+        """Fit what the residuals are whitened and weighted with to what a model leaves."""
+        ...
+
+    def noise_floor(self) -> float:
+        """Mean square error of positions that is noise of the measurement, m²."""
+        ...
+
     def positions(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n_raw)`` m: differences of positions as they are, neither whitened nor
         otherwise changed, for the costs that are reported."""

@@ -71,6 +71,7 @@ class Effect(Term):
         rank: place in the sum of terms; one that modifies the sum before it comes later.
         kin: name of the class of effects that data often cannot tell apart from it; empty: none.
         separated_by: what data would.
+        contains: names of effects that are special cases of this one.
         consecutive: the probes are neighbouring intervals of one quantity, and an effect on
             several of them is the sum of their traces. ``a`` and ``b`` are the interval's ends.
         individual: every agent has a strength of its own, with mean zero over the agents; the
@@ -83,6 +84,7 @@ class Effect(Term):
     rank: ClassVar[int] = 0
     kin: ClassVar[str] = ""
     separated_by: ClassVar[str] = ""
+    contains: ClassVar[tuple[str, ...]] = ()
     consecutive: ClassVar[bool] = False
     individual: ClassVar[bool] = False
 

@@ -64,6 +64,7 @@ class AsymmetricResponse(_SpeedAhead):
         "kappa_close": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1"),
     }
     rank = 51
+    contains = ("relative_speed",)
     kin = _KIN
     separated_by = _EXCITATION
 

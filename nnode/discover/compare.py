@@ -1,0 +1,68 @@
+"""Held-out costs of calibrated models by sequence, and tests of their differences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from nnode.discover.fit import Fit, sums
+
+
+def heldout(fit: Fit, sequence: np.ndarray) -> np.ndarray:
+    """``(S,)`` cost of each sequence under the parameters that the other sequences give.
+
+    One Gauss and Newton step from the full fit leads to the parameters without a sequence.
+    """
+    columns, number = fit.tangents, int(sequence.max()) + 1
+    if not columns.shape[1]:
+        return sums(fit.residual**2, sequence)
+    scale = np.sqrt((columns**2).sum(0))
+    columns = columns / scale
+    whole = columns.T @ columns
+    found = np.zeros(number)
+    for s in range(number):
+        own = sequence == s
+        part, residual = columns[own], fit.residual[own]
+        rest = whole - part.T @ part
+        # at the minimum the gradient of the others is minus that of this sequence
+        step = np.linalg.lstsq(rest, part.T @ residual, rcond=1e-8)[0]
+        left = residual + part @ step
+        found[s] = left @ left
+    return found
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Of two models on the same sequences.
+
+    Attributes:
+        gain: mean over the sequences of (first - second) / max(first, second).
+        low, high: its interval of 95 %.
+        p_value: that the second is not better, one-sided.
+    """
+
+    gain: float
+    low: float
+    high: float
+    p_value: float
+
+
+def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
+    """Paired by sequence; each one's difference is relative to its greater cost, so that no
+    sequence dominates.
+
+    Args:
+        first, second: ``(S,)`` held-out costs.
+    """
+    larger = np.maximum(first, second)
+    share = np.where(larger > 0, (first - second) / np.where(larger > 0, larger, 1), 0.0)
+    number = len(share)
+    mean = float(share.mean())
+    if number < 2:
+        return Comparison(mean, -np.inf, np.inf, 1.0)
+    error = float(share.std(ddof=1) / np.sqrt(number))
+    half = float(stats.t.ppf(0.975, number - 1)) * error
+    p_value = float(stats.t.sf(mean / error, number - 1)) if error > 0 else float(mean <= 0)
+    return Comparison(mean, mean - half, mean + half, p_value)

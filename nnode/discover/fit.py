@@ -1,0 +1,153 @@
+"""Calibration of a model to an engine's residuals, all its derivatives from one simulation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import stats
+
+from nnode.calibrate.least_squares import box_step
+from nnode.discover.engine import Engine, fill, row_of, trained
+from nnode.errors import SimulationError
+from nnode.models.system import System
+from nnode.models.term import Term
+
+#: Differences of parameters, relative to their size and at least so much.
+DIFFERENCE, LEAST = 1e-4, 0.1
+#: Dampings that are tried side by side, relative to the curvature.
+DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
+
+
+@dataclass
+class Fit:
+    """A calibrated model in the residuals of an engine.
+
+    Attributes:
+        system: the model, with the parameters of the fit.
+        names: of the K parameters, as in ``system.named_parameters()``.
+        row: ``(K,)`` parameters.
+        residual: ``(n,)``.
+        jacobian: ``(n, K)`` derivatives of the residuals.
+        free: ``(K,)`` False where a parameter is held at a bound.
+    """
+
+    system: System
+    names: list[str]
+    row: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    free: np.ndarray
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def tangents(self) -> np.ndarray:
+        """``(n, F)`` derivatives with respect to the parameters that are free."""
+        return self.jacobian[:, self.free]
+
+    def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:
+        """``(K, 2)`` confidence intervals that allow for any dependence within a sequence.
+
+        The covariance is the sandwich of sums over sequences, with Student's quantile; NaN for
+        parameters at a bound and where there are fewer than three sequences.
+
+        Source: Liang & Zeger 1986; Cameron & Miller 2015, Journal of Human Resources 50.
+        """
+        found = np.full((len(self.row), 2), np.nan)
+        number = len(np.unique(sequence))
+        columns = self.tangents
+        if number < 3 or not columns.shape[1]:
+            return found
+        inverse = np.linalg.pinv(columns.T @ columns)
+        scores = sums(columns * self.residual[:, None], sequence)
+        factor = number / (number - 1)
+        cov = factor * inverse @ (scores.T @ scores) @ inverse
+        half = stats.t.ppf(0.5 + level / 2, number - 1) * np.sqrt(np.maximum(np.diag(cov), 0))
+        found[self.free] = self.row[self.free, None] + half[:, None] * np.array([-1.0, 1.0])
+        return found
+
+
+def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1."""
+    found = np.zeros((int(label.max()) + 1, *values.shape[1:]))
+    np.add.at(found, label, values)
+    return found
+
+
+def limits(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """``(K,)`` lower and upper bounds of the parameters that are calibrated."""
+    known: dict[str, tuple[float, float]] = {}
+    for i, term in enumerate(system.terms):
+        assert isinstance(term, Term)
+        for name, interval in term.bounds.items():
+            known[f"terms.{i}.{name}"] = (interval.low, interval.high)
+    both = [
+        known.get(name, (-math.inf, math.inf))
+        for name, p in trained(system).items()
+        for _ in range(p.numel())
+    ]
+    return np.array([low for low, _ in both]), np.array([high for _, high in both])
+
+
+def linearise(engine: Engine, system: System, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals ``(n,)`` and their derivatives ``(n, K)`` at ``row``.
+
+    A derivative that cannot be computed, because the simulation blows up, is zero.
+
+    Raises:
+        SimulationError: the model cannot be simulated at ``row``.
+    """
+    _, high = limits(system)
+    step = DIFFERENCE * np.maximum(np.abs(row), LEAST)
+    step = np.where(row + step > high, -step, step)
+    rows = np.concatenate([row[None], row + np.diag(step)])
+    found = engine.residuals(system, torch.from_numpy(rows)).numpy()
+    if not np.isfinite(found[0]).all():
+        raise SimulationError(
+            "the model blows up on these data at its present parameters; start from others"
+        )
+    jacobian = (found[1:] - found[0]).T / step
+    jacobian[:, ~np.isfinite(jacobian).all(0)] = 0.0
+    return found[0], jacobian
+
+
+def refine(engine: Engine, system: System, *, steps: int = 12, tolerance: float = 1e-4) -> Fit:
+    """Levenberg and Marquardt's method from the system's own parameters, within their bounds.
+
+    Args:
+        steps: at most so many.
+        tolerance: ends when a step lowers the cost by less than this share.
+
+    Raises:
+        SimulationError: the start cannot be simulated.
+    """
+    low, high = limits(system)
+    row = np.clip(row_of(system).numpy(), low, high)
+    residual, jacobian = linearise(engine, system, row)
+    for _ in range(steps):
+        cost = float(residual @ residual)
+        gradient, curvature = jacobian.T @ residual, jacobian.T @ jacobian
+        trials = np.stack(
+            [box_step(row, gradient, curvature, damping, low, high) for damping in DAMPINGS]
+        )
+        found = engine.residuals(system, torch.from_numpy(trials)).numpy()
+        costs = np.where(np.isfinite(found).all(1), (found**2).sum(1), np.inf)
+        best = int(np.argmin(costs))
+        if not costs[best] < cost:
+            break
+        row = trials[best]
+        residual, jacobian = linearise(engine, system, row)
+        if cost - costs[best] < tolerance * cost:
+            break
+    gradient = jacobian.T @ residual
+    at_low, at_high = (row <= low) & (gradient > 0), (row >= high) & (gradient < 0)
+    moves = (jacobian**2).sum(0) > 0
+    fill(system, torch.from_numpy(row))
+    names = [name for name, p in trained(system).items() for _ in range(p.numel())]
+    return Fit(system, names, row, residual, jacobian, ~(at_low | at_high) & moves)

@@ -1,0 +1,253 @@
+"""Efficient scores: which effect's trace is in what the calibrated model leaves.
+
+The trace of an effect is the change of the residuals by a small strength of it. What
+recalibration of the model's own parameters can absorb is taken out of it, so that only the rest
+counts. Sums over blocks that are independent of each other may change their sign together
+without changing their distribution where nothing is hidden; the largest statistic over all
+effects is compared with its distribution under such flips.
+
+Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Westfall & Young 1993
+(maximum over hypotheses).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import stats
+
+from nnode.discover.engine import Engine, trained
+from nnode.discover.fit import Fit, sums
+from nnode.models.effects import Effect, Probe
+from nnode.models.extend import extended
+
+#: Sign flips that a p-value comes from.
+FLIPS = 1999
+
+
+@dataclass
+class Trace:
+    """What a weak effect does to the residuals.
+
+    Attributes:
+        effect: its class.
+        probes: one; or the neighbouring cells of an effect on an interval.
+        columns: ``(n, k)`` per unit of each strength of the probe, or per cell.
+    """
+
+    effect: type[Effect]
+    probes: list[Probe]
+    columns: np.ndarray
+
+
+@dataclass
+class Score:
+    """The best trace of an effect.
+
+    Attributes:
+        effect: its class.
+        options: where a calibration with this effect should start.
+        statistic: in units of a standard normal one.
+        p_value: of the maximum over all effects.
+        gain: share of the sum of squares that the trace explains beyond the model.
+        amount: strengths that explain most, less their neutral values.
+        error: standard errors of ``amount``.
+    """
+
+    effect: type[Effect]
+    options: dict[str, Any]
+    statistic: float
+    p_value: float
+    gain: float
+    amount: dict[str, float]
+    error: dict[str, float]
+
+
+def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
+    """The traces of an effect's probes in the residuals of a calibrated model."""
+    probes = effect.probes(engine.batch, fit.system)
+    found: list[Trace] = []
+    # probes that differ in numbers only are simulated side by side
+    groups: dict[str, list[Probe]] = {}
+    for probe in probes:
+        words = {k: v for k, v in probe.options.items() if not isinstance(v, float)}
+        groups.setdefault(repr(sorted(words.items())), []).append(probe)
+    for group in groups.values():
+        columns = _columns(engine, fit, effect, group)
+        if effect.consecutive:
+            found.append(Trace(effect, group, np.concatenate(columns, 1)))
+        else:
+            found += [Trace(effect, [p], c) for p, c in zip(group, columns, strict=True)]
+    return found
+
+
+def _columns(
+    engine: Engine, fit: Fit, effect: type[Effect], probes: list[Probe]
+) -> list[np.ndarray]:
+    system, place = extended(fit.system, effect(**probes[0].options))
+    own = trained(system)
+    base = dict(zip(fit.names, fit.row, strict=True))
+    rows, amounts = [], []
+    for probe in probes:
+        values = {**effect(**probe.options).options(), **probe.options}
+        for strength in probe.steps or [None]:
+            now = dict(values)
+            amount = 1.0
+            if strength is not None:
+                amount = probe.steps[strength]
+                now[strength] = effect.strengths[strength].neutral + amount
+            rows.append([_value(name, place, now, base) for name in own])
+            amounts.append(amount)
+    changed = engine.residuals(system, torch.tensor(rows, dtype=torch.float64)).numpy()
+    columns = (changed - fit.residual) / np.array(amounts)[:, None]
+    columns[~np.isfinite(columns).all(1)] = 0.0
+    sizes = [max(1, len(probe.steps)) for probe in probes]
+    return [part.T for part in np.split(columns, np.cumsum(sizes)[:-1])]
+
+
+def _value(name: str, place: int, own: dict[str, Any], base: dict[str, float]) -> float:
+    """A parameter of the extended model: the effect's own, or the one it had before."""
+    _, number, rest = name.split(".", 2)
+    if int(number) == place:
+        return float(own[rest])
+    before = int(number) - (int(number) > place)
+    return float(base[f"terms.{before}.{rest}"])
+
+
+class Screen:
+    """All traces against the residuals of one fit.
+
+    Args:
+        fit: the calibrated model.
+        block: ``(n,)`` see :class:`~nnode.discover.engine.Engine`.
+        seed: of the sign flips.
+    """
+
+    def __init__(self, fit: Fit, block: np.ndarray, seed: int = 0) -> None:
+        self.fit, self.block = fit, block
+        self.residual = fit.residual
+        self._basis = _orthonormal(fit.tangents)
+        self._flips = np.random.default_rng(seed).choice([-1.0, 1.0], (FLIPS, int(block.max()) + 1))
+        self._largest = np.zeros(FLIPS)
+
+    def beyond(self, columns: np.ndarray) -> np.ndarray:
+        """``columns`` without what the model's own parameters can do."""
+        rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
+        return rest
+
+    def scores(self, found: Iterable[Trace]) -> list[Score]:
+        """The best trace of each effect, the most significant first."""
+        best: dict[str, Score] = {}
+        for trace in found:
+            scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
+            for score in scores:
+                known = best.get(score.effect.name)
+                if known is None or score.gain > known.gain:
+                    best[score.effect.name] = score
+        for score in best.values():
+            score.p_value = self._p_value(score.statistic)
+        return sorted(best.values(), key=lambda score: -score.gain)
+
+    def _p_value(self, statistic: float) -> float:
+        return float((1 + (self._largest >= statistic - 1e-9).sum()) / (1 + FLIPS))
+
+    def _single(self, trace: Trace) -> Score:
+        z = self.beyond(trace.columns)
+        parts = sums(z * self.residual[:, None], self.block)
+        statistic = self._joint(parts)
+        amount, error, gain = self._estimate(z, parts)
+        (probe,) = trace.probes
+        options, amounts, errors = dict(probe.options), {}, {}
+        for name, value, width in zip(probe.steps, amount, error, strict=False):
+            strength = trace.effect.strengths[name]
+            options[name] = float(
+                np.clip(strength.neutral + value, strength.range.low, strength.range.high)
+            )
+            amounts[name], errors[name] = float(value), float(width)
+        return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
+
+    def _interval(self, trace: Trace) -> list[Score]:
+        """The best interval of neighbouring cells."""
+        z = self.beyond(trace.columns)
+        parts = sums(z * self.residual[:, None], self.block)
+        cells = z.shape[1]
+        first, last = np.triu_indices(cells)
+        cumulative = np.concatenate([np.zeros((len(parts), 1)), parts.cumsum(1)], 1)
+        each = cumulative[:, last + 1] - cumulative[:, first]
+        scale = np.sqrt((each**2).sum(0))
+        usable = scale > 1e-9 * scale.max()
+        each = np.where(usable, each, 0) / np.where(usable, scale, 1)
+        self._largest = np.maximum(self._largest, np.abs(self._flips @ each).max(1))
+        statistic = np.abs(each.sum(0))
+        gram = np.zeros((cells + 1, cells + 1))
+        gram[1:, 1:] = (z.T @ z).cumsum(0).cumsum(1)
+        size = (
+            gram[last + 1, last + 1]
+            - gram[first, last + 1]
+            - gram[last + 1, first]
+            + gram[first, first]
+        )
+        total = cumulative[-1:, last + 1][0] * 0 + (each.sum(0) * scale)
+        size = np.where(usable & (size > 1e-9 * max(size.max(), 1e-300)), size, np.inf)
+        gain = total**2 / size / (self.residual @ self.residual)
+        i = int(np.argmax(gain))
+        (name,) = trace.effect.strengths
+        strength = trace.effect.strengths[name]
+        amount, error = -total[i] / size[i], scale[i] / size[i]
+        options = dict(trace.probes[0].options)
+        options["a"] = trace.probes[first[i]].options["a"]
+        options["b"] = trace.probes[last[i]].options["b"]
+        options[name] = float(
+            np.clip(strength.neutral + amount, strength.range.low, strength.range.high)
+        )
+        return [
+            Score(
+                trace.effect, options, float(statistic.max()), 1.0, float(gain[i]),
+                {name: float(amount)}, {name: float(error)},
+            )
+        ]  # fmt: skip
+
+    def _joint(self, parts: np.ndarray) -> float:
+        """A statistic of the k sums ``(blocks, k)`` together, and its values under flips."""
+        spread = parts.T @ parts
+        scale = np.sqrt(np.maximum(np.diag(spread), 1e-300))
+        inverse = np.linalg.pinv(spread / np.outer(scale, scale), rcond=1e-6)
+        each = parts / scale
+        flipped = self._flips @ each
+        squares = np.einsum("fi,ij,fj->f", flipped, inverse, flipped)
+        own = float(each.sum(0) @ inverse @ each.sum(0))
+        k = parts.shape[1]
+        self._largest = np.maximum(self._largest, _normal(squares, k))
+        return float(_normal(np.array([own]), k)[0])
+
+    def _estimate(self, z: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        inverse = np.linalg.pinv(z.T @ z, rcond=1e-10)
+        total = parts.sum(0)
+        amount = -inverse @ total
+        cov = inverse @ (parts.T @ parts) @ inverse
+        gain = float(total @ inverse @ total / (self.residual @ self.residual))
+        return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the columns' span."""
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns[:, scale > 0] / scale[scale > 0]
+    if not columns.shape[1]:
+        return columns
+    vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
+    kept: np.ndarray = vectors[:, values > 1e-8 * values[0]]
+    return kept
+
+
+def _normal(squares: np.ndarray, k: int) -> np.ndarray:
+    """Sums of k squares on the scale of a standard normal variable."""
+    if k == 1:
+        return np.sqrt(np.maximum(squares, 0))
+    tail = stats.chi2.sf(np.maximum(squares, 0), k)
+    found: np.ndarray = np.sqrt(stats.chi2.isf(np.maximum(tail, 1e-300), 1))
+    return found

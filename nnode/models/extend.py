@@ -1,0 +1,38 @@
+"""A model with one more effect, or without one."""
+
+from __future__ import annotations
+
+import copy
+
+from nnode.models.effects import Effect
+from nnode.models.system import System
+
+
+def extended(system: System, effect: Effect) -> tuple[System, int]:
+    """A copy of a model with one more effect, and the effect's place among the terms.
+
+    It stands after the law, among the effects in the order of their ranks.
+    """
+    found = copy.deepcopy(system)
+    place = len(found.terms)
+    for i, term in enumerate(found.terms):
+        if isinstance(term, Effect) and term.rank > effect.rank:
+            place = i
+            break
+    found.terms.insert(place, effect)
+    return found, place
+
+
+def without(system: System, name: str) -> System:
+    """A copy of a model without the effect of a name."""
+    found = copy.deepcopy(system)
+    for i, term in enumerate(found.terms):
+        if isinstance(term, Effect) and term.name == name:
+            del found.terms[i]
+            return found
+    raise ValueError(f"the model has no effect {name}")
+
+
+def effects_of(system: System) -> list[Effect]:
+    """The effects of a model, in their order."""
+    return [term for term in system.terms if isinstance(term, Effect)]
