@@ -112,9 +112,9 @@ class Ensemble:
         """Time derivative of the states ``(R, B, N, ...)`` at time ``t`` (s)."""
         return self._rate(self._parameters, t, y)
 
-    def runge_kutta(self, t: Tensor, y: Tensor, h: float) -> Tensor:
-        """The states after a step of ``h`` s by the classical method of fourth order."""
-        k1 = self.rate(t, y)
+    def runge_kutta(self, t: Tensor, y: Tensor, h: float, k1: Tensor) -> Tensor:
+        """The states after a step of ``h`` s by the classical method of fourth order, from
+        those and their rates ``k1`` before."""
         k2 = self.rate(t + h / 2, y + h / 2 * k1)
         k3 = self.rate(t + h / 2, y + h / 2 * k2)
         k4 = self.rate(t + h, y + h * k3)

@@ -95,56 +95,77 @@ def limits(system: System) -> tuple[np.ndarray, np.ndarray]:
     return np.array([low for low, _ in both]), np.array([high for _, high in both])
 
 
-def linearise(engine: Engine, system: System, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals ``(n,)`` and their derivatives ``(n, K)`` at ``row``.
+class _Linear:
+    """Residuals and their derivatives; derivatives come with the first of several trials."""
 
-    A derivative that cannot be computed, because the simulation blows up, is zero.
+    def __init__(self, engine: Engine, system: System) -> None:
+        self.engine, self.system = engine, system
+        self.low, self.high = limits(system)
 
-    Raises:
-        SimulationError: the model cannot be simulated at ``row``.
-    """
-    _, high = limits(system)
-    step = DIFFERENCE * np.maximum(np.abs(row), LEAST)
-    step = np.where(row + step > high, -step, step)
-    rows = np.concatenate([row[None], row + np.diag(step)])
-    found = engine.residuals(system, torch.from_numpy(rows)).numpy()
-    if not np.isfinite(found[0]).all():
-        raise SimulationError(
-            "the model blows up on these data at its present parameters; start from others"
-        )
-    jacobian = (found[1:] - found[0]).T / step
-    jacobian[:, ~np.isfinite(jacobian).all(0)] = 0.0
-    return found[0], jacobian
+    def at(self, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals ``(T, n)`` of all trials ``(T, K)``, derivatives ``(n, K)`` at the first.
+
+        A derivative that cannot be computed, because the simulation blows up, is zero.
+        """
+        row = trials[0]
+        step = DIFFERENCE * np.maximum(np.abs(row), LEAST)
+        step = np.where(row + step > self.high, -step, step)
+        rows = np.concatenate([trials, row + np.diag(step)])
+        found = self.engine.residuals(self.system, torch.from_numpy(rows)).numpy()
+        jacobian = (found[len(trials) :] - found[0]).T / step
+        jacobian[:, ~np.isfinite(jacobian).all(0)] = 0.0
+        return found[: len(trials)], jacobian
 
 
-def refine(engine: Engine, system: System, *, steps: int = 12, tolerance: float = 1e-4) -> Fit:
+def refine(
+    engine: Engine,
+    system: System,
+    *,
+    steps: int = 15,
+    tolerance: float = 1e-4,
+    hopeless: float = 0.0,
+) -> Fit:
     """Levenberg and Marquardt's method from the system's own parameters, within their bounds.
 
     Args:
-        steps: at most so many.
+        steps: simulations of all trials and derivatives at most.
         tolerance: ends when a step lowers the cost by less than this share.
+        hopeless: ends as soon as the cost has nearly stopped to fall (by less than a tenth of
+            what is missing) and is still above this one.
 
     Raises:
         SimulationError: the start cannot be simulated.
     """
-    low, high = limits(system)
+    linear = _Linear(engine, system)
+    low, high = linear.low, linear.high
     row = np.clip(row_of(system).numpy(), low, high)
-    residual, jacobian = linearise(engine, system, row)
+    found, jacobian = linear.at(row[None])
+    residual = found[0]
+    if not np.isfinite(residual).all():
+        raise SimulationError(
+            "the model blows up on these data at its present parameters; start from others"
+        )
+    first = 0
     for _ in range(steps):
         cost = float(residual @ residual)
         gradient, curvature = jacobian.T @ residual, jacobian.T @ jacobian
-        trials = np.stack(
-            [box_step(row, gradient, curvature, damping, low, high) for damping in DAMPINGS]
-        )
-        found = engine.residuals(system, torch.from_numpy(trials)).numpy()
+        dampings = DAMPINGS[first:] + DAMPINGS[:first]
+        trials = np.stack([box_step(row, gradient, curvature, d, low, high) for d in dampings])
+        found, ahead = linear.at(trials)
         costs = np.where(np.isfinite(found).all(1), (found**2).sum(1), np.inf)
         best = int(np.argmin(costs))
         if not costs[best] < cost:
             break
-        row = trials[best]
-        residual, jacobian = linearise(engine, system, row)
-        if cost - costs[best] < tolerance * cost:
+        gained = cost - costs[best]
+        row, residual = trials[best], found[best]
+        # the trial that was best is tried first, with its derivatives, from now on
+        first = (first + best) % len(DAMPINGS)
+        small = gained < tolerance * cost
+        if small or (costs[best] > hopeless > 0 and gained < 0.1 * (costs[best] - hopeless)):
+            if best == 0:
+                jacobian = ahead
             break
+        jacobian = ahead if best == 0 else linear.at(row[None])[1]
     gradient = jacobian.T @ residual
     at_low, at_high = (row <= low) & (gradient > 0), (row >= high) & (gradient < 0)
     moves = (jacobian**2).sum(0) > 0

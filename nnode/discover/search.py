@@ -155,11 +155,12 @@ def _round(engine: Engine, found: Search, all_traces: list[Trace], alpha: float)
     most = max(score.gain for score in scores)
     tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
     before = heldout(found.fit, engine.sequence)
-    candidates = []
+    candidates: list[Candidate] = []
     for score in tried:
         system, _ = extended(found.fit.system, score.effect(**score.options))
+        least = min((c.fit.cost for c in candidates), default=0.0)
         try:
-            fit = refine(engine, system)
+            fit = refine(engine, system, hopeless=least)
         except SimulationError:
             continue
         losses = heldout(fit, engine.sequence)

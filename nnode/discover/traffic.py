@@ -7,16 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.engine import Ensemble
+from nnode.discover.engine import Ensemble, trained
 from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.whiten import PlatoonFilter
 from nnode.models.system import System
+from nnode.models.term import Term
 
-#: Longest step of the simulation, s; and where terms own states that may be fast.
-STEP, FAST_STEP = 0.25, 0.1
+#: Longest step of the simulation, s; and relative to the shortest time constant of the states
+#: that terms own, for which Runge and Kutta's method is stable.
+STEP, STABLE = 0.4, 0.7
 #: Parts of a sequence of this length, s, count as independent.
 BLOCK = 10.0
 #: Most past samples that a filter looks at.
@@ -62,16 +64,23 @@ class TrafficEngine:
         """``(R, K, B, N)`` positions, m."""
         batch = self.smoothed
         runs = Ensemble(system, rows, system.scene(batch))
-        longest = FAST_STEP if any(term.memory for term in system.terms) else STEP
+        longest = min(STEP, STABLE * fastest(system, rows))
+        # several samples in a step, or several steps in a sample
+        stride = max(1, math.floor(longest / batch.dt + 1e-9))
         steps = max(1, math.ceil(batch.dt / longest - 1e-9))
-        h = batch.dt / steps
+        h = batch.dt * stride / steps
         y = runs.start(batch)
-        found = [y[..., 0]]
-        for k in range(batch.n_samples - 1):
-            for part in range(steps):
-                y = runs.runge_kutta(torch.tensor(k * batch.dt + part * h).double(), y, h)
-            found.append(y[..., 0])
-        return torch.stack(found, 1)
+        rate, found = runs.rate(_time(0.0), y), [y[..., 0]]
+        number = math.ceil((batch.n_samples - 1) / stride) * steps
+        for step in range(number):
+            t = step * h
+            after = runs.runge_kutta(_time(t), y, h, rate)
+            slope = runs.rate(_time(t + h), after)
+            found += _between(y, rate, after, slope, h, stride)
+            if (step + 1) % steps == 0:
+                found.append(after[..., 0])
+            y, rate = after, slope
+        return torch.stack(found[: batch.n_samples], 1)
 
     def deviations(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N)`` measured minus simulated positions, m; 0 where nothing is compared."""
@@ -93,6 +102,36 @@ class TrafficEngine:
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
+
+
+def fastest(system: System, rows: Tensor) -> float:
+    """The shortest time constant of the states that terms own, s; infinite where none do."""
+    names = [name for name, p in trained(system).items() for _ in range(p.numel())]
+    wanted = {f"terms.{i}.{name}" for i, term in enumerate(system.terms) for name in _fast(term)}
+    found = [float(rows[:, j].min()) for j, name in enumerate(names) if name in wanted]
+    return min(found, default=math.inf)
+
+
+def _fast(term: nn.Module) -> tuple[str, ...]:
+    assert isinstance(term, Term)
+    return term.fast
+
+
+def _time(t: float) -> Tensor:
+    return torch.tensor(t, dtype=torch.float64)
+
+
+def _between(
+    before: Tensor, start: Tensor, after: Tensor, end: Tensor, h: float, stride: int
+) -> list[Tensor]:
+    """Positions at the samples within a step of ``h`` s, by Hermite's cubic interpolation."""
+    x0, v0, x1, v1 = (part[..., 0] for part in (before, start, after, end))
+    found = []
+    for part in range(1, stride):
+        s = part / stride
+        away = h * (s * (1 - s) ** 2 * v0 - s**2 * (1 - s) * v1)
+        found.append((1 + 2 * s) * (1 - s) ** 2 * x0 + s**2 * (3 - 2 * s) * x1 + away)
+    return found
 
 
 def _smoothed(sequence: Sequence) -> Sequence:

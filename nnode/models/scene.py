@@ -24,6 +24,7 @@ class Scene:
         destination: ``(B, N, D)`` m.
         length: ``(B, N)`` m, NaN where unknown.
         measured: ``(K, B, N, D)`` measured positions, m.
+        measured_rate: ``(K, B, N, D)`` measured velocities, m/s.
         dt: sampling interval of ``measured``, s.
         wall: ``(B, P, 2)`` wall points, m.
         wall_normal: ``(B, P, 2)`` unit normals into the walkable side.
@@ -41,6 +42,7 @@ class Scene:
     destination: Tensor
     length: Tensor
     measured: Tensor
+    measured_rate: Tensor
     dt: float
     wall: Tensor
     wall_normal: Tensor
@@ -67,6 +69,7 @@ class Scene:
             destination=batch.destination,
             length=batch.length,
             measured=batch.x,
+            measured_rate=batch.v,
             dt=batch.dt,
             wall=wall,
             wall_normal=normal,
@@ -80,21 +83,19 @@ class Scene:
 
     def measured_at(self, t: Tensor) -> Tensor:
         """``(B, N, D)`` measured positions at time ``t`` (s), linear between samples."""
-        position, before, after = self._around(t)
-        return torch.lerp(before, after, position.clamp(0, 1).to(before.dtype))
+        return self._between(self.measured, t)
 
     def measured_rate_at(self, t: Tensor) -> Tensor:
-        """``(B, N, D)`` velocity of the measured positions at time ``t`` (s), m/s: constant
-        between samples."""
-        _, before, after = self._around(t)
-        return (after - before) / self.dt
+        """``(B, N, D)`` measured velocities at time ``t`` (s), m/s, linear between samples."""
+        return self._between(self.measured_rate, t)
 
-    def _around(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The samples before and after ``t``, and how far ``t`` is between them."""
+    def _between(self, samples: Tensor, t: Tensor) -> Tensor:
         position = t / self.dt
         # a hair of tolerance keeps whole sample numbers whole in any precision
-        k = torch.floor(position + 1e-4).long().clamp(0, self.measured.shape[0] - 2)
-        return position - k, self.measured[k], self.measured[k + 1]
+        k = torch.floor(position + 1e-4).long().clamp(0, samples.shape[0] - 2)
+        # an index that stays a tensor lets the equations be recorded and run in batches
+        before, after = samples.index_select(0, torch.stack([k, k + 1]))
+        return torch.lerp(before, after, (position - k).clamp(0, 1).to(before.dtype))
 
     @cached_property
     def kinds(self) -> dict[str, Tensor]:

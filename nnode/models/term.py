@@ -74,12 +74,14 @@ class Term(nn.Module):
         formula: the formula, in the symbols of the parameters.
         source: where the formula stands.
         memory: number M of additional states of each agent that the term owns.
+        fast: names of parameters that are time constants of these states, s.
     """
 
     name: ClassVar[str]
     formula: ClassVar[str]
     source: ClassVar[str]
     memory: ClassVar[int] = 0
+    fast: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self) -> None:
         super().__init__()

@@ -90,6 +90,7 @@ class ReactionDelay(Effect):
     strengths = {"T": Strength(0.0, 0.3, Interval(0.15, 3.0), "s")}
     rank = 35
     memory = 2
+    fast = ("T",)
     kin = _KIN
     separated_by = _EXCITATION
 
@@ -129,6 +130,7 @@ class Inertia(Effect):
     strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.15, 10.0), "s")}
     rank = 60
     memory = 1
+    fast = ("tau_v",)
     kin = _KIN
     separated_by = _EXCITATION
 
