@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from nnode.data.sequence import Batch
+from nnode.models.effects import Effect
 from nnode.models.scene import Scene
 from nnode.models.system import System
 
@@ -27,11 +28,18 @@ class Engine(Protocol):
         sequence: ``(n,)`` position of each residual's sequence in the batch.
         block: ``(n,)`` number of each residual's block: a part of a sequence that is taken as
             independent of the others.
+        unit: ``(n,)`` number of the agents whose own numbers are estimated together.
+        people: of each unit, per direction the sequence and the place of the agent it belongs
+            to; one entry where all directions belong to one agent.
+        half: ``(n,)`` 0 or 1: the two halves of an agent's time.
     """
 
     batch: Batch
     sequence: np.ndarray
     block: np.ndarray
+    unit: np.ndarray
+    people: list[list[tuple[int, int]]]
+    half: np.ndarray
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` residuals of R runs of one model; NaN where a run blows up.
@@ -40,6 +48,12 @@ class Engine(Protocol):
             system: the model.
             rows: ``(R, K)`` its parameters that are calibrated, see :func:`row_of`.
         """
+        ...
+
+    def individual(
+        self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to M numbers of every unit."""
         ...
 
     def settle(self, system: System, row: Tensor) -> None:

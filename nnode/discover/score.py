@@ -22,6 +22,7 @@ from scipy import stats
 
 from nnode.discover.engine import Engine, trained
 from nnode.discover.fit import Fit, sums
+from nnode.discover.individual import Individuals
 from nnode.models.effects import Effect, Probe
 from nnode.models.extend import extended
 
@@ -139,9 +140,9 @@ class Screen:
         rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
         return rest
 
-    def scores(self, found: Iterable[Trace]) -> list[Score]:
-        """The best trace of each effect, the most significant first."""
-        best: dict[str, Score] = {}
+    def scores(self, found: Iterable[Trace], individual: Iterable[Individuals] = ()) -> list[Score]:
+        """The best trace of each effect, the one that explains most first."""
+        best = {one.effect.name: self._individual(one) for one in individual}
         for trace in found:
             scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
             for score in scores:
@@ -170,6 +171,22 @@ class Screen:
             amounts[name], errors[name] = float(value), float(width)
         return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
 
+    def _individual(self, found: Individuals) -> Score:
+        """Only products of halves that agree speak for an effect."""
+        products = found.products
+        scale = float(np.sqrt((products**2).sum()))
+        each = products / scale if scale > 0 else products
+        rng = np.random.default_rng(len(products))
+        flipped = rng.choice([-1.0, 1.0], (FLIPS, len(each))) @ each
+        self._largest = np.maximum(self._largest, flipped)
+        (name,) = found.effect.strengths
+        options = {**found.options, name: found.sigma, "people": found.people}
+        error = (found.interval[1] - found.interval[0]) / 4
+        return Score(
+            found.effect, options, float(each.sum()), 1.0, found.gain,
+            {name: found.sigma}, {name: error},
+        )  # fmt: skip
+
     def _interval(self, trace: Trace) -> list[Score]:
         """The best interval of neighbouring cells."""
         z = self.beyond(trace.columns)
@@ -191,7 +208,7 @@ class Screen:
             - gram[last + 1, first]
             + gram[first, first]
         )
-        total = cumulative[-1:, last + 1][0] * 0 + (each.sum(0) * scale)
+        total = each.sum(0) * scale
         size = np.where(usable & (size > 1e-9 * max(size.max(), 1e-300)), size, np.inf)
         gain = total**2 / size / (self.residual @ self.residual)
         i = int(np.argmax(gain))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from dataclasses import dataclass, field
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.engine import Engine, row_of
-from nnode.discover.fit import Fit, refine
+from nnode.discover.fit import Fit, refine, sums
+from nnode.discover.individual import Individuals, individuals
 from nnode.discover.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
-from nnode.models.effects import Effect
+from nnode.models.effects import Effect, IndividualEffect
 from nnode.models.extend import effects_of, extended, without
 from nnode.models.system import System
 
@@ -26,6 +28,10 @@ RIVAL = 0.25
 RIVALS = 5
 #: A rival whose held-out gain is below this share of the best one's is told apart from it.
 CLOSE = 0.9
+#: Calibrations of rivals end where a step lowers the cost by less than this share.
+ROUGH = 1e-3
+#: An interval is moved at most so many times.
+SHIFTS = 3
 #: Two rivals are told apart at this error probability.
 APART = 0.05
 
@@ -39,12 +45,14 @@ class Candidate:
         fit: of the extended model.
         losses: ``(S,)`` held-out cost of each sequence.
         gain: over the model without it.
+        individuals: of an individual effect.
     """
 
     score: Score
     fit: Fit
     losses: np.ndarray
     gain: Comparison
+    individuals: Individuals | None = None
 
     @property
     def name(self) -> str:
@@ -53,6 +61,8 @@ class Candidate:
 
     def strength_excludes_neutral(self, sequence: np.ndarray) -> bool:
         """Whether the interval of any of its strengths excludes the neutral value."""
+        if self.individuals is not None:
+            return self.individuals.interval[0] > 0
         intervals = self.fit.intervals(sequence)
         place = next(
             i for i, t in enumerate(self.fit.system.terms) if getattr(t, "name", "") == self.name
@@ -61,8 +71,6 @@ class Candidate:
         if not strengths:
             return True
         for name, strength in strengths.items():
-            if f"terms.{place}.{name}" not in self.fit.names:
-                return True
             low, high = intervals[self.fit.names.index(f"terms.{place}.{name}")]
             if low > strength.neutral or high < strength.neutral:
                 return True
@@ -133,13 +141,14 @@ def search(
     """
     found = Search(fit)
     while True:
-        left = [e for e in effects if e.name not in {t.name for t in effects_of(found.fit.system)}]
-        screening = Screen(found.fit, engine.block, seed + len(found.steps))
-        all_traces = [trace for effect in left for trace in traces(engine, found.fit, effect)]
-        found.screen, found.scores = screening, screening.scores(all_traces)
+        own = {effect.name for effect in effects_of(found.fit.system)}
+        left = [effect for effect in effects if effect.name not in own]
+        look = _look(engine, found.fit, left)
+        found.screen = Screen(found.fit, engine.block, seed + len(found.steps))
+        found.scores = found.screen.scores(look.traces, look.individuals)
         if len(found.steps) >= most:
             break
-        step = _round(engine, found, all_traces, alpha)
+        step = _round(engine, found, look, alpha)
         if step is None:
             break
         found.steps.append(step)
@@ -148,7 +157,28 @@ def search(
     return _pruned(engine, found)
 
 
-def _round(engine: Engine, found: Search, all_traces: list[Trace], alpha: float) -> Step | None:
+@dataclass
+class _Look:
+    """The traces of all effects that are left."""
+
+    traces: list[Trace]
+    individuals: list[Individuals]
+
+    def of(self, name: str) -> Individuals | None:
+        return next((one for one in self.individuals if one.effect.name == name), None)
+
+
+def _look(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> _Look:
+    found = _Look([], [])
+    for effect in effects:
+        if not issubclass(effect, IndividualEffect):
+            found.traces += traces(engine, fit, effect)
+        elif (one := individuals(engine, fit, effect)) is not None:
+            found.individuals.append(one)
+    return found
+
+
+def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | None:
     scores = found.scores
     if not scores or min(score.p_value for score in scores) > alpha:
         return None
@@ -157,14 +187,17 @@ def _round(engine: Engine, found: Search, all_traces: list[Trace], alpha: float)
     before = heldout(found.fit, engine.sequence)
     candidates: list[Candidate] = []
     for score in tried:
-        system, _ = extended(found.fit.system, score.effect(**score.options))
         least = min((c.fit.cost for c in candidates), default=0.0)
+        one = look.of(score.effect.name)
         try:
-            fit = refine(engine, system, hopeless=least)
+            fit = _calibrated(engine, found.fit, score, least)
         except SimulationError:
             continue
         losses = heldout(fit, engine.sequence)
-        candidates.append(Candidate(score, fit, losses, compare(before, losses)))
+        if one is not None:
+            # numbers from one half of the time, tried on the other
+            losses = before * one.losses / sums(found.fit.residual**2, engine.sequence)
+        candidates.append(Candidate(score, fit, losses, compare(before, losses), one))
     candidates.sort(key=lambda c: -c.gain.gain)
     passing = [
         c for c in candidates
@@ -185,6 +218,49 @@ def _round(engine: Engine, found: Search, all_traces: list[Trace], alpha: float)
         if test.p_value > APART and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals, scores)
+
+
+def _calibrated(engine: Engine, before: Fit, score: Score, hopeless: float) -> Fit:
+    """The model with one more effect."""
+    system, place = extended(before.system, score.effect(**score.options))
+    fit = refine(engine, system, tolerance=ROUGH, hopeless=hopeless)
+    if not score.effect.consecutive:
+        return fit
+    # a strong effect bends the paths, so that the interval that a weak one would have is off
+    for _ in range(SHIFTS):
+        shifted = _shifted(engine, fit, score.effect, place)
+        if shifted is None:
+            break
+        fit = shifted
+    return fit
+
+
+def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit | None:
+    """The fit with another interval, where the same effect once more would explain something."""
+    own = fit.system.terms[place]
+    assert isinstance(own, effect)
+    now = own.options()
+    (score,) = Screen(fit, engine.block).scores(traces(engine, fit, effect))
+    if score.gain < ROUGH:
+        return None
+    low, high = score.options["a"], score.options["b"]
+    trials = [
+        {**now, "a": min(now["a"], low), "b": max(now["b"], high)},
+        {**now, "a": max(low, now["a"]), "b": min(high, now["b"])},
+    ]
+    best = None
+    for values in trials:
+        if values["b"] <= values["a"]:
+            continue
+        system = copy.deepcopy(fit.system)
+        system.terms[place] = effect(**values)
+        try:
+            found = refine(engine, system, tolerance=ROUGH, hopeless=fit.cost)
+        except SimulationError:
+            continue
+        if found.cost < (1 - ROUGH) * (fit if best is None else best).cost:
+            best = found
+    return best
 
 
 def _simplest(candidates: list[Candidate]) -> Candidate:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -13,14 +14,20 @@ from nnode.data.sequence import Sequence, collate
 from nnode.discover.engine import Ensemble, trained
 from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.whiten import PlatoonFilter
+from nnode.models.effects import Effect, Strength
+from nnode.models.extend import extended
 from nnode.models.system import System
-from nnode.models.term import Term
+from nnode.models.term import State, Term
 
 #: Longest step of the simulation, s; and relative to the shortest time constant of the states
 #: that terms own, for which Runge and Kutta's method is stable.
 STEP, STABLE = 0.4, 0.7
+#: Change of a vehicle's pace by which its derivative is computed.
+_PACE = 1e-3
 #: Parts of a sequence of this length, s, count as independent.
 BLOCK = 10.0
+#: Whitened residuals beyond this count less.
+LARGE = 6.0
 #: Most past samples that a filter looks at.
 ORDER = 4
 
@@ -33,6 +40,11 @@ class TrafficEngine:
 
     Args:
         sequences: at least one, of the same sampling interval.
+
+    Attributes:
+        unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
+        people: of each unit, per direction the sequence and the place of its agent.
+        half: ``(n,)`` 0 or 1: the two halves of a sequence's time.
     """
 
     def __init__(self, sequences: list[Sequence]) -> None:
@@ -53,6 +65,12 @@ class TrafficEngine:
         last = np.array([max(1, round(s.dt * (s.n_samples - 1) / BLOCK)) - 1 for s in sequences])
         part = np.minimum(part, last[b])
         self.block = np.unique(b * 10_000 + part, return_inverse=True)[1]
+        middle = np.array([s.n_samples / 2 for s in sequences])
+        self.half = (k >= middle[b]).astype(int)
+        self.unit = b
+        self.people = [
+            [(i, n) for n in range(self.batch.agent.shape[1])] for i in range(len(sequences))
+        ]
 
     def noise_floor(self) -> float:
         """Mean square error of positions that is noise of the measurement, m²."""
@@ -89,12 +107,32 @@ class TrafficEngine:
         return torch.where(self.seen, away, 0.0)
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` whitened residuals."""
-        return self.filter(self.deviations(system, rows))[:, self.seen]
+        """``(R, n)`` whitened residuals, the largest drawn in."""
+        return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen])
 
     def positions(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` measured minus simulated positions, m."""
         return self.deviations(system, rows)[:, self.seen]
+
+    def individual(
+        self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
+    ) -> Tensor:
+        """``(N, n)``: derivatives of the residuals with respect to the pace of the vehicle at
+        each place of the platoon, in all sequences at once."""
+        places = self.batch.agent.shape[1]
+        pace, _ = extended(system, _Pace(places))
+        own = trained(pace)
+        base = torch.zeros(1 + places, sum(p.numel() for p in own.values()), dtype=torch.float64)
+        column, before = 0, 0
+        for name, p in own.items():
+            if name.endswith(".pace"):
+                base[1:, column : column + places] = _PACE * torch.eye(places, dtype=torch.float64)
+            else:
+                base[:, column] = row[before]
+                before += 1
+            column += p.numel()
+        found = self.residuals(pace, base)
+        return (found[1:] - found[0]) / _PACE
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""
@@ -102,6 +140,35 @@ class TrafficEngine:
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
+
+
+class _Pace(Effect):
+    """The vehicle at each place of the platoon drives slower or faster by a share of its own."""
+
+    name = "pace"
+    domain = "traffic"
+    strengths: ClassVar[dict[str, Strength]] = {}
+    rank = 13
+
+    def __init__(self, places: int) -> None:
+        super().__init__()
+        self.pace = nn.Parameter(torch.zeros(places, dtype=torch.float64))
+
+    def forward(self, state: State) -> Tensor:
+        assert state.rate is not None
+        change = torch.where(state.scene.follower, self.pace, 0.0)
+        return change[..., None] * state.rate
+
+
+def drawn_in(residual: Tensor) -> Tensor:
+    """Residuals whose squares are Huber's loss: a vehicle that breaks down does not outweigh
+    all others.
+
+    Source: Huber 1964.
+    """
+    size = residual.abs()
+    large = torch.sqrt((2 * LARGE * size - LARGE**2).clamp(min=0)).copysign(residual)
+    return torch.where(size <= LARGE, residual, large)
 
 
 def fastest(system: System, rows: Tensor) -> float:

@@ -5,7 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from nnode.data.sequence import Batch, Domain
+from nnode.models.scene import Scene
 from nnode.models.system import System
 from nnode.models.term import Interval, Term
 
@@ -116,7 +121,43 @@ class Effect(Term):
 
     def options(self) -> dict[str, Any]:
         """What builds this effect again, in plain numbers."""
-        return {name: float(getattr(self, name)) for name in (*self.strengths, *self.settings)}
+        return {
+            name: float(getattr(self, name).detach()) for name in (*self.strengths, *self.settings)
+        }
+
+
+class IndividualEffect(Effect):
+    """An effect with a number for every agent that is estimated beside the parameters.
+
+    Args:
+        people: sequence name to the numbers of its agents; without them there is no effect.
+        values: the parameters.
+    """
+
+    individual = True
+
+    def __init__(self, people: dict[str, list[float]] | None = None, **values: float) -> None:
+        super().__init__(**values)
+        self.people = {str(k): [float(own) for own in v] for k, v in (people or {}).items()}
+
+    def options(self) -> dict[str, Any]:
+        return {**super().options(), "people": self.people}
+
+    @classmethod
+    def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
+        """An agent's number, from the amounts of the directions that were fitted to him."""
+        return float(numbers[0])
+
+    def known(self, scene: Scene, like: Tensor) -> tuple[Tensor, Tensor]:
+        """``(B, N)`` the agents' numbers (0 where unknown), and 1 where they are known."""
+        number = torch.zeros(scene.agent.shape, dtype=like.dtype)
+        there = torch.zeros_like(number)
+        for b, name in enumerate(scene.names):
+            own = self.people.get(name)
+            if own is not None:
+                number[b, : len(own)] = torch.tensor(own, dtype=like.dtype)
+                there[b, : len(own)] = 1.0
+        return number.to(like.device), there.to(like.device)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
-from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
+from nnode.models.effects.base import (
+    CATALOGUE,
+    Effect,
+    IndividualEffect,
+    Probe,
+    Setting,
+    Strength,
+)
 from nnode.models.system import System, Traffic
 from nnode.models.term import Interval, State
 from nnode.models.traffic import FollowTheLeader, LighthillWhithamRichards
@@ -264,12 +271,9 @@ class LeaderSpeed(Effect):
 
 
 @CATALOGUE.add
-class DriverHeterogeneity(Effect):
-    """Every driver has a pace of his own, with mean zero over the drivers.
-
-    Args:
-        drivers: sequence name to one deviation eta per vehicle; others drive as the law says.
-    """
+class DriverHeterogeneity(IndividualEffect):
+    """Every driver has a pace of his own, with mean zero over the drivers; ``people`` holds
+    their eta_i."""
 
     sigma: Tensor
     name = "driver_heterogeneity"
@@ -278,26 +282,16 @@ class DriverHeterogeneity(Effect):
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 1.0), "1")}
     rank = 13
-    individual = True
     kin = "who"
     separated_by = "the same drivers for a longer time"
 
-    def __init__(self, drivers: dict[str, list[float]] | None = None, **values: float) -> None:
-        super().__init__(**values)
-        self.drivers = {str(k): [float(eta) for eta in v] for k, v in (drivers or {}).items()}
+    def __init__(self, people: dict[str, list[float]] | None = None, **values: float) -> None:
+        super().__init__(people, **values)
         self.idle("sigma")  # it describes the drivers and is not in the equation
 
     def forward(self, state: State) -> Tensor:
-        rate = rate_of(state)
-        eta = torch.zeros_like(rate)
-        for b, name in enumerate(state.scene.names):
-            own = self.drivers.get(name)
-            if own is not None:
-                eta[b, : len(own)] = torch.tensor(own, dtype=rate.dtype, device=rate.device)
-        return for_followers(state, eta * rate)
-
-    def options(self) -> dict[str, Any]:
-        return {**super().options(), "drivers": self.drivers}
+        eta, _ = self.known(state.scene, state.x)
+        return for_followers(state, eta * rate_of(state))
 
 
 @CATALOGUE.add

@@ -1,0 +1,152 @@
+"""Effects that differ from agent to agent: a variance, and one number for everybody.
+
+Each agent's number is fitted to one half of his time and tried on the other. Where agents do
+not differ the two halves have nothing to do with each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from nnode.discover.engine import Engine
+from nnode.discover.fit import Fit, sums
+from nnode.models.effects import IndividualEffect
+
+#: Standard deviations, relative to the one that the halves have in common, that are tried.
+SPREADS = (0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0)
+
+
+@dataclass
+class Individuals:
+    """An individual effect in the residuals of a calibrated model.
+
+    Attributes:
+        effect: its class.
+        options: its settings.
+        products: ``(S,)`` per sequence the product of the scores of the two halves.
+        sigma: standard deviation of the agents' numbers.
+        interval: of 95 %, by leaving out each sequence in turn.
+        gain: share of the residuals' sum of squares that numbers from the one half remove in
+            the other.
+        losses: ``(S,)`` sum of squares that is left so.
+        people: sequence name to its agents' numbers, from all their time.
+    """
+
+    effect: type[IndividualEffect]
+    options: dict[str, Any]
+    products: np.ndarray
+    sigma: float
+    interval: tuple[float, float]
+    gain: float
+    losses: np.ndarray
+    people: dict[str, list[float]]
+
+
+def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Individuals | None:
+    """The best setting of an individual effect; None where it cannot act on these data."""
+    found = [
+        _at(engine, fit, effect, probe.options) for probe in effect.probes(engine.batch, fit.system)
+    ]
+    return max(found, key=lambda one: one.gain, default=None)
+
+
+def _at(
+    engine: Engine,
+    fit: Fit,
+    effect: type[IndividualEffect],
+    options: dict[str, Any],
+) -> Individuals:
+    row = torch.from_numpy(fit.row)
+    z = engine.individual(fit.system, row, effect, options).numpy().T
+    gram, score = _halves(z, fit.residual, engine)
+    sequence_of = np.array([people[0][0] for people in engine.people])
+    each = np.einsum("um,um->u", score[0], score[1])
+    scale = np.einsum("umn,unm->u", gram[0], gram[1])
+    count = int(engine.sequence.max()) + 1
+    products = np.bincount(sequence_of, each, count)
+    scales = np.bincount(sequence_of, scale, count)
+    variance = products.sum() / max(scales.sum(), 1e-300)
+    # by leaving out one sequence at a time
+    others = (products.sum() - products) / np.maximum(scales.sum() - scales, 1e-300)
+    error = float(np.sqrt((count - 1) / count * ((others - others.mean()) ** 2).sum()))
+    sigma = float(np.sqrt(max(variance, 0.0)))
+    low, high = (float(np.sqrt(max(variance + s * 2.1 * error, 0.0))) for s in (-1, 1))
+    losses, best = _crossed(z, fit.residual, gram, score, engine, max(sigma, 1e-6))
+    full = _amounts(gram[0] + gram[1], score[0] + score[1], best)
+    return Individuals(
+        effect=effect,
+        options=options,
+        products=products,
+        sigma=sigma,
+        interval=(low, high),
+        gain=1 - float(losses.sum()) / fit.cost,
+        losses=losses,
+        people=_people(engine, effect, options, full),
+    )
+
+
+def _halves(
+    z: np.ndarray, residual: np.ndarray, engine: Engine
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Gram matrices ``(U, M, M)`` and scores ``(U, M)`` of both halves."""
+    gram, score = [], []
+    units = int(engine.unit.max()) + 1
+    for half in (0, 1):
+        own = engine.half == half
+        part, label = z[own], engine.unit[own]
+        matrix = np.zeros((units, z.shape[1], z.shape[1]))
+        np.add.at(matrix, label, part[:, :, None] * part[:, None, :])
+        vector = np.zeros((units, z.shape[1]))
+        np.add.at(vector, label, -part * residual[own][:, None])
+        gram.append(matrix)
+        score.append(vector)
+    return gram, score
+
+
+def _amounts(gram: np.ndarray, score: np.ndarray, sigma: float) -> np.ndarray:
+    """``(U, M)`` amounts, drawn to zero as their standard deviation says."""
+    ridge = np.eye(gram.shape[1]) / sigma**2
+    found: np.ndarray = np.linalg.solve(gram + ridge, score[..., None])[..., 0]
+    return found
+
+
+def _crossed(
+    z: np.ndarray,
+    residual: np.ndarray,
+    gram: list[np.ndarray],
+    score: list[np.ndarray],
+    engine: Engine,
+    sigma: float,
+) -> tuple[np.ndarray, float]:
+    """``(S,)`` sums of squares of each half under the other's amounts, and the best sigma."""
+    best, chosen = None, sigma
+    for spread in SPREADS:
+        left = residual.copy()
+        for half in (0, 1):
+            amounts = _amounts(gram[1 - half], score[1 - half], spread * sigma)
+            own = engine.half == half
+            left[own] += np.einsum("nm,nm->n", z[own], amounts[engine.unit[own]])
+        losses = sums(left**2, engine.sequence)
+        if best is None or losses.sum() < best.sum():
+            best, chosen = losses, spread * sigma
+    assert best is not None
+    return best, chosen
+
+
+def _people(
+    engine: Engine, effect: type[IndividualEffect], options: dict[str, Any], amounts: np.ndarray
+) -> dict[str, list[float]]:
+    names, sizes = engine.batch.names, engine.batch.agent.shape[1]
+    found = {name: [0.0] * sizes for name in names}
+    for people, own in zip(engine.people, amounts, strict=True):
+        if len(people) == 1:
+            (b, n) = people[0]
+            found[names[b]][n] = effect.person(own, options)
+        else:
+            for (b, n), number in zip(people, own, strict=True):
+                found[names[b]][n] = effect.person(np.array([number]), options)
+    return found
