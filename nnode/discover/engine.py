@@ -24,8 +24,9 @@ class Engine(Protocol):
     the residuals allows it. All models of a diagnosis are compared in the same residuals.
 
     Attributes:
-        batch: the sequences.
-        sequence: ``(n,)`` position of each residual's sequence in the batch.
+        batch: the sequences, or windows of them that bear their names.
+        names: of the sequences.
+        sequence: ``(n,)`` position of each residual's sequence in ``names``.
         block: ``(n,)`` number of each residual's block: a part of a sequence that is taken as
             independent of the others.
         unit: ``(n,)`` number of the agents whose own numbers are estimated together.
@@ -35,6 +36,7 @@ class Engine(Protocol):
     """
 
     batch: Batch
+    names: list[str]
     sequence: np.ndarray
     block: np.ndarray
     unit: np.ndarray

@@ -27,7 +27,7 @@ class Individuals:
     Attributes:
         effect: its class.
         options: its settings.
-        products: ``(S,)`` per sequence the product of the scores of the two halves.
+        products: per agent the product of the standardised scores of the two halves.
         sigma: standard deviation of the agents' numbers.
         interval: of 95 %, by leaving out each sequence in turn.
         gain: share of the residuals' sum of squares that numbers from the one half remove in
@@ -66,12 +66,13 @@ def _at(
     sequence_of = np.array([people[0][0] for people in engine.people])
     each = np.einsum("um,um->u", score[0], score[1])
     scale = np.einsum("umn,unm->u", gram[0], gram[1])
+    products = _products(engine, gram, score)
     count = int(engine.sequence.max()) + 1
-    products = np.bincount(sequence_of, each, count)
-    scales = np.bincount(sequence_of, scale, count)
-    variance = products.sum() / max(scales.sum(), 1e-300)
+    each = np.bincount(sequence_of, each, count)
+    scale = np.bincount(sequence_of, scale, count)
+    variance = each.sum() / max(scale.sum(), 1e-300)
     # by leaving out one sequence at a time
-    others = (products.sum() - products) / np.maximum(scales.sum() - scales, 1e-300)
+    others = (each.sum() - each) / np.maximum(scale.sum() - scale, 1e-300)
     error = float(np.sqrt((count - 1) / count * ((others - others.mean()) ** 2).sum()))
     sigma = float(np.sqrt(max(variance, 0.0)))
     low, high = (float(np.sqrt(max(variance + s * 2.1 * error, 0.0))) for s in (-1, 1))
@@ -107,6 +108,14 @@ def _halves(
     return gram, score
 
 
+def _products(engine: Engine, gram: list[np.ndarray], score: list[np.ndarray]) -> np.ndarray:
+    """Per agent the product of the two halves' scores, each in units of its standard error."""
+    size = [np.sqrt(np.maximum(np.einsum("umm->um", g), 1e-300)) for g in gram]
+    both = (score[0] / size[0]) * (score[1] / size[1])
+    alone = len(engine.people[0]) == 1
+    return both.sum(1) if alone else both[(gram[0] > 0).any(2) & (gram[1] > 0).any(2)]
+
+
 def _amounts(gram: np.ndarray, score: np.ndarray, sigma: float) -> np.ndarray:
     """``(U, M)`` amounts, drawn to zero as their standard deviation says."""
     ridge = np.eye(gram.shape[1]) / sigma**2
@@ -140,7 +149,7 @@ def _crossed(
 def _people(
     engine: Engine, effect: type[IndividualEffect], options: dict[str, Any], amounts: np.ndarray
 ) -> dict[str, list[float]]:
-    names, sizes = engine.batch.names, engine.batch.agent.shape[1]
+    names, sizes = engine.names, engine.batch.agent.shape[1]
     found = {name: [0.0] * sizes for name in names}
     for people, own in zip(engine.people, amounts, strict=True):
         if len(people) == 1:

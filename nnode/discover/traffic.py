@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,8 +25,8 @@ from nnode.models.term import State, Term
 STEP, STABLE = 0.4, 0.7
 #: Change of a vehicle's pace by which its derivative is computed.
 _PACE = 1e-3
-#: Parts of a sequence of this length, s, count as independent.
-BLOCK = 10.0
+#: Sequences are simulated in windows of about this length, s.
+WINDOW = 10.0
 #: Whitened residuals beyond this count less.
 LARGE = 6.0
 #: Most past samples that a filter looks at.
@@ -35,11 +36,14 @@ ORDER = 4
 class TrafficEngine:
     """Residuals of platoons; see :class:`~nnode.discover.engine.Engine`.
 
-    Only the leader's path and the start are taken from the measurement, smoothed. Followers are
-    simulated behind each other, so that no follower's noise enters the right-hand side.
+    Only the leader's path and the starts are taken from the measurement, smoothed. Followers are
+    simulated behind each other, so that no follower's noise enters the right-hand side. A law of
+    following forgets its start within some seconds: windows keep the simulated paths near the
+    measured ones, also where the model is quite wrong, and lose little.
 
     Args:
         sequences: at least one, of the same sampling interval.
+        window: length of a window, s; infinite simulates whole sequences.
 
     Attributes:
         unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
@@ -47,10 +51,14 @@ class TrafficEngine:
         half: ``(n,)`` 0 or 1: the two halves of a sequence's time.
     """
 
-    def __init__(self, sequences: list[Sequence]) -> None:
+    def __init__(self, sequences: list[Sequence], window: float = WINDOW) -> None:
         self.sequences = sequences
-        self.batch = collate(sequences)
-        self.smoothed = collate([_smoothed(sequence) for sequence in sequences])
+        self.names = [sequence.name for sequence in sequences]
+        parts = [_windows(sequence, window) for sequence in sequences]
+        self.batch = collate(part for each in parts for part in each)
+        smoothed = [_windows(_smoothed(sequence), window) for sequence in sequences]
+        self.smoothed = collate(part for each in smoothed for part in each)
+        owner = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
         leader = self.batch.agent.sum(1) - 1
         index = torch.arange(self.batch.x.shape[2])
         follower = self.batch.agent & (index != leader[:, None])
@@ -59,15 +67,11 @@ class TrafficEngine:
         self.seen = torch.cat([torch.zeros_like(self.seen[:1]), self.seen[1:]])
         self.filter = PlatoonFilter.none()
         k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
-        self.sequence = b
-        part = (k * self.batch.dt // BLOCK).astype(int)
-        # a short rest belongs to the part before it
-        last = np.array([max(1, round(s.dt * (s.n_samples - 1) / BLOCK)) - 1 for s in sequences])
-        part = np.minimum(part, last[b])
-        self.block = np.unique(b * 10_000 + part, return_inverse=True)[1]
-        middle = np.array([s.n_samples / 2 for s in sequences])
-        self.half = (k >= middle[b]).astype(int)
-        self.unit = b
+        self.block, self.sequence = b, owner[b]
+        middle = np.array([(s.time[0] + s.time[-1]) / 2 for s in sequences])
+        clock = self.batch.start.numpy()[b] + k * self.batch.dt
+        self.half = (clock > middle[self.sequence] + 1e-6).astype(int)
+        self.unit = self.sequence
         self.people = [
             [(i, n) for n in range(self.batch.agent.shape[1])] for i in range(len(sequences))
         ]
@@ -136,7 +140,7 @@ class TrafficEngine:
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""
-        shortest = min(s.n_samples for s in self.sequences)
+        shortest = int(self.batch.valid.any(-1).sum(0).min())
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
@@ -199,6 +203,22 @@ def _between(
         away = h * (s * (1 - s) ** 2 * v0 - s**2 * (1 - s) * v1)
         found.append((1 + 2 * s) * (1 - s) ** 2 * x0 + s**2 * (3 - 2 * s) * x1 + away)
     return found
+
+
+def _windows(sequence: Sequence, length: float) -> list[Sequence]:
+    """Windows of equal length that share their boundary sample."""
+    intervals = sequence.n_samples - 1
+    number = max(1, round(intervals * sequence.dt / length)) if intervals else 1
+    ends = np.linspace(0, intervals, number + 1).round().astype(int)
+    return [
+        replace(
+            sequence,
+            time=sequence.time[first : last + 1],
+            x=sequence.x[first : last + 1],
+            v=None if sequence.v is None else sequence.v[first : last + 1],
+        )
+        for first, last in pairwise(ends)
+    ]
 
 
 def _smoothed(sequence: Sequence) -> Sequence:
