@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import signal
 import time
 from collections.abc import Callable, Mapping
@@ -14,10 +15,10 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.saved import make_absolute, plain_config
+from nnode.app.saved import make_absolute, plain_config, shell_override
 from nnode.app.train import brief, set_threads
 from nnode.calibrate.checkpoint import save_checkpoint
-from nnode.calibrate.interrupt import BreakingGuard, InterruptGuard, Interrupted
+from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults, TableOptions
@@ -262,7 +263,27 @@ def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]
     """Draw the figures; returns what writes the page and TensorBoard's events."""
     from nnode.discover.pages import draw  # loads Matplotlib, which takes a second
 
-    return draw(job.inputs, found, job.options, training_config(job, found), folder)
+    config = training_config(job, found)
+    return draw(job.inputs, found, job.options, config, _commands(config, folder), folder)
+
+
+def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
+    """What can be done with the extended model, as it can be typed."""
+    checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
+    name, data = config["model"]["name"], config["data"]
+    place = shlex.quote(str(folder / MODEL))
+    options = [
+        shell_override(f"data.{key}", data[key])
+        for key in ("path", "domain", "walls")
+        if config["groups"]["data"] == "table" and data.get(key) is not None
+    ]
+    train = ["python scripts/train.py", f"model={name}", f"data={config['groups']['data']}"]
+    return [
+        f"python scripts/evaluate.py {checkpoint}",
+        f"python scripts/plot_forces.py {checkpoint}",
+        f"cp {place} conf/model/{name}.yaml",
+        " ".join([*train, *options]),
+    ]
 
 
 def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:

@@ -50,6 +50,10 @@ class Logbook:
         """A picture."""
         self._writer.add_figure(name, figure, step)
 
+    def text(self, name: str, text: str) -> None:
+        """Words in Markdown."""
+        self._writer.add_text(name, text, 0)
+
     def close(self, result: dict[str, float] | None = None) -> None:
         """Write the hyperparameters beside the final ``result`` and close the files."""
         if result:

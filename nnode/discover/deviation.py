@@ -16,8 +16,9 @@ from nnode.solvers import TorchdiffeqSolver
 #: Longest step of the classical Runge-Kutta method, s; it is to be seen in no picture.
 STEP = {"traffic": 0.1, "crowd": 0.05}
 
-#: Time over which a deviation is averaged, s: shorter ones show the noise of the positions.
-SPAN = 1.0
+#: Length of the pieces that are simulated, s: shorter ones show the noise of the positions, in
+#: longer ones a deviation shows far from where it arises.
+SPAN = {"traffic": 2.0, "crowd": 1.0}
 
 #: Half of the time over which a person's velocity is estimated, s.
 SMOOTH = 0.3
@@ -87,76 +88,54 @@ def _together(
 def deviation(system: System, sequences: list[Sequence], step: float | None = None) -> Deviation:
     """Where ``system`` and the sequences part.
 
-    Traffic: whole sequences are simulated, and speeds over :data:`SPAN` compared; of a leader
-    only where it is simulated. Crowds: everyone is simulated over pieces of :data:`SPAN`, and
-    what is missed at their end is expressed as a constant acceleration.
+    Sequences are cut into pieces of :data:`SPAN`, each simulated from its own first state. What
+    is missed at the end of a piece is expressed as a constant speed (traffic) or acceleration
+    (crowd). A leader whose path is given is left out.
     """
+    seconds = SPAN[system.domain]
+    pieces = [piece for s in sequences for piece in _pieces(s, seconds, system.order)]
     measure = _traffic if system.domain == "traffic" else _crowd
-    parts = measure(system, sequences, step)
-    d = 1 if system.domain == "traffic" else 2
+    led = getattr(system, "leader", "constant") == "measured"
+    parts = [
+        measure(s, x, s.n_agents - led)
+        for s, x in zip(pieces, simulate(system, pieces, step), strict=True)
+        if x is not None
+    ]
     if not parts:
-        none = np.empty((0, d))
+        none = np.empty((0, system.dim))
         return Deviation(np.empty(0), none, none, none, np.empty((0, 2)))
     names = [field.name for field in fields(Deviation)]
     return Deviation(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
-def _samples(sequence: Sequence, least: int) -> int:
-    """Sampling intervals that make up :data:`SPAN`, at most what the sequence has."""
-    return min(max(least, round(SPAN / sequence.dt)), sequence.n_samples - 1)
+def _traffic(s: Sequence, x: np.ndarray, number: int) -> Deviation:
+    """The deviations of the last ``number`` vehicles of a piece that was simulated as ``x``."""
+    seconds = s.time[-1] - s.time[0]
+    value = (s.x[-1] - x[-1]) / seconds
+    place = (s.x[0] + s.x[-1])[:, 0] / 2
+    speed = (s.x[-1] - s.x[0])[:, 0] / seconds
+    beside = np.stack([np.diff(place, append=np.nan), np.diff(speed, append=np.nan)], 1)
+    time = np.full(s.n_agents, (s.time[0] + s.time[-1]) / 2)
+    columns = (time, place[:, None], value, value, beside)
+    return Deviation(*(column[:number] for column in columns))
 
 
-def _traffic(system: System, sequences: list[Sequence], step: float | None) -> list[Deviation]:
-    parts = []
-    followers_only = getattr(system, "leader", "measured") == "measured"
-    for s, x in zip(sequences, simulate(system, sequences, step), strict=True):
-        if x is None:
-            continue
-        n = _samples(s, 1)
-        seconds = n * s.dt
-        real, model = ((p[n:] - p[:-n])[..., 0] / seconds for p in (s.x, x))
-        place = (s.x[n:] + s.x[:-n])[..., 0] / 2
-        gap = np.diff(place, axis=1, append=np.nan)
-        approach = np.diff(real, axis=1, append=np.nan)
-        last = s.n_agents - 1 if followers_only else s.n_agents
-        time = np.broadcast_to(((s.time[n:] + s.time[:-n]) / 2)[:, None], place.shape)
-        value = (real - model)[:, :last].reshape(-1, 1)
-        parts.append(
-            Deviation(
-                time[:, :last].ravel(),
-                place[:, :last].reshape(-1, 1),
-                value,
-                value,
-                np.stack([gap, approach], -1)[:, :last].reshape(-1, 2),
-            )
-        )
-    return parts
+def _crowd(s: Sequence, x: np.ndarray, number: int) -> Deviation:
+    assert s.v is not None
+    seconds = s.time[-1] - s.time[0]
+    value = 2 * (s.x[-1] - x[-1]) / seconds**2
+    time = np.full(number, s.time.mean())
+    beside = nearest(s.x[0], s.v[0])
+    return Deviation(time, s.x.mean(0), value, in_own_frame(value, s.v[0]), beside)
 
 
-def _crowd(system: System, sequences: list[Sequence], step: float | None) -> list[Deviation]:
-    pieces = [piece for s in sequences for piece in _pieces(s)]
-    parts = []
-    for s, x in zip(pieces, simulate(system, pieces, step), strict=True):
-        if x is None:
-            continue
-        seconds = s.time[-1] - s.time[0]
-        assert s.v is not None
-        value = 2 * (s.x[-1] - x[-1]) / seconds**2
-        parts.append(
-            Deviation(
-                np.full(s.n_agents, s.time.mean()),
-                s.x.mean(0),
-                value,
-                in_own_frame(value, s.v[0]),
-                nearest(s.x[0], s.v[0]),
-            )
-        )
-    return parts
+def _pieces(s: Sequence, seconds: float, least: int) -> list[Sequence]:
+    """Successive pieces with smoothed velocities, and the destinations of the whole.
 
-
-def _pieces(sequence: Sequence) -> list[Sequence]:
-    """Successive pieces with smoothed velocities, and the destinations of the whole."""
-    s, n = sequence, _samples(sequence, 2)
+    Args:
+        seconds: their length, if it makes up ``least`` sampling intervals or more.
+    """
+    n = min(max(least, round(seconds / s.dt)), s.n_samples - 1)
     goal = s.x[-1] if s.destination is None else s.destination
     v = smooth_velocity(s)
     return [

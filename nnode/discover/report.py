@@ -67,13 +67,19 @@ def amount(value: float | None, digits: int = 3) -> str:
     """A number in words: few digits, a true minus, a dash for what is missing."""
     if value is None or math.isnan(value):
         return "–"
-    return f"{value:.{digits}g}".replace("-", "−")
+    short = float(f"{value:.{digits}g}")
+    return f"{short:g}".replace("-", "−")
+
+
+def in_unit(unit: str) -> str:
+    """A unit as it follows a number: nothing for pure numbers."""
+    return "" if unit in ("", "1") else f" {unit}"
 
 
 def interval(effect: NamedEffect) -> str:
     """An effect's coefficients with their intervals, in one line."""
     return ", ".join(
-        f"{name} = {amount(c.value)} [{amount(c.low)}, {amount(c.high)}] {c.unit}".rstrip()
+        f"{name} = {amount(c.value)} [{amount(c.low)}, {amount(c.high)}]{in_unit(c.unit)}"
         for name, c in effect.coefficients.items()
     )
 
@@ -89,7 +95,8 @@ def sentence(diagnosis: Diagnosis) -> str:
     )
     match d.verdict:
         case "named":
-            return f"The model {d.model} lacks {names}: with it, {gain}."
+            them = "it" if len(d.effects) == 1 else "them"
+            return f"The model {d.model} lacks {names}: with {them}, {gain}."
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
             beside = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
@@ -141,7 +148,7 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
         options: what the model was built from before it was calibrated and extended.
     """
     own = {
-        name: float(getattr(term, name))
+        name: float(getattr(term, name).detach())
         for term in system.terms
         if term not in effects_of(system)
         for name in getattr(term, "units", {})
@@ -152,7 +159,8 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
     name = "_".join([str(options["name"]).split("_with_")[0], "with", *names])
     if not effects:
         name = f"{options['name']}_calibrated"
-    return {**options, "name": name, **own, "effects": effects}
+    rest = {key: value for key, value in options.items() if key != "effects"}
+    return {**rest, "name": name, **own, "effects": effects}
 
 
 def has_network(system: System) -> bool:

@@ -137,18 +137,16 @@ def _arrows(
 ) -> Figure:
     finite = places[np.isfinite(places).all(1)]
     finite = finite if len(finite) else np.array([[-1.0, -1.0], [1.0, 1.0]])
-    low, high = finite.min(0), finite.max(0)
+    low, high = np.percentile(finite, [0.5, 99.5], axis=0)
     size = max(float((high - low).max()), 1e-6)
     # squares of about a step's length, at most 24 along the longer side
     side = max(size / 24, 0.4)
-    edges = tuple(
-        np.arange(a - side / 2, b + side, side) for a, b in zip(low, high, strict=True)
-    )
+    edges = tuple(np.arange(a - side / 2, b + side, side) for a, b in zip(low, high, strict=True))
     wide = (high - low)[0] > 1.6 * (high - low)[1]
     rows, columns = (len(panels), 1) if wide else (1, len(panels))
     ratio = float(np.clip((high - low)[1] / max((high - low)[0], 1e-6), 0.25, 1.6))
     width = 8.0 / columns if columns > 1 else 7.2
-    figure = new_figure(width * columns + 1.0, (width * ratio + 0.55) * rows + 0.3)
+    figure = new_figure(width * columns + 1.0, (0.92 * width * ratio + 0.5) * rows + 0.3)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     fields = []
     for place, value in panels.values():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +19,8 @@ COLUMNS = 3
 NAMED = 24
 
 #: Colour and marker of the model before and after, the same in all figures.
-BEFORE = {"color": OKABE_ITO["vermillion"], "marker": "s"}
-AFTER = {"color": OKABE_ITO["blue"], "marker": "o"}
+BEFORE: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "marker": "s"}
+AFTER: dict[str, Any] = {"color": OKABE_ITO["blue"], "marker": "o"}
 
 
 def place_curves(places: Sequence[Place], unit: str) -> Figure:
@@ -46,7 +47,7 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
         share = f"{100 * place.share:.0f} % of the excess" if np.isfinite(place.share) else ""
         dress(
             ax,
-            x=f"{place.variable} ({place.unit})" if place.unit else place.variable,
+            x=place.variable + (f" ({place.unit})" if place.unit not in ("", "1") else ""),
             y=f"deviation ({unit})" if n % columns == 0 else "",
             title=share.replace("-", "−"),
         )
@@ -74,7 +75,9 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
             color=OKABE_ITO["blue"], capsize=4, markersize=6,
         )  # fmt: skip
         ax.set_ylim(-1, 1)
-        ax.set_yticks([0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit else ''}"])
+        ax.set_yticks(
+            [0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit not in ('', '1') else ''}"]
+        )
         dress(ax, grid=False)
         ax.tick_params(axis="y", length=0)
         ax.margins(x=0.15)

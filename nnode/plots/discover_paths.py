@@ -1,9 +1,9 @@
-"""One sequence as it was measured and as two models simulate it: paths, moments, a moving picture."""
+"""One sequence as measured and as two models simulate it: paths, moments, a moving picture."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,11 +21,11 @@ from nnode.plots.discover_marks import AFTER, BEFORE
 from nnode.plots.style import FONT, GREY, SMALL_FONT, dress, new_figure
 
 #: Moments of a film strip.
-MOMENTS = 6
+MOMENTS = 5
 #: At most so many frames, colours and bytes has a moving picture, and so many dots in an inch.
 FRAMES, COLOURS, BYTES, DOTS = 60, 32, 1_000_000, 80
 
-_MEASURED = {"color": GREY, "marker": "o"}
+_MEASURED: dict[str, Any] = {"color": GREY, "marker": "o"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Simulated:
 
     title: str
     x: np.ndarray
-    style: Mapping[str, str]
+    style: dict[str, Any]
 
 
 def pair(before: np.ndarray, after: np.ndarray | None) -> list[Simulated]:
@@ -111,8 +111,8 @@ _LEGEND: dict[str, Any] = {
 
 
 def _handles(simulated: list[Simulated], lines: bool) -> list[Line2D]:
-    style = {"linestyle": "-", "marker": ""} if lines else {"linestyle": ""}
-    measured = {"linewidth": 2.2, "alpha": 0.55} if lines else {"fillstyle": "none"}
+    style: dict[str, Any] = {"linestyle": "-", "marker": ""} if lines else {"linestyle": ""}
+    measured: dict[str, Any] = {"linewidth": 2.2, "alpha": 0.55} if lines else {"fillstyle": "none"}
     return [
         Line2D([], [], label="measured", **{**_MEASURED, **style, **measured}),
         *(Line2D([], [], label=one.title, **{**one.style, **style}) for one in simulated),
@@ -167,7 +167,7 @@ def _panel(ax: Axes, s: Sequence, one: Simulated) -> Update:
     if traffic:
         half = max(np.abs(x[..., 0] - frame[:, None]).max() for x in (s.x, one.x))
         ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
-        ax.set_yticks([0, 1], [one.title, "measured"])
+        ax.set_yticks([0, 1], ["simulated", "measured"])
     else:
         low, high = _view(s)
         draw_walls(ax, s.walls)
@@ -207,6 +207,8 @@ def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
             along = "position seen from the platoon's middle (m)" if traffic else "x (m)"
             title = one.title if k == moments[0] else ""
             dress(ax, x=along if last else "", y=across if i == 0 else "", title=title)
+            if i:
+                ax.tick_params(labelleft=False)
     figure.legend(handles=_handles(simulated, False), **_LEGEND)
     return figure
 
@@ -229,7 +231,7 @@ def moving_picture(sequence: Sequence, simulated: list[Simulated]) -> tuple[byte
     shows = [_panel(ax, s, one) for ax, one in zip(axes, simulated, strict=True)]
     for ax, one in zip(axes, simulated, strict=True):
         if s.x.shape[2] == 1:
-            dress(ax, x="position seen from the platoon's middle (m)")
+            dress(ax, x="position seen from the platoon's middle (m)", y=one.title)
         else:
             dress(ax, x="x (m)", y="y (m)", title=one.title)
         ax.label_outer()
