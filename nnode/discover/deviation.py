@@ -88,7 +88,7 @@ def _together(
 def deviation(system: System, sequences: list[Sequence], step: float | None = None) -> Deviation:
     """Where ``system`` and the sequences part.
 
-    Sequences are cut into pieces of :data:`SPAN`, each simulated from its own first state. What
+    Sequences are cut into overlapping pieces of :data:`SPAN`, each simulated from its own first state. What
     is missed at the end of a piece is expressed as a constant speed (traffic) or acceleration
     (crowd). A leader whose path is given is left out.
     """
@@ -130,7 +130,7 @@ def _crowd(s: Sequence, x: np.ndarray, number: int) -> Deviation:
 
 
 def _pieces(s: Sequence, seconds: float, least: int) -> list[Sequence]:
-    """Successive pieces with smoothed velocities, and the destinations of the whole.
+    """Pieces, half of each in the next, with smoothed velocities and the destinations of the whole.
 
     Args:
         seconds: their length, if it makes up ``least`` sampling intervals or more.
@@ -147,7 +147,7 @@ def _pieces(s: Sequence, seconds: float, least: int) -> list[Sequence]:
             v=v[first : first + n + 1],
             destination=goal,
         )
-        for first in range(0, s.n_samples - n, n)
+        for first in range(0, s.n_samples - n, max(1, n // 2))
     ]
 
 

@@ -47,7 +47,7 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
         share = f"{100 * place.share:.0f} % of the excess" if np.isfinite(place.share) else ""
         dress(
             ax,
-            x=place.variable + (f" ({place.unit})" if place.unit not in ("", "1") else ""),
+            x=_with_unit(place.variable, place.unit),
             y=f"deviation ({unit})" if n % columns == 0 else "",
             title=share.replace("-", "−"),
         )
@@ -136,3 +136,7 @@ def flexible_curve(structure: Structure, unit: str) -> Figure:
     if structure.hint:
         ax.set_title(f"hint: {structure.hint}", fontsize=FONT, color=GREY, loc="left")
     return figure
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return name if unit in ("", "1") else f"{name} ({unit})"

@@ -6,6 +6,7 @@ import os
 import time
 from copy import deepcopy
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ class Wind(Effect):
     domain = "crowd"
     formula = "+ (w_x, w_y)"
     source = "none: made up"
-    strengths = {
+    strengths: ClassVar = {
         "w_x": Strength(0.0, 0.1, Interval(-2.0, 2.0), "m/s²"),
         "w_y": Strength(0.0, 0.1, Interval(-2.0, 2.0), "m/s²"),
     }
