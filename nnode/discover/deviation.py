@@ -88,9 +88,9 @@ def _together(
 def deviation(system: System, sequences: list[Sequence], step: float | None = None) -> Deviation:
     """Where ``system`` and the sequences part.
 
-    Sequences are cut into overlapping pieces of :data:`SPAN`, each simulated from its own first state. What
-    is missed at the end of a piece is expressed as a constant speed (traffic) or acceleration
-    (crowd). A leader whose path is given is left out.
+    Sequences are cut into overlapping pieces of :data:`SPAN`, each simulated from its own first
+    state. What is missed at the end of a piece is expressed as a constant speed (traffic) or
+    acceleration (crowd). A leader whose path is given is left out.
     """
     seconds = SPAN[system.domain]
     pieces = [piece for s in sequences for piece in _pieces(s, seconds, system.order)]

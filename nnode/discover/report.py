@@ -19,7 +19,7 @@ from nnode.discover.found import Found
 from nnode.discover.result import Diagnosis, NamedEffect
 from nnode.files import write_text
 from nnode.models import FeedForward, System, build_model
-from nnode.models.build import effects_of
+from nnode.models.extend import effects_of
 
 REPORT = "report.json"
 MODEL = "model.yaml"

@@ -12,7 +12,7 @@ import torch
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
-from nnode.models.effects import CATALOGUE, Effect
+from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import load_own
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
@@ -144,8 +144,3 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
             raise ConfigError(f"model.effects: {name}: {error}") from error
     for effect in sorted(added, key=lambda effect: effect.rank):
         model.terms.append(effect)
-
-
-def effects_of(model: System) -> list[Effect]:
-    """The effects among a model's terms, in their order."""
-    return [term for term in model.terms if isinstance(term, Effect)]
