@@ -132,7 +132,7 @@ def diagnose_table(
     Raises:
         NNodeError: see :func:`discover`.
     """
-    own = _model_options(model, domain, leader)
+    own = _model_options(model, leader)
     chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
     data = TableOptions(
         domain=domain, path=str(path), walls=None if walls is None else str(walls),
@@ -150,7 +150,7 @@ def diagnose_table(
     return plain_report(found.diagnosis)
 
 
-def _model_options(model: Mapping[str, Any], domain: str, leader: str) -> dict[str, Any]:
+def _model_options(model: Mapping[str, Any], leader: str) -> dict[str, Any]:
     """A model's options with the defaults of its schema."""
     from nnode.config import SCHEMAS
 
@@ -160,7 +160,7 @@ def _model_options(model: Mapping[str, Any], domain: str, leader: str) -> dict[s
         known = [name.removesuffix("_schema") for group, name in SCHEMAS if group == "model"]
         raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(known)}")
     given = {"name": term, **model}
-    if domain == "traffic":
+    if hasattr(schema, "leader"):
         given.setdefault("leader", leader)
     try:
         merged = OmegaConf.merge(OmegaConf.structured(schema), given)

@@ -63,10 +63,10 @@ def draw(
     title = f"Diagnosis of {found.diagnosis.model} on {config['data']['name']}"
 
     def write() -> dict[str, Path]:
-        # events first: drawing a figure into them leaves the page's own size untouched
-        events = write_events(found, drawn, config, folder / TENSORBOARD)
         subtitle = sentence(found.diagnosis)
-        page, *_ = write_page(blocks, folder, title=title, subtitle=subtitle, stem="report")
+        page, *others = write_page(blocks, folder, title=title, subtitle=subtitle, stem="report")
+        pictures = [path for path in others if path.suffix == ".png"]
+        events = write_events(found, pictures, config, folder / TENSORBOARD)
         return {"page": page, "tensorboard": events}
 
     return write
@@ -228,10 +228,13 @@ def _names(names: list[str]) -> str:
     return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
 
 
-def write_events(found: Found, drawn: Figures, config: dict[str, Any], folder: Path) -> Path:
+def write_events(found: Found, pictures: list[Path], config: dict[str, Any], folder: Path) -> Path:
     """Write TensorBoard's events: step 0 is the model as it was given, step 1 the extended one.
 
     Events of an earlier run in the folder are replaced.
+
+    Args:
+        pictures: the page's figures.
     """
     d = found.diagnosis
     shutil.rmtree(folder, ignore_errors=True)
@@ -245,8 +248,8 @@ def write_events(found: Found, drawn: Figures, config: dict[str, Any], folder: P
         book.scalars({name: value for name, value in row.items() if _number(value)}, 1)
     book.text("verdict", sentence(d))
     book.text("effects", "\n\n".join(f"{e.name}: {interval(e)}; {e.where}" for e in d.effects))
-    for block in drawn.all():
-        book.figure(f"diagnosis/{block.name}", block.figure, 1)
+    for path in pictures:
+        book.picture(f"diagnosis/{path.stem}", path, 1)
     book.close()
     return folder
 

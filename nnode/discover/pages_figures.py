@@ -43,11 +43,6 @@ class Figures:
     unknown: list[FigureBlock] = field(default_factory=list)
     paths: list[FigureBlock | MovingBlock] = field(default_factory=list)
 
-    def all(self) -> list[FigureBlock]:
-        """Every figure that stands still."""
-        parts = (self.effects, self.gap, self.faults, self.places, self.unknown, self.paths)
-        return [block for part in parts for block in part if isinstance(block, FigureBlock)]
-
 
 def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
     """Draw everything that the diagnosis gives occasion to."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
@@ -152,11 +153,16 @@ def _planes(
     return figure, list(grid.ravel())
 
 
-Update = Callable[[int], None]
+@dataclass(frozen=True)
+class _Panel:
+    """A panel of moments: what moves in it, and what puts that where it is at sample k."""
+
+    artists: list[Artist]
+    show: Callable[[int], None]
 
 
-def _panel(ax: Axes, s: Sequence, one: Simulated) -> Update:
-    """An empty panel, and what shows sample k in it: measured and simulated agents, joined."""
+def _panel(ax: Axes, s: Sequence, one: Simulated) -> _Panel:
+    """A panel with measured and simulated agents, joined by lines."""
     traffic = s.x.shape[2] == 1
     joined = LineCollection([], colors="black", linewidths=0.7)
     ax.add_collection(joined)
@@ -185,7 +191,7 @@ def _panel(ax: Axes, s: Sequence, one: Simulated) -> Update:
         model.set_data(*ends[1].T)
         joined.set_segments(list(np.stack(ends, 1)))
 
-    return show
+    return _Panel([joined, real, model], show)
 
 
 def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
@@ -201,7 +207,7 @@ def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
     axes = figure.subplots(len(moments), len(simulated), sharex=True, sharey="col", squeeze=False)
     for row, k in zip(axes, moments, strict=True):
         for i, (ax, one) in enumerate(zip(row, simulated, strict=True)):
-            _panel(ax, s, one)(int(k))
+            _panel(ax, s, one).show(int(k))
             last, seconds = k == moments[-1], s.time[k] - s.time[0]
             across = f"{seconds:.1f} s" if traffic else f"{seconds:.1f} s: y (m)"
             along = "position seen from the platoon's middle (m)" if traffic else "x (m)"
@@ -228,7 +234,7 @@ def moving_picture(sequence: Sequence, simulated: list[Simulated]) -> tuple[byte
         figure, axes = _planes(*_view(s), len(simulated), side=6.4)
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(DOTS)
-    shows = [_panel(ax, s, one) for ax, one in zip(axes, simulated, strict=True)]
+    panels = [_panel(ax, s, one) for ax, one in zip(axes, simulated, strict=True)]
     for ax, one in zip(axes, simulated, strict=True):
         if s.x.shape[2] == 1:
             dress(ax, x="position seen from the platoon's middle (m)", y=one.title)
@@ -236,14 +242,19 @@ def moving_picture(sequence: Sequence, simulated: list[Simulated]) -> tuple[byte
             dress(ax, x="x (m)", y="y (m)", title=one.title)
         ax.label_outer()
     clock = figure.suptitle("0.0 s", fontsize=FONT, x=0.02, ha="left")
+    moving: list[Artist] = [artist for panel in panels for artist in panel.artists]
+    for artist in (*moving, clock):
+        artist.set_animated(True)  # not part of the ground, which is drawn once
     canvas.draw()
-    figure.set_layout_engine("none")  # the layout of the first frame holds for all
+    ground = canvas.copy_from_bbox(figure.bbox)
     pictures = []
     for k in range(0, s.n_samples, every):
-        for show in shows:
-            show(k)
+        for panel in panels:
+            panel.show(k)
         clock.set_text(f"{s.time[k] - s.time[0]:.1f} s")
-        canvas.draw()
+        canvas.restore_region(ground)
+        for artist in (*moving, clock):
+            artist.draw(canvas.get_renderer())
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
         pictures.append(picture.quantize(COLOURS, dither=Image.Dither.NONE))
     stream = io.BytesIO()
