@@ -43,12 +43,12 @@ def test_the_command_prints_and_writes(tmp_path, capsys) -> None:
     main([])
     assert "| `speed_zone` |" in capsys.readouterr().out
     path = tmp_path / "doc.md"
-    path.write_text(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n")
+    path.write_text(f"before\n{MARKS[0]}\nthe table of before\n{MARKS[1]}\nafter\n")
     main([str(path)])
     text = path.read_text()
     assert text.startswith(f"before\n{MARKS[0]}\n### Traffic\n")
     assert text.endswith(f"|\n{MARKS[1]}\nafter\n")
-    assert "old" not in text
+    assert "the table of before" not in text
     with pytest.raises(ConfigError, match="expected the lines"):
         written("no marks", "")
 
