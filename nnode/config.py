@@ -31,6 +31,7 @@ from nnode.data.options import (
     TableOptions,
     VehicleTableOptions,
 )
+from nnode.discover.options import DiscoverOptions
 from nnode.models.options import (
     LawOptions,
     NetworkForceOptions,
@@ -108,6 +109,15 @@ class StudyConfig:
     study: Any = MISSING
 
 
+@dataclass
+class DiscoverConfig:
+    """``scripts/discover.py``: what a model lacks."""
+
+    model: Any = MISSING
+    data: Any = MISSING
+    discover: DiscoverOptions = field(default_factory=DiscoverOptions)
+
+
 SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
@@ -115,6 +125,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "benchmark_schema"): BenchmarkConfig,
     (None, "study_schema"): StudyConfig,
+    (None, "discover_schema"): DiscoverConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
+import sys
 from collections.abc import Iterable
+from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from nnode import __version__
 
 
 def cores() -> int:
@@ -35,4 +40,16 @@ def machine(packages: Iterable[str]) -> dict[str, Any]:
         "system": platform.platform(),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "versions": versions,
+    }
+
+
+def how_made(packages: Iterable[str]) -> dict[str, str]:
+    """What a page says of how it was made: command, date, machine, versions."""
+    here = machine(packages)
+    versions = {"nnode": __version__, **here["versions"]}
+    return {
+        "Command": shlex.join(["python", *sys.argv]),
+        "Date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        "Machine": f"{here['processor']}, {here['cores']} cores, {here['system']}",
+        "Versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
     }

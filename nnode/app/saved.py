@@ -26,12 +26,16 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     assert isinstance(plain, dict)
     choices = HydraConfig.get().runtime.choices
     groups = {group: str(choices[group]) for group in GROUPS if group in choices}
-    data = plain.get("data", {})
+    make_absolute(plain.get("data", {}))
+    return {**{str(k): v for k, v in plain.items() if k != "resume"}, "groups": groups}
+
+
+def make_absolute(data: dict[str, Any]) -> None:
+    """Let a data set's files be found again from any working directory."""
     for key in ("path", "source", "prepared", "walls"):
         place = data.get(key)
         if isinstance(place, str) and Path(place).exists():
-            data[key] = str(Path(place).absolute())  # found again from any working directory
-    return {**{str(k): v for k, v in plain.items() if k != "resume"}, "groups": groups}
+            data[key] = str(Path(place).absolute())
 
 
 def _checkpoint_of(overrides: list[str], option: str) -> str | None:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import logging
-import shlex
 import signal
-import sys
 import time
-from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-import nnode
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted
 from nnode.errors import ConfigError
-from nnode.machine import cores, machine
+from nnode.machine import cores, how_made
 from nnode.study.options import StudyOptions
 from nnode.study.page import Block, Provenance, write_page
 
@@ -97,15 +93,9 @@ def study(config: DictConfig, folder: Path) -> None:
 
 def _made(seconds: float, workers: int) -> Provenance:
     """How this run made the page."""
-    here = machine(_PACKAGES)
-    versions = {"nnode": nnode.__version__, **here["versions"]}
-    return Provenance(
-        {
-            "Command": shlex.join(["python", *sys.argv]),
-            "Date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-            "Time": f"{seconds:.0f} s in this run with {workers} worker process(es); results that "
-            "were kept before are not computed again",
-            "Machine": f"{here['processor']}, {here['cores']} cores, {here['system']}",
-            "Versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
-        }
+    facts = how_made(_PACKAGES)
+    time_taken = (
+        f"{seconds:.0f} s in this run with {workers} worker process(es); results that were kept "
+        "before are not computed again"
     )
+    return Provenance({**facts, "Time": time_taken})

@@ -31,7 +31,7 @@ from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import DataOptions, LoaderOptions
 from nnode.data.prepare import open_data
 from nnode.data.sequence import Batch
-from nnode.data.split import split
+from nnode.data.split import Split, split
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.files import write_json
@@ -193,7 +193,7 @@ def _trainer(
         data.loader.batch_size = 0
     seed = int(config.seed)
     _check_same_data(store, checkpoint)
-    parts = split(store, data.split)
+    parts = _parts(store, data, checkpoint)
     loader = make_loader(
         SequenceDataset(store, parts.train),
         data.loader,
@@ -259,6 +259,18 @@ def brief(manifest: dict[str, Any]) -> dict[str, Any]:
 def source_hashes(manifest: dict[str, Any]) -> dict[str, str]:
     """SHA-256 of every raw file that a data set was prepared from."""
     return {name: file["sha256"] for name, file in manifest.get("files", {}).items()}
+
+
+def _parts(store: Store, data: DataOptions, checkpoint: Checkpoint | None) -> Split:
+    """Which sequences train; a resumed run keeps what its checkpoint trained on and held out."""
+    places = {entry["name"]: i for i, entry in enumerate(store.index)}
+    known = {} if checkpoint is None else checkpoint.split
+    if not known or not {name for names in known.values() for name in names} <= set(places):
+        return split(store, data.split)
+    train, heldout, dropped = (
+        sorted(places[name] for name in known.get(part, [])) for part in _PARTS
+    )
+    return Split(train=train, heldout=heldout, dropped=dropped, mode="checkpoint", note="as it was")
 
 
 def _check_same_data(store: Store, checkpoint: Checkpoint | None) -> None:

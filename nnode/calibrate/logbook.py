@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 
@@ -49,6 +51,16 @@ class Logbook:
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """A picture."""
         self._writer.add_figure(name, figure, step)
+
+    def picture(self, name: str, path: Path, step: int) -> None:
+        """A picture from a file."""
+        self._writer.add_image(
+            name, np.asarray(Image.open(path).convert("RGB")), step, dataformats="HWC"
+        )
+
+    def text(self, name: str, text: str) -> None:
+        """Words in Markdown."""
+        self._writer.add_text(name, text, 0)
 
     def close(self, result: dict[str, float] | None = None) -> None:
         """Write the hyperparameters beside the final ``result`` and close the files."""

@@ -118,7 +118,7 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
         "recordings": by_recording(read, kept, faults),
         "dropped": dropped,
         "dropped_agents": absent,
-        "faults": [asdict(fault) for found in faults.values() for fault in found],
+        "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
     }
     with _drawn(folder, sequences, faults, domain, draw):
         store = write_store(folder, kept, manifest)
@@ -162,6 +162,12 @@ def plain(options: DataOptions) -> dict[str, Any]:
     """Options as a dict that JSON can hold, as the manifest remembers them."""
     container = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
     return cast(dict[str, Any], json.loads(json.dumps(container)))
+
+
+def _account(fault: Fault, sequence: Sequence) -> dict[str, Any]:
+    """A fault as the manifest remembers it: with the agents' identifiers, where there are such."""
+    names = [sequence.agents[i] for i in fault.agents] if sequence.agents else []
+    return {**asdict(fault), "names": names}
 
 
 def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:

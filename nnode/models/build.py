@@ -13,6 +13,7 @@ from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
+from nnode.models.effects.own import load_own
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
 
@@ -118,6 +119,8 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
         ConfigError: an effect that the catalogue or the model's domain does not have, or a
             parameter that the effect does not have.
     """
+    if chosen:
+        load_own()
     added = []
     for entry in chosen:
         if not isinstance(entry, Mapping) or "name" not in entry:

@@ -36,3 +36,9 @@ def without(system: System, name: str) -> System:
 def effects_of(system: System) -> list[Effect]:
     """The effects of a model, in their order."""
     return [term for term in system.terms if isinstance(term, Effect)]
+
+
+def beside(system: System) -> str:
+    """What a figure of a model's law or force alone leaves out, in words; empty: nothing."""
+    names = [effect.name for effect in effects_of(system)]
+    return f"without its effects {', '.join(names)}" if names else ""

@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from nnode.errors import ConfigError
 from nnode.models import SocialForce, System
+from nnode.models.extend import beside
 from nnode.plots.interaction import (
     Part,
     Vector,
@@ -167,6 +168,9 @@ def _contours(
     bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
     bar.ax.yaxis.label.set_fontsize(FONT)
     title = describe(term, part)
+    left_out = beside(system)
+    if left_out:
+        title += f", {left_out}"
     if contact is not None:
         title += f"; circle: contact at {contact:g} m"
     if extend != "neither":

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
@@ -36,21 +37,31 @@ def plot_faults(
     domain: Domain,
     path: Path | str,
 ) -> None:
-    """Draw the faulty sequences of one recording as space-time lines, faults marked.
+    """Save :func:`faults_figure` of all sequences of one recording as PNG at ``path``."""
+    save(faults_figure(sequences, faults, domain), path)
+
+
+def faults_figure(
+    sequences: list[Sequence],
+    faults: Mapping[str, list[Fault]],
+    domain: Domain,
+    most: int = MAX_PANELS,
+) -> Figure:
+    """The faulty ones of some sequences as space-time lines, faults marked.
 
     Args:
-        sequences: all sequences of the recording.
-        faults: faults by the sequence's name.
+        sequences: with and without faults.
+        faults: by the sequence's name.
         domain: in a crowd the axis of the greater extent is drawn, and people without a fault
             are grey.
-        path: the PNG to write.
+        most: sequences that are drawn.
     """
     faulty = [s for s in sequences if faults.get(s.name)]
-    shown = faulty[:MAX_PANELS]
+    shown = faulty[:most]
     rows = math.ceil(len(shown) / COLUMNS)
     figure = new_figure(2.4 * COLUMNS, 2.2 + 2.0 * rows)
     grid = figure.add_gridspec(rows + 1, COLUMNS)
-    _bars(figure.add_subplot(grid[0, :]), sequences, faulty, faults)
+    _bars(figure.add_subplot(grid[0, :]), sequences, faulty, faults, most)
     used = dict.fromkeys(f.kind for s in shown for f in faults[s.name])
     for n, s in enumerate(shown):
         axes = figure.add_subplot(grid[1 + n // COLUMNS, n % COLUMNS])
@@ -65,7 +76,7 @@ def plot_faults(
         Line2D([], [], color=STYLES[k][0], marker=STYLES[k][1], linestyle="", label=k) for k in used
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) or 1)
-    save(figure, path)
+    return figure
 
 
 def _bars(
@@ -73,6 +84,7 @@ def _bars(
     sequences: list[Sequence],
     faulty: list[Sequence],
     faults: Mapping[str, list[Fault]],
+    most: int,
 ) -> None:
     counts = Counter(kind for s in faulty for kind in {f.kind for f in faults[s.name]})
     kinds = [kind for kind in KINDS if counts[kind]]
@@ -81,9 +93,11 @@ def _bars(
     axes.invert_yaxis()
     axes.margins(x=0.06)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    title = f"{sequences[0].recording}: {len(faulty)} of {len(sequences)} sequences are faulty"
-    if len(faulty) > MAX_PANELS:
-        title += f"; the first {MAX_PANELS} are shown"
+    recordings = {s.recording for s in sequences}
+    which = recordings.pop() if len(recordings) == 1 else f"{len(recordings)} recordings"
+    title = f"{which}: {len(faulty)} of {len(sequences)} sequences are faulty"
+    if len(faulty) > most:
+        title += f"; the first {most} are shown"
     dress(axes, x="sequences", title=title, grid=False)
 
 

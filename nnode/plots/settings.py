@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from nnode.errors import ConfigError
 from nnode.models import System
+from nnode.models.extend import beside
 from nnode.plots.interaction import (
     Part,
     Vector,
@@ -99,7 +100,8 @@ def six_settings(
             "force_red": [tuple(map(float, force)) for force in red],
         }
     )
-    return _quivers(table, describe(term, part)), table
+    what = ", ".join(filter(None, (describe(term, part), beside(system))))
+    return _quivers(table, what), table
 
 
 #: Lengths (inches) of the longest velocity and of the longest force arrow.

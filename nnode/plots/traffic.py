@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 from nnode.models import FollowTheLeader, System
+from nnode.models.extend import beside
 from nnode.plots.style import (
     GREY,
     OKABE_ITO,
@@ -150,7 +151,7 @@ def speed_curves(
         label = "markers: leader's v0"
         handles.append(Line2D([], [], color=GREY, marker=marker, linestyle="", label=label))
     ax.set_xlim(low, high)
-    _limit(ax, table, list(leaders.values()))
+    _limit(ax, table, list(leaders.values()), _left_out(models))
     right = ax.secondary_yaxis("right", functions=(_to_kmh, _from_kmh))
     right.set_ylabel("speed W (km/h)", fontsize=ax.yaxis.label.get_fontsize())
     right.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
@@ -243,8 +244,17 @@ def _curve(
         )  # fmt: skip
 
 
-def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float]) -> None:
-    """Keep the speed axis legible, and say what it cuts."""
+def _left_out(models: Mapping[str, System]) -> list[str]:
+    """Which effects the curves are drawn without."""
+    effects = {name: beside(system) for name, system in models.items()}
+    having = {name: words for name, words in effects.items() if words}
+    if len(having) > 2:
+        return [f"{len(having)} models have effects beside their laws, not drawn"]
+    return [f"{name}: its law, {words}" for name, words in having.items()]
+
+
+def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float], extra: list[str]) -> None:
+    """Keep the speed axis legible, and say what it cuts and what else is not shown."""
     values = np.concatenate([table.to_numpy().ravel(), leaders, [0.0]])
     values = values[np.isfinite(values)]
     bottom, top = max(values.min(), SHOWN[0]), min(values.max(), SHOWN[1])
@@ -260,12 +270,13 @@ def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float]) -> None:
         cut.append(f"above {SHOWN[1]:g} m/s")
     unfinished = [str(name) for name in table if not np.isfinite(table[name]).all()]
     notes = [f"curves {' and '.join(cut)} are cut"] if cut else []
+    notes += extra
     if unfinished:
         notes.append(f"not finite everywhere: {', '.join(unfinished[:3])}")
     if bottom < 0:
         ax.axhline(0.0, color=GREY, linewidth=0.6, zorder=1)
     if notes:
-        ax.set_title("; ".join(notes), fontsize=SMALL_FONT, color=GREY, loc="left")
+        ax.set_title("\n".join(notes), fontsize=SMALL_FONT, color=GREY, loc="left")
 
 
 def _histogram(ax: Axes, gaps: np.ndarray, span: tuple[float, float]) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from nnode.errors import ConfigError
-from nnode.files import write_text
+from nnode.files import write_bytes, write_text
 from nnode.plots.style import save
 from nnode.study import tables
 
@@ -91,19 +91,38 @@ class FigureBlock:
 
 
 @dataclass
+class MovingBlock:
+    """An animated picture, and the file ``figures/<name>.gif``; it plays when it is asked for.
+
+    Attributes:
+        name: of the file; ``[text](#figure-<name>)`` refers to it.
+        content: the file.
+        width, height: in pixels.
+        caption, alt: as of a figure.
+    """
+
+    name: str
+    content: bytes
+    width: int
+    height: int
+    caption: str
+    alt: str
+
+
+@dataclass
 class Provenance:
     """How a page was made, by what: goes to the page's foot. Several add up."""
 
     facts: dict[str, str]
 
 
-Block = Heading | Text | TableBlock | FigureBlock | Provenance
+Block = Heading | Text | TableBlock | FigureBlock | MovingBlock | Provenance
 
 
 def write_page(
     blocks: list[Block], folder: Path, *, title: str, subtitle: str = "", stem: str = "study"
 ) -> list[Path]:
-    """Write ``<stem>.html``, ``<stem>.md``, a CSV per table and a PNG per figure.
+    """Write ``<stem>.html``, ``<stem>.md``, a CSV per table and a PNG or GIF per figure.
 
     The HTML needs no other file and no network: style, figures and the tables' CSV are in it.
     The Markdown refers to the CSV and PNG files beside it. Each file is replaced as a whole, the
@@ -130,6 +149,8 @@ def write_page(
                 paths.append(write_text(folder / f"{block.name}.csv", block.csv()))
             elif isinstance(block, FigureBlock):
                 paths.append(save(block.figure, folder / FIGURES / f"{block.name}.png"))
+            elif isinstance(block, MovingBlock):
+                paths.append(write_bytes(folder / FIGURES / f"{block.name}.gif", block.content))
         markdown = write_text(folder / f"{stem}.md", _markdown(blocks, title, subtitle))
         html = write_text(folder / f"{stem}.html", _html(blocks, folder, title, subtitle))
     except OSError as error:
@@ -140,8 +161,8 @@ def write_page(
 
 
 def _check(blocks: list[Block]) -> None:
-    named = [block for block in blocks if isinstance(block, TableBlock | FigureBlock)]
-    for kind in (TableBlock, FigureBlock):
+    named = [b for b in blocks if isinstance(b, TableBlock | FigureBlock | MovingBlock)]
+    for kind in (TableBlock, FigureBlock, MovingBlock):
         names = Counter(block.name.casefold() for block in named if isinstance(block, kind))
         twice = [name for name, count in names.items() if count > 1]
         if twice:
@@ -149,7 +170,7 @@ def _check(blocks: list[Block]) -> None:
     for block in named:
         if not _NAME.fullmatch(block.name):
             raise ValueError(f"{block.name!r} cannot be used as a file name")
-        if isinstance(block, FigureBlock) and not block.alt.strip():
+        if not isinstance(block, TableBlock) and not block.alt.strip():
             raise ValueError(f"figure {block.name} has no alternative text")
     for heading in (block for block in blocks if isinstance(block, Heading)):
         if not 2 <= heading.level <= 4:
@@ -175,9 +196,10 @@ def _markdown(blocks: list[Block], title: str, subtitle: str) -> str:
                 parts.append(f'<a id="table-{block.name}"></a>{block.caption.strip()}')
                 parts.append(_markdown_table(block))
                 parts.append(f"[{block.name}.csv]({block.name}.csv)")
-            case FigureBlock():
+            case FigureBlock() | MovingBlock():
+                kind = "gif" if isinstance(block, MovingBlock) else "png"
                 alt = re.sub(r"\s+", " ", block.alt).replace("[", "(").replace("]", ")").strip()
-                parts.append(f"![{alt}]({FIGURES}/{block.name}.png)")
+                parts.append(f"![{alt}]({FIGURES}/{block.name}.{kind})")
                 parts.append(f'<a id="figure-{block.name}"></a>{block.caption.strip()}')
     facts = _facts(blocks)
     if facts:
@@ -239,6 +261,18 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
                         "png": _base64((folder / FIGURES / f"{block.name}.png").read_bytes()),
                         "width": width,
                         "height": height,
+                    }
+                )
+            case MovingBlock():
+                parts.append(
+                    {
+                        "kind": "moving",
+                        "name": block.name,
+                        "caption": Markup(text.renderInline(block.caption.strip())),
+                        "alt": block.alt.strip(),
+                        "gif": _base64(block.content),
+                        "width": block.width,
+                        "height": block.height,
                     }
                 )
     environment = Environment(

@@ -1,0 +1,300 @@
+"""What a model lacks: ``scripts/discover.py``."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import signal
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.app.saved import make_absolute, plain_config, shell_override
+from nnode.app.train import brief, set_threads
+from nnode.calibrate.checkpoint import save_checkpoint
+from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
+from nnode.calibrate.optimizers import AdadeltaOptions
+from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
+from nnode.data.options import DataOptions, Faults, TableOptions
+from nnode.discover.found import Found
+from nnode.discover.inputs import Inputs, read_inputs
+from nnode.discover.options import DiscoverOptions, check_options
+from nnode.discover.report import (
+    CHECKPOINT,
+    MODEL,
+    REPORT,
+    checkpoint_of,
+    extended_options,
+    has_network,
+    interval,
+    model_yaml,
+    plain_report,
+    sentence,
+    write_report,
+)
+from nnode.errors import ConfigError
+from nnode.files import write_text
+from nnode.models import System, build_model
+from nnode.models.effects.own import load_own
+
+log = logging.getLogger(__name__)
+
+#: Module of the diagnosis itself; imported when it is asked for.
+CORE = "nnode.discover.diagnose"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is diagnosed.
+
+    Attributes:
+        model, data: their options in plain types.
+        groups: the configuration groups that they come from.
+        system: the model, not calibrated.
+        inputs: the data.
+        options: checked.
+        seconds: that reading took.
+    """
+
+    model: dict[str, Any]
+    data: dict[str, Any]
+    groups: dict[str, str]
+    system: System
+    inputs: Inputs
+    options: DiscoverOptions
+    seconds: float
+
+
+def discover(config: DictConfig, folder: Path) -> None:
+    """Diagnose a model on data, write the report, and print what was found.
+
+    Raises:
+        ConfigError: options that do not go together.
+        DataError: data on which nothing can be diagnosed.
+        Interrupted: a signal asked to stop.
+    """
+    start = time.monotonic()
+    with BreakingGuard() as guard:
+        try:
+            plain = plain_config(config)
+            options = cast(DiscoverOptions, OmegaConf.to_object(config.discover))
+            data = cast(DataOptions, OmegaConf.to_object(config.data))
+            job = _job(plain["model"], data, plain["data"], plain["groups"], options, folder)
+            found = _diagnose(job)
+            drawn = _drawn(job, found, folder) if options.page else None
+        except KeyboardInterrupt:
+            number = guard.requested or signal.SIGINT
+            raise Interrupted(
+                f"stopped by {signal.Signals(number).name}: the diagnosis was not finished and "
+                f"nothing of it is written to {folder}; the same command starts it again",
+                number,
+            ) from None
+    with InterruptGuard() as guard:
+        paths = _write(job, found, folder, drawn)
+    _print(found, paths, time.monotonic() - start)
+    if guard.requested:
+        name = signal.Signals(guard.requested).name
+        raise Interrupted(f"stopped by {name} when all was written", guard.requested)
+
+
+def diagnose_table(
+    path: str | Path,
+    domain: str,
+    *,
+    model: Mapping[str, Any],
+    walls: str | Path | None = None,
+    leader: str = "measured",
+    folder: str | Path | None = None,
+    seed: int = 0,
+    options: DiscoverOptions | None = None,
+) -> dict[str, Any]:
+    """Diagnose a model on a tidy table.
+
+    Args:
+        path: CSV or Parquet, see ``docs/data.md``.
+        domain: ``traffic`` or ``crowd``.
+        model: options of the model; ``term`` says which, what is left out has its default.
+        walls: CSV with x1, y1, x2, y2, m.
+        leader: of a traffic model.
+        folder: receives what the script writes; None writes and draws nothing.
+        seed: of the diagnosis; wins over that of ``options``.
+        options: further options of the diagnosis.
+
+    Returns:
+        The content of ``report.json``.
+
+    Raises:
+        NNodeError: see :func:`discover`.
+    """
+    own = _model_options(model, leader)
+    chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
+    data = TableOptions(
+        domain=domain, path=str(path), walls=None if walls is None else str(walls),
+        name="table", faults=Faults.drop,
+    )  # fmt: skip
+    plain = _plain(data)
+    make_absolute(plain)
+    groups = {"model": str(own["name"]), "data": "table"}
+    with TemporaryDirectory(prefix="nnode-") as scratch:
+        place = Path(scratch) if folder is None else Path(folder)
+        job = _job(own, data, plain, groups, chosen, place)
+        found = _diagnose(job)
+        if folder is not None:
+            _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
+    return plain_report(found.diagnosis)
+
+
+def _model_options(model: Mapping[str, Any], leader: str) -> dict[str, Any]:
+    """A model's options with the defaults of its schema."""
+    from nnode.config import SCHEMAS
+
+    term = str(model.get("term", ""))
+    schema = SCHEMAS.get(("model", f"{term}_schema"))
+    if schema is None:
+        known = [name.removesuffix("_schema") for group, name in SCHEMAS if group == "model"]
+        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(known)}")
+    given = {"name": term, **model}
+    if hasattr(schema, "leader"):
+        given.setdefault("leader", leader)
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(schema), given)
+    except Exception as error:  # omegaconf's own errors share no narrower class
+        raise ConfigError(f"model: {str(error).splitlines()[0]}") from error
+    found = OmegaConf.to_container(merged, enum_to_str=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
+def _plain(options: Any) -> dict[str, Any]:
+    """A dataclass of options in plain types."""
+    found = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
+def _job(
+    model: dict[str, Any],
+    data: DataOptions,
+    plain_data: dict[str, Any],
+    groups: dict[str, str],
+    options: DiscoverOptions,
+    folder: Path,
+) -> Job:
+    start = time.monotonic()
+    load_own()
+    system = build_model(model, options.seed)
+    if data.domain in ("traffic", "crowd") and data.domain != system.domain:
+        raise ConfigError(
+            f"model={model['name']} is a {system.domain} model, data={data.name} are "
+            f"{data.domain} data; choose both of one domain"
+        )
+    check_options(options, system.domain)  # type: ignore[arg-type]
+    inputs = read_inputs(data, folder / "data")
+    # what the extended model is trained and tested on are the sequences without a fault
+    plain_data = {**plain_data, "faults": Faults.drop.value}
+    seconds = time.monotonic() - start
+    return Job(model, plain_data, groups, system, inputs, options, seconds)
+
+
+def _diagnose(job: Job) -> Found:
+    """Run the diagnosis, and add what only its caller knows."""
+    set_threads(None, job.system.domain)
+    diagnose = cast(Callable[..., Found], import_module(CORE).diagnose)
+    inputs = job.inputs
+    found = diagnose(job.system, inputs.sequences, job.options, faults=inputs.faults)
+    diagnosis = found.diagnosis
+    # the reader of the data knows the agents by name
+    known = {(fault.kind, fault.sequence, fault.time) for fault in inputs.data_faults}
+    others = [f for f in diagnosis.data_faults if (f.kind, f.sequence, f.time) not in known]
+    diagnosis.data_faults = [*inputs.data_faults, *others]
+    if diagnosis.verdict == "none" and diagnosis.data_faults:
+        diagnosis.verdict = "data_fault"
+    diagnosis.model = str(job.model["name"])
+    diagnosis.seconds = {"reading": job.seconds, **diagnosis.seconds}
+    return found
+
+
+def training_config(job: Job, found: Found) -> dict[str, Any]:
+    """The configuration of a training that would go on with the extended model."""
+    return {
+        "model": extended_options(job.model, found.extended),
+        "data": job.data,
+        "solver": _plain(TorchdiffeqOptions()),
+        "optimizer": _plain(AdadeltaOptions()),
+        "trainer": _plain(TrainerOptions()),
+        "seed": job.options.seed,
+        "groups": {**job.groups, "solver": "torchdiffeq", "optimizer": "adadelta"},
+    }
+
+
+def _write(
+    job: Job, found: Found, folder: Path, drawn: Callable[[], dict[str, Path]] | None
+) -> dict[str, Path]:
+    """Write all results, the report last; returns their paths."""
+    config = training_config(job, found)
+    checkpoint = checkpoint_of(
+        found, job.inputs.sequences, config, brief(job.inputs.manifest), AdadeltaOptions()
+    )
+    path, text = folder / CHECKPOINT, model_yaml(config["model"], has_network(found.base))
+    report = plain_report(found.diagnosis)
+    try:
+        save_checkpoint(checkpoint, path)
+        model = write_text(folder / MODEL, text)
+        pages = {} if drawn is None else drawn()
+        return {
+            "report": write_report(report, folder / REPORT),
+            **pages,
+            "extended model": model,
+            "checkpoint": path,
+        }
+    except OSError as error:
+        raise ConfigError(
+            f"the report cannot be written to {folder} ({error}); choose another hydra.run.dir"
+        ) from error
+
+
+def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]]:
+    """Draw the figures; returns what writes the page and TensorBoard's events."""
+    from nnode.discover.pages import draw  # loads Matplotlib, which takes a second
+
+    config = training_config(job, found)
+    return draw(job.inputs, found, job.options, config, _commands(config, folder), folder)
+
+
+def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
+    """What can be done with the extended model, as it can be typed."""
+    checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
+    name, data = config["model"]["name"], config["data"]
+    place = shlex.quote(str(folder / MODEL))
+    options = [
+        shell_override(f"data.{key}", data[key])
+        for key in ("path", "domain", "walls")
+        if config["groups"]["data"] == "table" and data.get(key) is not None
+    ]
+    train = ["python scripts/train.py", f"model={name}", f"data={config['groups']['data']}"]
+    return [
+        f"python scripts/evaluate.py {checkpoint}",
+        f"python scripts/plot_forces.py {checkpoint}",
+        f"cp {place} conf/model/{name}.yaml",
+        " ".join([*train, *options]),
+    ]
+
+
+def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:
+    d = found.diagnosis
+    print(f"verdict: {d.verdict}")
+    print(sentence(d))
+    for effect in d.effects:
+        print(f"  {effect.name}: {interval(effect)}")
+        print(f"    {effect.formula}; {effect.where}")
+        for other in effect.alternatives:
+            print(f"    not to be told from {other.name}: {other.separated_by}")
+    for what, path in paths.items():
+        print(f"{what}: {path}")
+    print(f"time: {seconds:.1f} s")

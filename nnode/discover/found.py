@@ -1,0 +1,31 @@
+"""What a diagnosis hands on to those who report it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from nnode.discover.result import Diagnosis
+from nnode.models import System
+
+
+@dataclass
+class Found:
+    """A diagnosis and the models that it is about.
+
+    Attributes:
+        diagnosis: in plain types.
+        base: the model as it was given, calibrated on the open sequences.
+        extended: the same with the accepted effects, calibrated together; without any it may
+            be ``base`` itself.
+        open, sealed: positions of the sequences that were used, and of those kept for the end.
+        maps: ``before`` and ``after``: :class:`nnode.discover.deviation.Deviation` of ``base``
+            and ``extended``, where the diagnosis has them; they are computed where it has not.
+    """
+
+    diagnosis: Diagnosis
+    base: System
+    extended: System
+    open: list[int]
+    sealed: list[int]
+    maps: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,98 @@
+"""The sequences that a diagnosis works on, and the faults that it leaves out and reports."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, cast
+
+from nnode.data.options import DataOptions, Faults
+from nnode.data.prepare import open_data
+from nnode.data.quality import Fault
+from nnode.data.sequence import Domain, Sequence
+from nnode.discover.result import DataFault
+from nnode.errors import DataError
+
+#: Fewer sequences can be neither resampled nor divided.
+LEAST = 3
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a diagnosis is given.
+
+    Attributes:
+        domain: of the data.
+        sequences: without a fault.
+        faulty: those with faults that can be drawn.
+        faults: all faults by the sequence's name.
+        data_faults: the same for the report, agents by identifier or, where there are none, by
+            their number in the sequence.
+        manifest: where the data come from.
+    """
+
+    domain: Domain
+    sequences: list[Sequence]
+    faulty: list[Sequence]
+    faults: dict[str, list[Fault]]
+    data_faults: list[DataFault]
+    manifest: dict[str, Any]
+
+
+def read_inputs(options: DataOptions, folder: Path) -> Inputs:
+    """Read data and part what is sound from what is faulty.
+
+    Args:
+        options: with ``faults=error`` faults are refused; otherwise faulty sequences are left
+            out of the diagnosis, whatever becomes of them in training.
+        folder: where data are prepared.
+
+    Raises:
+        DataError: fewer than three sequences are left, or no vehicle follows another.
+        NNodeError: see :func:`nnode.data.prepare.open_data`.
+    """
+    if options.prepared is None and options.faults is Faults.drop:
+        options = replace(options, faults=Faults.keep)
+    store = open_data(options, folder)
+    names = {field.name for field in fields(Fault)}
+    faults: dict[str, list[Fault]] = {}
+    reported = []
+    for entry in store.manifest["faults"]:
+        plain = {key: value for key, value in entry.items() if key in names}
+        fault = Fault(**{**plain, "agents": tuple(entry["agents"])})
+        faults.setdefault(fault.sequence, []).append(fault)
+        who = entry.get("names") or [str(i) for i in fault.agents]
+        reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
+    everything = list(store)
+    sound = [s for s in everything if s.name not in faults]
+    _check_enough(sound, faults, store.manifest["counts"]["read"], options)
+    return Inputs(
+        domain=cast(Domain, options.domain),
+        sequences=sound,
+        faulty=[s for s in everything if s.name in faults],
+        faults=faults,
+        data_faults=reported,
+        manifest=store.manifest,
+    )
+
+
+def _check_enough(
+    sound: list[Sequence], faults: dict[str, list[Fault]], read: int, options: DataOptions
+) -> None:
+    if options.domain == "traffic" and all(s.n_agents < 2 for s in sound) and read:
+        alone = [f for found in faults.values() for f in found if f.kind == "too_short"]
+        if sound or len(alone) == sum(map(len, faults.values())):
+            raise DataError(
+                f"data={options.name}: no vehicle follows another in any of the {read} sequences; "
+                "a diagnosis of traffic needs sequences of two or more vehicles of one lane"
+            )
+    if len(sound) >= LEAST:
+        return
+    counts = Counter(kind for found in faults.values() for kind in {f.kind for f in found})
+    why = ", ".join(f"{kind} in {n}" for kind, n in counts.most_common())
+    raise DataError(
+        f"data={options.name}: {len(sound)} of {read} sequences are without a fault"
+        f"{f' ({why})' if why else ''}; a diagnosis needs at least {LEAST}, some to calibrate on "
+        "and some kept for the end: take more data, or cut a long recording into several sequences"
+    )

@@ -1,0 +1,74 @@
+"""Options of the diagnosis, as a dataclass that the configuration is checked against."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+
+from nnode.data.sequence import Domain
+from nnode.errors import ConfigError
+from nnode.models.effects import CATALOGUE
+
+
+@dataclass
+class DiscoverOptions:
+    """What is looked for, how carefully, and what is made of it."""
+
+    sealed: float = 0.2  # share of the sequences that nothing looks at before the last step
+    alpha: float = 0.05  # rate of false alarms over all effects together
+    seed: int = 0  # of the split, of resampling and of a network's start weights
+    effects: list[str] | None = None  # names of the catalogue to look for; null: all
+    exclude: list[str] = field(default_factory=list)  # names not to look for
+    max_effects: int = 4  # at most so many are added
+    step: float | None = None  # s, of the simulation; null takes the domain's
+    workers: int | None = None  # processes; null: one per core
+    page: bool = True  # report.html with figures, and figures in TensorBoard
+    animation: bool = True  # one sealed sequence as a moving picture in the page
+
+
+def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
+    """Refuse what no diagnosis can work with.
+
+    Returns:
+        The names of the effects to look for, in the catalogue's order.
+
+    Raises:
+        ConfigError: a number outside its range, or an effect that the domain's catalogue does
+            not have; names the nearest.
+    """
+    for name, value in (("sealed", options.sealed), ("alpha", options.alpha)):
+        if not 0 < value < 1:
+            raise ConfigError(f"discover.{name}={value} must lie between 0 and 1")
+    if options.max_effects < 0:
+        raise ConfigError(f"discover.max_effects={options.max_effects} must be at least 0")
+    if options.step is not None and not (math.isfinite(options.step) and options.step > 0):
+        raise ConfigError(f"discover.step={options.step} must be a positive number of s, or null")
+    if options.workers is not None and options.workers < 1:
+        raise ConfigError(f"discover.workers={options.workers} must be at least 1, or null")
+    known = [effect.name for effect in CATALOGUE.of(domain)]
+    _known("discover.exclude", options.exclude, known, domain)
+    chosen = known
+    if options.effects is not None:
+        _known("discover.effects", options.effects, known, domain)
+        chosen = [name for name in known if name in options.effects]
+    return [name for name in chosen if name not in options.exclude]
+
+
+def _known(option: str, names: Iterable[str], known: list[str], domain: Domain) -> None:
+    for name in names:
+        if name in known:
+            continue
+        other = CATALOGUE.effects.get(name)
+        if other is not None:
+            raise ConfigError(
+                f"{option}: {name} is an effect of {other.domain} models, the data and the model "
+                f"are of {domain}; leave it out"
+            )
+        near = get_close_matches(name, known, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(
+            f"{option}: there is no {domain} effect {name}, expected some of "
+            f"{', '.join(known) or 'none at all'}{hint}"
+        )

@@ -1,0 +1,229 @@
+"""A diagnosis as a file: the report, the extended model as options and as a checkpoint."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from nnode.calibrate.checkpoint import Checkpoint
+from nnode.calibrate.evaluate import best_common_speed
+from nnode.calibrate.optimizers import build_optimizer
+from nnode.data.sequence import Sequence, collate
+from nnode.discover.found import Found
+from nnode.discover.result import Diagnosis, NamedEffect
+from nnode.files import write_text
+from nnode.models import FeedForward, System, build_model
+from nnode.models.extend import effects_of
+
+REPORT = "report.json"
+MODEL = "model.yaml"
+CHECKPOINT = Path("checkpoints", "best.pt")
+
+#: The counters of a training that has not begun.
+UNTRAINED: dict[str, float] = {
+    "epoch": 0,
+    "batch": 0,
+    "step": 0,
+    "sum": 0.0,
+    "gradient_norm": 0.0,
+    "best": math.inf,
+    "best_epoch": -1,
+    "stale": 0,
+    "seconds": 0.0,
+}
+
+
+def plain_report(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The content of ``report.json``: plain types, None for what is no number."""
+    found = _finite(diagnosis.plain())
+    assert isinstance(found, dict)
+    return found
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if hasattr(value, "item"):  # numpy's numbers and arrays, torch's tensors
+        return _finite(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_report(report: dict[str, Any], path: Path) -> Path:
+    """Write a report as JSON that any reader takes."""
+    return write_text(path, json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def amount(value: float | None, digits: int = 3) -> str:
+    """A number in words: few digits, a true minus, a dash for what is missing."""
+    if value is None or math.isnan(value):
+        return "–"
+    short = float(f"{value:.{digits}g}")
+    return f"{short:g}".replace("-", "−")
+
+
+def in_unit(unit: str) -> str:
+    """A unit as it follows a number: nothing for pure numbers."""
+    return "" if unit in ("", "1") else f" {unit}"
+
+
+def interval(effect: NamedEffect) -> str:
+    """An effect's coefficients with their intervals, in one line."""
+    return ", ".join(
+        f"{name} = {amount(c.value)} [{amount(c.low)}, {amount(c.high)}]{in_unit(c.unit)}"
+        for name, c in effect.coefficients.items()
+    )
+
+
+def sentence(diagnosis: Diagnosis) -> str:
+    """The verdict in one sentence."""
+    d = diagnosis
+    names = _listed([effect.name for effect in d.effects])
+    gain = (
+        f"the error on sealed sequences goes from {amount(d.gap.before)} to "
+        f"{amount(d.gap.after)} m² ({closed(d)} of what can be closed above the noise floor of "
+        f"{amount(d.gap.noise_floor)} m²)"
+    )
+    match d.verdict:
+        case "named":
+            them = "it" if len(d.effects) == 1 else "them"
+            return f"The model {d.model} lacks {names}: with {them}, {gain}."
+        case "indistinguishable":
+            alternatives = {a.name for effect in d.effects for a in effect.alternatives}
+            beside = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
+            return (
+                f"The model {d.model} lacks something, and these data cannot tell whether it is "
+                f"{names} or rather {beside}: with {names}, {gain}."
+            )
+        case "unknown":
+            on = _listed(d.unknown.variables) if d.unknown else "variables that were not found"
+            first = f"Beyond {names} the" if d.effects else "The"
+            return (
+                f"{first} model {d.model} lacks something that is not in the catalogue; it "
+                f"depends on {on}."
+            )
+        case "data_fault":
+            where = len({fault.sequence for fault in d.data_faults})
+            number = len(d.data_faults)
+            return (
+                f"The measurement is at fault, not the model: {number} "
+                f"{'fault' if number == 1 else 'faults'} in {where} "
+                f"{'sequence' if where == 1 else 'sequences'}; in the others nothing is missing "
+                f"from {d.model} that these data could show."
+            )
+        case "none":
+            return (
+                f"Nothing is missing from the model {d.model} that these data could show: no "
+                "effect of the catalogue passes, and no structure is left."
+            )
+
+
+def closed(diagnosis: Diagnosis) -> str:
+    """The closed share of the gap, as a percentage."""
+    share = diagnosis.gap.closed
+    return "–" if math.isnan(share) else f"{100 * share:.0f} %".replace("-", "−")
+
+
+def _listed(names: list[str], last: str = "and") -> str:
+    if len(names) < 2:
+        return names[0] if names else "nothing"
+    return f"{', '.join(names[:-1])} {last} {names[-1]}"
+
+
+def extended_options(options: Mapping[str, Any], system: System) -> dict[str, Any]:
+    """The options of a model that give ``system``: effects, and parameters as start values.
+
+    Weights of networks are no options; only a checkpoint holds them.
+
+    Args:
+        options: what the model was built from before it was calibrated and extended.
+    """
+    own = {
+        name: float(getattr(term, name).detach())
+        for term in system.terms
+        if term not in effects_of(system)
+        for name in getattr(term, "units", {})
+        if name in options
+    }
+    effects = [{"name": effect.name, **effect.options()} for effect in effects_of(system)]
+    names = [str(effect["name"]) for effect in effects]
+    name = "_".join([str(options["name"]).split("_with_")[0], "with", *names])
+    if not effects:
+        name = f"{options['name']}_calibrated"
+    rest = {key: value for key, value in options.items() if key != "effects"}
+    return {**rest, "name": name, **own, "effects": effects}
+
+
+def has_network(system: System) -> bool:
+    """Whether a network is among what a model sums."""
+    return any(isinstance(module, FeedForward) for module in system.modules())
+
+
+def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
+    """A model's options as a file for ``conf/model``."""
+    name = options["name"]
+    lines = [
+        f"# Made by scripts/discover.py. Copy it to conf/model/{name}.yaml, then: model={name}",
+    ]
+    if networks:
+        lines.append(f"# The weights of the network are in {CHECKPOINT} only: these would be new.")
+    content = {"defaults": [f"{options['term']}_schema", "_self_"], **options}
+    body = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return "\n".join(lines) + "\n" + body
+
+
+def rebuilt(options: Mapping[str, Any], system: System) -> System:
+    """The model of ``options`` with the parameters of ``system``."""
+    model = build_model(options, 0, torch.float64)
+    target = {effect.name: effect for effect in effects_of(model)}
+    for effect in effects_of(system):
+        target[effect.name].load_state_dict(effect.state_dict())
+    ours, theirs = (
+        [term for term in s.terms if term not in effects_of(s)] for s in (model, system)
+    )
+    for mine, given in zip(ours, theirs, strict=True):
+        mine.load_state_dict(given.state_dict())
+    return model
+
+
+def checkpoint_of(
+    found: Found,
+    sequences: list[Sequence],
+    config: dict[str, Any],
+    manifest: dict[str, Any],
+    optimizer: Any,
+) -> Checkpoint:
+    """The extended model as a checkpoint: trained on the open, tested on the sealed sequences.
+
+    Args:
+        config: a training's composed configuration in plain types, ``model`` that of the
+            extended model.
+        manifest: where the data come from.
+        optimizer: options of the optimiser that training would go on with.
+    """
+    model = rebuilt(config["model"], found.extended)
+    speed = None
+    if model.domain == "traffic":
+        speed = best_common_speed([collate([sequences[i] for i in found.open])])
+    parts = {"train": found.open, "heldout": found.sealed}
+    return Checkpoint(
+        config=config,
+        manifest=manifest,
+        model=model.state_dict(),
+        optimizer=build_optimizer(model, optimizer, int(config["seed"])).state_dict(),
+        progress=dict(UNTRAINED),
+        split={
+            **{part: [sequences[i].name for i in places] for part, places in parts.items()},
+            "dropped": [],
+        },
+        free_speed=speed,
+    )

@@ -1,0 +1,142 @@
+"""What a diagnosis found, as marks: curves by variable, intervals, costs by sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from nnode.discover.result import NamedEffect, Place, Structure
+from nnode.models.effects import CATALOGUE
+from nnode.plots.style import FONT, GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
+
+COLUMNS = 3
+#: Sequences that are named one by one.
+NAMED = 24
+
+#: Colour and marker of the model before and after, the same in all figures.
+BEFORE: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "marker": "s"}
+AFTER: dict[str, Any] = {"color": OKABE_ITO["blue"], "marker": "o"}
+
+
+def place_curves(places: Sequence[Place], unit: str) -> Figure:
+    """Mean deviation by variable, with its standard errors and the interval that stands out.
+
+    Args:
+        places: one panel each.
+        unit: of the deviations.
+    """
+    rows = -(-len(places) // COLUMNS)
+    columns = min(COLUMNS, len(places))
+    figure = new_figure(3.1 * columns + 0.3, 2.5 * rows + 0.3)
+    axes = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for n, place in enumerate(places):
+        ax = axes.flat[n]
+        ax.axhline(0, color=GREY, linewidth=0.8)
+        if np.isfinite([place.low, place.high]).all():
+            ax.axvspan(place.low, place.high, color=OKABE_ITO["orange"], alpha=0.25, linewidth=0)
+        if place.curve:
+            ax.errorbar(
+                place.curve["at"], place.curve["deviation"], yerr=place.curve.get("error"),
+                fmt=".-", color=OKABE_ITO["blue"], linewidth=1, elinewidth=0.8, markersize=4,
+            )  # fmt: skip
+        share = f"{100 * place.share:.0f} % of the excess" if np.isfinite(place.share) else ""
+        dress(
+            ax,
+            x=_with_unit(place.variable, place.unit),
+            y=f"deviation ({unit})" if n % columns == 0 else "",
+            title=share.replace("-", "−"),
+        )
+    for ax in axes.flat[len(places) :]:
+        ax.set_axis_off()
+    return figure
+
+
+def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
+    """Coefficients with their 95 % intervals, each on a scale of its own.
+
+    A dotted line stands at the value without the effect, where it has one.
+    """
+    rows = [(e, name, c) for e in effects for name, c in e.coefficients.items()]
+    figure = new_figure(6.4, 0.75 * len(rows) + 0.35)
+    axes = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
+    for ax, (effect, name, c) in zip(axes, rows, strict=True):
+        known = CATALOGUE.effects.get(effect.name)
+        neutral = known.strengths[name].neutral if known and name in known.strengths else None
+        if neutral is not None:
+            ax.axvline(neutral, color=GREY, linestyle=":", linewidth=1.4)
+        ends = np.array([[c.value - c.low], [c.high - c.value]])
+        ax.errorbar(
+            [c.value], [0], xerr=np.nan_to_num(ends).clip(min=0), fmt="o",
+            color=OKABE_ITO["blue"], capsize=4, markersize=6,
+        )  # fmt: skip
+        ax.set_ylim(-1, 1)
+        ax.set_yticks(
+            [0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit not in ('', '1') else ''}"]
+        )
+        dress(ax, grid=False)
+        ax.tick_params(axis="y", length=0)
+        ax.margins(x=0.15)
+        for side in ("top", "right", "left"):
+            ax.spines[side].set_visible(False)
+    return figure
+
+
+def sealed_costs(
+    names: Sequence[str], before: Sequence[float], after: Sequence[float], floor: float
+) -> Figure:
+    """Mean square error of every sealed sequence, before and after, m².
+
+    Args:
+        floor: of the measurement's noise, m².
+    """
+    order = np.argsort(before)[::-1]
+    b, a = np.asarray(before, float)[order], np.asarray(after, float)[order]
+    place = np.arange(len(order))
+    figure = new_figure(7.2, 3.2)
+    ax = figure.subplots()
+    ax.vlines(place, np.minimum(b, a), np.maximum(b, a), color=GREY, linewidth=1)
+    ax.plot(place, b, linestyle="", markersize=5.5, **BEFORE)
+    ax.plot(place, a, linestyle="", markersize=5.5, **AFTER)
+    positive = np.concatenate([b, a])
+    if (positive > 0).all():
+        ax.set_yscale("log")
+    handles = [
+        Line2D([], [], linestyle="", label="as it was given, calibrated", **BEFORE),
+        Line2D([], [], linestyle="", label="with the effects", **AFTER),
+    ]
+    if np.isfinite(floor) and floor > 0:
+        ax.axhline(floor, color="black", linestyle="--", linewidth=0.9)
+        handles.append(
+            Line2D([], [], color="black", linestyle="--", label="noise of the measurement")
+        )
+    if len(order) <= NAMED:
+        ax.set_xticks(place, [names[i] for i in order], rotation=40, ha="right")
+    else:
+        ax.set_xticks([])
+    dress(ax, x="sealed sequence", y="mean square error (m²)")
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize=SMALL_FONT
+    )
+    return figure
+
+
+def flexible_curve(structure: Structure, unit: str) -> Figure:
+    """What a flexible fit makes of the first variable that is left."""
+    figure = new_figure(4.8, 3.0)
+    ax: Axes = figure.subplots()
+    ax.axhline(0, color=GREY, linewidth=0.8)
+    ax.plot(structure.curve["at"], structure.curve["deviation"], color=OKABE_ITO["blue"])
+    variable = structure.variables[0] if structure.variables else "variable"
+    dress(ax, x=variable, y=f"missing ({unit})")
+    if structure.hint:
+        ax.set_title(f"hint: {structure.hint}", fontsize=FONT, color=GREY, loc="left")
+    return figure
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return name if unit in ("", "1") else f"{name} ({unit})"

@@ -1,0 +1,293 @@
+"""The diagnosis as a command, with results made by hand, and what takes the extended model."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from nnode.app import discover as app
+from nnode.app.cli import check_overrides
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.config import register
+from nnode.data.options import EsimasOptions, TableOptions
+from nnode.discover import pages
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.result import DataFault
+from nnode.errors import ConfigError
+from tests.app.conftest import ROOT, Script, environment
+from tests.discover import stand_in
+from tests.discover.recorded import ZONE, corridor, lane
+
+#: The script with results made by hand.
+CODE = """
+import sys
+from nnode.app import discover
+from nnode.app.cli import run
+if __name__ == "__main__":
+    sys.argv[0] = "scripts/discover.py"
+    discover.CORE = "tests.discover.stand_in"
+    run("discover", discover.discover)
+"""
+
+
+def start(*overrides: str, **env: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", CODE, *overrides],
+        cwd=ROOT,
+        env={**environment(), **env},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def overrides(table: Path, folder: Path) -> list[str]:
+    return ["model=lin", "model.leader=measured", "data=table", f"data.path={table}",
+            "data.domain=traffic", f"hydra.run.dir={folder}", "discover.sealed=0.4"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished diagnosis on a table in which one sequence is faulty."""
+    folder = tmp_path_factory.mktemp("discover")
+    table = lane(folder / "lane.csv", sequences=6, seconds=4.0, cars=3)
+    frame = pd.read_csv(table)
+    frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
+    frame.to_csv(table, index=False)
+    process = start(*overrides(table, folder / "run"), "discover.animation=false")
+    shown, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    (folder / "run" / "shown.txt").write_text(shown)
+    return folder / "run"
+
+
+def test_the_command_prints_what_was_found_and_where_it_is(run: Path) -> None:
+    shown = (run / "shown.txt").read_text()
+    assert "verdict: named" in shown
+    assert "The model lin lacks speed_zone" in shown
+    assert "  speed_zone: alpha = 0.65 [0.627, 0.68], a = 400 [392, 400] m" in shown
+    assert "not to be told from speed_period: platoons at other times" in shown
+    for what, name in (
+        ("report", "report.json"),
+        ("page", "report.html"),
+        ("extended model", "model.yaml"),
+        ("checkpoint", "checkpoints/best.pt"),
+    ):
+        assert f"{what}: {run / name}" in shown.splitlines()
+        assert (run / name).is_file()
+    assert not list(run.rglob(".*.tmp")) + [p for p in run.iterdir() if p.name.startswith(".r")]
+
+
+def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
+    report = json.loads((run / "report.json").read_text())
+    assert report["model"] == "lin"
+    assert report["verdict"] == "named"
+    fault = report["data_faults"][0]
+    assert fault["sequence"] == "lane/0"
+    assert "v0-1" in fault["agents"]
+    assert fault["time"] == pytest.approx(3.2)
+    assert "lane/0" not in report["split"]["open"] + report["split"]["sealed"]
+    assert report["seconds"]["reading"] > 0
+    page = (run / "report.html").read_text()
+    assert f"python scripts/evaluate.py checkpoint={run / 'checkpoints' / 'best.pt'}" in page
+    assert f"cp {run / 'model.yaml'} conf/model/lin_with_speed_zone.yaml" in page
+    assert "python scripts/train.py model=lin_with_speed_zone data=table data.path=" in page
+
+
+def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(
+    script: Script, run: Path, tmp_path: Path
+) -> None:
+    checkpoint = f"checkpoint={run / 'checkpoints' / 'best.pt'}"
+    done = script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    report = json.loads((run / "report.json").read_text())
+    assert metrics["part"] == "heldout"
+    assert metrics["trained_on"] == 0
+    assert sorted(metrics["costs"]) == sorted(report["split"]["sealed"])
+    assert metrics["parameters"]["alpha"] == pytest.approx(0.65)
+    # the mean square error over all vehicles, of a simulation with another step
+    assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
+
+
+def test_force_plots_take_the_checkpoint(script: Script, run: Path, tmp_path: Path) -> None:
+    checkpoint = f"checkpoint={run / 'checkpoints' / 'best.pt'}"
+    done = script("plot_forces", checkpoint, f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "forces.png").stat().st_size > 10_000
+    assert list(pd.read_csv(tmp_path / "forces.csv"))[-1] == "lin_with_speed_zone"
+
+
+def test_the_configuration_trains_from_the_estimates(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "conf", tmp_path / "conf")
+    shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
+    shutil.copy(run / "model.yaml", tmp_path / "conf" / "model" / "lin_with_speed_zone.yaml")
+    table = run.parent / "lane.csv"
+    done = subprocess.run(
+        [
+            sys.executable, "scripts/train.py", "model=lin_with_speed_zone", "solver=fused",
+            "data=table", f"data.path={table}", "data.domain=traffic", "trainer.max_epochs=1",
+            "solver.dt=0.02", f"hydra.run.dir={tmp_path / 'run'}",
+        ],
+        cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    first = result["history"][0]
+    assert first["parameters/alpha"] == pytest.approx(0.65)
+    assert first["parameters/a"] == pytest.approx(ZONE[0])
+    checkpoint = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.pt")
+    assert checkpoint.history[-1]["parameters/alpha"] != 0.65  # it is calibrated
+
+
+@pytest.mark.slow
+def test_training_goes_on_with_the_open_sequences(
+    script: Script, run: Path, tmp_path: Path
+) -> None:
+    resume = f"resume={run / 'checkpoints' / 'best.pt'}"
+    done = script("train", resume, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    before = load_checkpoint(run / "checkpoints" / "best.pt")
+    after = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
+    report = json.loads((run / "report.json").read_text())
+    assert after.split["heldout"] == before.split["heldout"] == report["split"]["sealed"]
+    assert after.split["train"] == report["split"]["open"]
+    assert after.history[0]["parameters/alpha"] == pytest.approx(0.65)
+
+
+def test_a_signal_leaves_no_half_report(run: Path, tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+    process = start(
+        *overrides(run.parent / "lane.csv", tmp_path / "run"), **{stand_in.WAIT: str(sign)}
+    )
+    while process.poll() is None and not sign.exists():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM, errors
+    assert "stopped by SIGTERM: the diagnosis was not finished and nothing of it" in errors
+    assert "Traceback" not in errors
+    left = {p.name for p in (tmp_path / "run").iterdir()}
+    assert left <= {"data", ".hydra", "discover.log"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["discover.efects=[inertia]"], r"did you mean discover\.effects"),
+        (["discover.page=perhaps"], "discover.page=perhaps is refused"),
+        (["model=line"], r"model=line is unknown.*did you mean lin"),
+        (["discover.max_effects=many"], "could not be converted to Integer"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_words(given: list[str], message: str) -> None:
+    register()
+    with pytest.raises(ConfigError, match=message):
+        check_overrides(given, ROOT / "conf", "discover")
+
+
+def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
+    full = app._model_options(model, "measured")
+    return app._job(full, data, {}, {}, DiscoverOptions(**options), Path("nowhere"))
+
+
+def test_model_and_data_of_two_domains_are_refused() -> None:
+    with pytest.raises(ConfigError, match="model=social_force is a crowd model, data=esimas are"):
+        job({"term": "social_force"}, EsimasOptions())
+
+
+def test_an_unknown_effect_is_refused_before_any_data_are_read() -> None:
+    data = TableOptions(domain="traffic", path="there/is/none.csv")
+    with pytest.raises(ConfigError, match=r"no traffic effect relative_sped.*relative_speed\?"):
+        job({"term": "lin"}, data, effects=["relative_sped"])
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ({"term": "linn"}, r"model\.term=linn is unknown"),
+        ({}, r"model\.term= is unknown"),
+        ({"term": "lin", "w0": 3}, "w0"),
+        ({"term": "lin", "v0": "fast"}, "v0|fast"),
+    ],
+)
+def test_wrong_options_of_a_model_are_refused(model: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        app.diagnose_table("any.csv", "traffic", model=model)
+
+
+@pytest.fixture
+def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results made by hand, and nothing that could be drawn."""
+    monkeypatch.setattr(app, "CORE", "tests.discover.stand_in")
+
+    def never(*_: object) -> None:
+        pytest.fail("something was drawn")
+
+    monkeypatch.setattr(pages, "draw", never)
+
+
+@pytest.mark.usefixtures("by_hand")
+def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> None:
+    table, walls = corridor(tmp_path / "walk.csv", sequences=4, seconds=2.0, people=4)
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    report = app.diagnose_table(
+        table, "crowd", model={"term": "social_force", "B": 0.3, "walls": False}, walls=walls,
+        seed=3,
+    )  # fmt: skip
+    assert report["verdict"] == "named"
+    assert report["model"] == "social_force"
+    assert report["effects"][0]["coefficients"]["w_y"]["value"] == pytest.approx(0.35)
+    assert sorted(tmp_path.iterdir()) == before
+    json.dumps(report, allow_nan=False)
+
+
+@pytest.mark.usefixtures("by_hand")
+def test_without_a_page_nothing_is_drawn(tmp_path: Path) -> None:
+    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    report = app.diagnose_table(
+        table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
+        options=DiscoverOptions(page=False),
+    )  # fmt: skip
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"checkpoints", "data", "model.yaml", "report.json"}
+    assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
+    assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
+
+
+@pytest.mark.usefixtures("by_hand")
+def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, monkeypatch) -> None:
+    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    frame = pd.read_csv(table)
+    frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
+    frame.to_csv(table, index=False)
+    real = stand_in.diagnose
+
+    def nothing(*arguments: Any, faults: dict[str, Any]) -> Any:
+        found = real(*arguments, faults=faults)
+        known = faults["lane/1"][0]
+        # what the diagnosis reports itself: one fault that the reader knows, one of its own
+        again = DataFault(known.kind, known.sequence, ["1"], known.time)
+        mine = DataFault("overlap", "lane/2", ["0"], 3.0)
+        diagnosis = replace(found.diagnosis, verdict="none", data_faults=[again, mine])
+        return replace(found, diagnosis=diagnosis)
+
+    monkeypatch.setattr(stand_in, "diagnose", nothing)
+    report = app.diagnose_table(table, "traffic", model={"term": "lin"})
+    assert report["verdict"] == "data_fault"
+    faults = [(f["kind"], f["sequence"], f["agents"]) for f in report["data_faults"]]
+    assert ("overlap", "lane/2", ["0"]) in faults
+    assert sum(sequence == "lane/1" for _, sequence, _ in faults) == len(faults) - 1
+    assert all(agent.startswith("v1-") for _, s, agents in faults if s == "lane/1"
+               for agent in agents)  # fmt: skip

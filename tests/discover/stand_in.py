@@ -1,0 +1,174 @@
+"""A diagnosis with results made by hand, to test what stands before and after the real one."""
+
+from __future__ import annotations
+
+import os
+import time
+from copy import deepcopy
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.data.quality import Fault
+from nnode.data.sequence import Sequence
+from nnode.discover.deviation import simulate
+from nnode.discover.found import Found
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.result import (
+    Absence,
+    Alternative,
+    Coefficient,
+    Diagnosis,
+    Gap,
+    NamedEffect,
+    Place,
+    Structure,
+)
+from nnode.models import Linear, System
+from nnode.models.build import add_effects
+from nnode.models.crowd import SocialForce
+from nnode.models.effects import CATALOGUE, Effect, Strength
+from nnode.models.term import Interval, State
+from tests.discover.recorded import ALPHA, PUSH, V0, WIND, ZONE, L
+
+#: A folder: the stand-in leaves a sign there and waits, so that it can be interrupted.
+WAIT = "STAND_IN_WAITS_IN"
+
+
+@CATALOGUE.add
+class Wind(Effect):
+    """Everyone is pushed the same way."""
+
+    w_x: Tensor
+    w_y: Tensor
+    name = "made_up_wind"
+    domain = "crowd"
+    formula = "+ (w_x, w_y)"
+    source = "none: made up"
+    strengths: ClassVar = {
+        "w_x": Strength(0.0, 0.1, Interval(-2.0, 2.0), "m/s²"),
+        "w_y": Strength(0.0, 0.1, Interval(-2.0, 2.0), "m/s²"),
+    }
+
+    def forward(self, state: State) -> Tensor:
+        return torch.stack([self.w_x, self.w_y]).expand_as(state.x)
+
+
+def diagnose(
+    system: System,
+    sequences: list[Sequence],
+    options: DiscoverOptions,
+    *,
+    faults: dict[str, list[Fault]],
+) -> Found:
+    """Results that a right diagnosis of :mod:`tests.discover.recorded` would come to."""
+    if os.environ.get(WAIT):
+        Path(os.environ[WAIT]).write_text("")
+        time.sleep(60)
+    traffic = system.domain == "traffic"
+    number = max(1, round(options.sealed * len(sequences)))
+    sealed = list(range(len(sequences) - number, len(sequences)))
+    base = calibrated(system)
+    extended = deepcopy(base)
+    if traffic:
+        a, b = ZONE
+        values = {"alpha": ALPHA, "a": a, "b": b}
+        add_effects(extended, [{"name": "speed_zone", **values}])
+    else:
+        values = {"w_x": WIND[0], "w_y": WIND[1]}
+        add_effects(extended, [{"name": "made_up_wind", **values}])
+    name = "speed_zone" if traffic else "made_up_wind"
+    units = {**CATALOGUE.effects[name].strengths, **CATALOGUE.effects[name].settings}
+    effect = NamedEffect(
+        name=name,
+        formula=CATALOGUE.effects[name].formula,
+        source=CATALOGUE.effects[name].source,
+        coefficients={
+            key: Coefficient(v, v - 0.02 * abs(v) - 0.01, v + 0.03, units[key].unit)
+            for key, v in values.items()
+        },
+        where=f"x in [{ZONE[0]:g}, {ZONE[1]:g}] m" if traffic else "everywhere",
+        alternatives=[Alternative("speed_period", 1.02, 0.3, "platoons at other times")]
+        if traffic
+        else [],
+        p_value=0.001,
+        gain=0.63,
+    )
+    costs = _costs((base, extended), [sequences[i] for i in sealed])
+    before, after = costs.mean(0)
+    floor = 0.0025 if traffic else 0.0002
+    at = np.linspace(0, 1000, 12)
+    near = np.exp(-(((at - 500) / 90) ** 2))
+    return Found(
+        diagnosis=Diagnosis(
+            verdict="named",
+            domain=system.domain,
+            model="stand-in",
+            effects=[effect],
+            data_faults=[],
+            not_testable=["reaction_delay"] if traffic else [],
+            absences=[
+                Absence("inertia", True, "tau_v", "s", 0.2, 0.15, ""),
+                Absence("vehicle_class", False, "phi", "1", None, None, "no classes are known"),
+            ],
+            places=[
+                Place(
+                    variable,
+                    unit,
+                    400,
+                    600,
+                    -6.1,
+                    0.4,
+                    0.71,
+                    0.001,
+                    {"at": list(at), "deviation": list(-6 * near), "error": list(0.3 + 0 * at)},
+                )
+                for variable, unit in (("position", "m"), ("gap", "m"), ("clock time", "s"))
+            ],
+            unknown=Structure(
+                ["position", "gap"], 0.07, "0.02 x", {"at": list(at), "deviation": list(near)}
+            ),
+            gap=Gap(before, after, floor, (before - after) / (before - floor)),
+            base={"v0": {"before": 24.0, "after": V0, "unit": "m/s"}} if traffic else {},
+            split={
+                "open": [s.name for i, s in enumerate(sequences) if i not in sealed],
+                "sealed": [sequences[i].name for i in sealed],
+            },
+            notes=["made by hand"],
+            seconds={"screening": 1.0},
+            sealed=[
+                {"name": sequences[i].name, "before": b, "after": a}
+                for i, (b, a) in zip(sealed, costs, strict=True)
+            ],
+        ),
+        base=base,
+        extended=extended,
+        open=[i for i in range(len(sequences)) if i not in sealed],
+        sealed=sealed,
+    )
+
+
+@torch.no_grad()
+def calibrated(system: System) -> System:
+    """A copy with parameters that fit the recorded data without the effect."""
+    base = deepcopy(system)
+    law, force = base.find(Linear), base.find(SocialForce)
+    if law is not None:
+        law.v0.fill_(V0)
+        law.L.fill_(L)
+    if force is not None:
+        force.A.fill_(PUSH)
+        force.k.fill_(0.0)
+        force.kappa.fill_(0.0)
+    return base
+
+
+def _costs(systems: tuple[System, ...], sequences: list[Sequence]) -> np.ndarray:
+    columns = []
+    for system in systems:
+        pairs = zip(simulate(system, sequences), sequences, strict=True)
+        columns.append([np.nan if x is None else np.mean((x - s.x) ** 2) for x, s in pairs])
+    return np.array(columns).T
