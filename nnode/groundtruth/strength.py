@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-#: Two effects hidden together may differ in their misfit by this factor.
+#: Two effects hidden together should not differ in their misfit by more than this factor.
 _BALANCE = 3.0
 #: A share is reached where it is this close.
 _CLOSE = 0.02
@@ -25,6 +25,7 @@ class Amplitude:
         misfit: M, mean squared misfit of the recalibrated base model without noise, m².
         spread: V, mean squared displacement by noise of amplitude 1, m².
         reached: the share that an oracle really removes.
+        alone: M of each effect without the others, m².
     """
 
     share: float
@@ -33,6 +34,7 @@ class Amplitude:
     misfit: float = 0.0
     spread: float = 0.0
     reached: float | None = None
+    alone: dict[str, float] = field(default_factory=dict)
 
 
 def amplitude_for(
@@ -75,15 +77,19 @@ def _got(amplitude: Amplitude) -> float:
     return 0.0 if amplitude.reached is None else amplitude.reached
 
 
-def balanced(misfits: dict[str, float]) -> dict[str, float]:
-    """Factors on coefficients after which no effect hides in the shadow of another.
+def scaled(misfits: dict[str, float], factor: float) -> dict[str, float]:
+    """Factors on effects that together change their misfit by ``factor`` squared.
+
+    One that outweighs the others is made smaller, so that none hides in the shadow of another;
+    and one that is outweighed is not made smaller still.
 
     Args:
         misfits: mean squared misfit that each effect causes alone, m².
     """
-    middle = float(np.exp(np.mean([np.log(max(m, 1e-12)) for m in misfits.values()])))
-    limit = float(np.sqrt(_BALANCE))
-    return {
-        name: float(np.sqrt(np.clip(m, middle / limit, middle * limit) / max(m, 1e-12)))
-        for name, m in misfits.items()
-    }
+    least = max(min(misfits.values()), 1e-12)
+    found = {}
+    for name, misfit in misfits.items():
+        even = min(1.0, float(np.sqrt(_BALANCE * least / max(misfit, 1e-12))))
+        outweighed = len(misfits) > 1 and misfit < 0.5 * max(misfits.values())
+        found[name] = even * (max(factor, 1.0) if outweighed else factor)
+    return found

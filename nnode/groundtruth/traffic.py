@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nnode.groundtruth.case import STRENGTHS, Case, check_effects
-from nnode.groundtruth.strength import Amplitude, amplitude_for, balanced, refine
+from nnode.groundtruth.strength import Amplitude, amplitude_for, refine, scaled
 from nnode.groundtruth.traffic_catalogue import (
     EFFECTS,
     SMOOTH_EDGE,
@@ -18,7 +18,7 @@ from nnode.groundtruth.traffic_replay import Recording, cost_by_sequence
 from nnode.groundtruth.traffic_road import BURN_IN, SUBSTEPS, Road, lay_out, surroundings
 
 #: Standard deviation of drivers' velocities, m/s: coefficients are rescaled to keep it here,
-AMPLITUDES = (0.02, 0.6)
+AMPLITUDES = (0.02, 1.0)
 #: and it goes no farther than this where that does not suffice.
 EXTREME_AMPLITUDES = (0.005, 2.0)
 #: So often coefficients are rescaled; the misfit is not quite quadratic in them.
@@ -223,29 +223,28 @@ class TrafficCase:
         share = STRENGTHS[case.strength]
         if case.arm == "no_excitation" or case.variant == "white":
             return Amplitude(share=share, value=0.0)
-        if not case.effects:
+        if not case.effects or "leader_speed" in case.effects:
+            # a leader at the wrong speed is beyond all noise that could be set against it
             value = float(rng.uniform(*_IDLE_AMPLITUDES))
             self.truth = replace(self.truth, amplitude=value)
             return Amplitude(share=share, value=value)
         if share == 1.0:
             return Amplitude(share=share, value=0.0)
-        if len(case.effects) > 1:
-            self._rescale(balanced({name: self._misfit([name]) for name in case.effects}))
         for left in range(_RESCALINGS, -1, -1):
+            alone = {name: self._misfit([name]) for name in case.effects}
             misfit, spread = self._misfit(list(case.effects)), self._spread()
             first = amplitude_for(misfit, spread, share, EXTREME_AMPLITUDES)
             within = float(np.clip(first.wanted, *AMPLITUDES))
             # the misfit grows about as the square of the coefficient, as noise does
-            if not left or within == first.wanted:
-                break
-            if not self._rescale(dict.fromkeys(case.effects, within / first.wanted)):
+            factors = scaled(alone, within / first.wanted)
+            if not left or not self._rescale(factors):
                 break
 
         def reached(value: float) -> float:
             truth = replace(self.truth, amplitude=value)
             return self.costs(truth).share
 
-        found = refine(first, reached, EXTREME_AMPLITUDES)
+        found = refine(replace(first, alone=alone), reached, EXTREME_AMPLITUDES)
         self.truth = replace(self.truth, amplitude=found.value)
         return found
 
@@ -254,6 +253,11 @@ class TrafficCase:
         changed = dict(self.truth.effects)
         for name, factor in factors.items():
             rescaled = EFFECTS[name].rescaled
+            if factor == 1.0:
+                continue
+            if name in dict(_LATE):
+                # it is as large as stability lets it be
+                factor = min(factor, 1.0)
             if rescaled is not None:
                 changed[name] = rescaled(changed[name], factor, self.road.around)
         same = changed == self.truth.effects

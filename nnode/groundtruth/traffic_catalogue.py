@@ -103,7 +103,7 @@ def _simple(
 
 
 #: Factors on W as drawn, and as strength may move them.
-_REDUCED, _REDUCED_REACH = (0.6, 0.85), (0.6, 0.95)
+_REDUCED, _REDUCED_REACH = (0.6, 0.85), (0.6, 0.97)
 
 
 def _zone(rng: np.random.Generator, _: Surroundings) -> Coefficients:
@@ -139,10 +139,13 @@ def _top_speed(rng: np.random.Generator, around: Surroundings) -> Coefficients:
 
 
 def _nearer_top(values: Coefficients, factor: float, around: Surroundings) -> Coefficients:
-    """The nearer to the fastest leader, the less a top speed shows; it always binds sometimes."""
+    """The nearer to the fastest leader, the less a top speed shows; it always binds sometimes.
+
+    It binds less often and less far at once: the root makes up for the higher power.
+    """
     span = around.fast - around.slow
-    below = factor * (around.fast - values["v_max"])
-    return {"v_max": around.fast - float(np.clip(below, 0.06 * span, 0.5 * span))}
+    below = np.sqrt(factor) * (around.fast - values["v_max"])
+    return {"v_max": around.fast - float(np.clip(below, 0.12 * span, 0.5 * span))}
 
 
 def _bump(rng: np.random.Generator, around: Surroundings) -> Coefficients:
@@ -185,14 +188,14 @@ CATALOGUE: dict[str, Effect] = {
         "phi",
         (0.75, 0.9),
         nothing=1.0,
-        reach=(0.75, 0.95),
+        reach=(0.75, 0.97),
         fields={},
     ),
     "driver_heterogeneity": _simple(
         "(1 + eta_i) W, eta_i normal of mean 0 and standard deviation sigma",
         "sigma",
         (0.05, 0.12),
-        reach=(0.03, 0.12),
+        reach=(0.02, 0.12),
         fields={},
     ),
     "free_flow_speed": Effect(

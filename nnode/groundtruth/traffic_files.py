@@ -63,6 +63,7 @@ def write_traffic(case: Case, folder: Path) -> dict[str, Any]:
             "reached": costs.share,
             "misfit": made.amplitude.misfit,
             "spread": made.amplitude.spread,
+            "alone": made.amplitude.alone,
         },
         "cost": {
             "unit": "m²",
