@@ -221,15 +221,14 @@ class TrafficCase:
         """Choose the drivers' noise, and where it must the coefficients; keeps both."""
         case = self.case
         share = STRENGTHS[case.strength]
-        if case.arm == "no_excitation" or case.variant == "white":
+        silent = case.arm == "no_excitation" or case.variant == "white"
+        if silent or (case.effects and share == 1.0):
             return Amplitude(share=share, value=0.0)
         if not case.effects or "leader_speed" in case.effects:
             # a leader at the wrong speed is beyond all noise that could be set against it
             value = float(rng.uniform(*_IDLE_AMPLITUDES))
             self.truth = replace(self.truth, amplitude=value)
             return Amplitude(share=share, value=value)
-        if share == 1.0:
-            return Amplitude(share=share, value=0.0)
         for left in range(_RESCALINGS, -1, -1):
             alone = {name: self._misfit([name]) for name in case.effects}
             misfit, spread = self._misfit(list(case.effects)), self._spread()
