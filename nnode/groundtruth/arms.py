@@ -1,0 +1,122 @@
+"""The cases of the benchmark: which truths are hidden, arm by arm."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from nnode.errors import ConfigError
+from nnode.groundtruth import faults, traffic_catalogue
+from nnode.groundtruth.case import ARMS, Case
+
+NULLS = ("white", "autocorrelated", "heterogeneous")
+
+#: Effects that act in different places, times or variables, so that both can be told.
+TRAFFIC_PAIRS = (
+    ("relative_speed", "speed_zone"),
+    ("relative_speed", "driver_heterogeneity"),
+    ("relative_speed", "multi_anticipation"),
+    ("multi_anticipation", "speed_period"),
+    ("multi_anticipation", "vehicle_class"),
+    ("reaction_delay", "speed_zone"),
+    ("inertia", "vehicle_class"),
+    ("speed_zone", "speed_period"),
+    ("time_gap", "speed_zone"),
+    ("free_flow_speed", "vehicle_class"),
+)
+
+
+@dataclass(frozen=True)
+class Hides:
+    """What one case of an arm hides."""
+
+    effects: tuple[str, ...] = ()
+    variant: str = "plain"
+
+
+def _traffic() -> dict[str, list[Hides]]:
+    return {
+        "single": [Hides((name,)) for name in traffic_catalogue.CATALOGUE],
+        "pair": [Hides(pair) for pair in TRAFFIC_PAIRS],
+        "null": [Hides((), variant) for variant in NULLS],
+        "outside": [Hides((name,)) for name in traffic_catalogue.OUTSIDE],
+        "near_miss": [
+            Hides(("speed_zone",), "smooth"),
+            Hides(("speed_period",), "smooth"),
+            Hides(("relative_speed",), "heavy_tails"),
+            Hides(("multi_anticipation",), "heavy_tails"),
+            Hides((), "heavy_tails"),
+        ],
+        "no_excitation": [Hides((name,)) for name in traffic_catalogue.NEEDS_EXCITATION],
+        "fault": [Hides((), kind) for kind in faults.KINDS],
+    }
+
+
+_HIDES = {"traffic": _traffic}
+
+
+def hides(domain: str, arm: str) -> list[Hides]:
+    """What the cases of an arm hide.
+
+    Raises:
+        ConfigError: an unknown domain or arm.
+    """
+    if domain not in _HIDES:
+        raise ConfigError(f"domain={domain}: expected one of {', '.join(_HIDES)}")
+    if arm not in ARMS:
+        raise ConfigError(f"arm={arm}: expected one of {', '.join(ARMS)}")
+    return _HIDES[domain]()[arm]
+
+
+def cases(
+    domain: str,
+    arm: str,
+    *,
+    seeds: Iterable[int],
+    strengths: Iterable[str] = ("medium",),
+    noises: Iterable[float | None] = (None,),
+    sizes: Iterable[int] = (20,),
+    effects: Iterable[str] | None = None,
+) -> list[Case]:
+    """Every case of an arm: what it hides × strengths × noise × number of sequences × seeds.
+
+    Strength has no meaning where nothing is hidden or nothing can be seen; such arms come with
+    the strength ``full`` only.
+
+    Args:
+        noises: standard deviations of measured positions (m); None takes the domain's low one.
+        sizes: numbers of sequences.
+        effects: keeps the cases that hide at least one of these.
+
+    Raises:
+        ConfigError: an unknown domain, arm, strength or effect.
+    """
+    wanted = None if effects is None else set(effects)
+    found = []
+    seeds, noises, sizes, strengths = list(seeds), list(noises), list(sizes), list(strengths)
+    known = {name for item in hides(domain, arm) for name in item.effects}
+    if wanted is not None and known and not wanted & known:
+        raise ConfigError(
+            f"effects={sorted(wanted)}: {domain}, arm {arm}, hides {', '.join(sorted(known))}"
+        )
+    for item in hides(domain, arm):
+        if wanted is not None and not wanted & set(item.effects):
+            continue
+        idle = not item.effects or arm == "no_excitation"
+        for strength in ["full"] if idle else strengths:
+            for noise in noises:
+                for size in sizes:
+                    found += [
+                        Case(
+                            domain=domain,
+                            arm=arm,
+                            effects=item.effects,
+                            variant=item.variant,
+                            strength=strength,
+                            noise=noise,
+                            n_sequences=size,
+                            seed=seed,
+                        )
+                        for seed in seeds
+                    ]
+    return found
