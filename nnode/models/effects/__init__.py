@@ -1,6 +1,27 @@
 """Effects that a model may lack: terms with a name, a formula, units and a source."""
 
-from nnode.models.effects import following, traffic
+from nnode.models.effects import (
+    crowd_force,
+    crowd_individual,
+    crowd_motion,
+    crowd_pairs,
+    crowd_places,
+    following,
+    traffic,
+)
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 
-__all__ = ["CATALOGUE", "Effect", "Probe", "Setting", "Strength", "following", "traffic"]
+__all__ = [
+    "CATALOGUE",
+    "Effect",
+    "Probe",
+    "Setting",
+    "Strength",
+    "crowd_force",
+    "crowd_individual",
+    "crowd_motion",
+    "crowd_pairs",
+    "crowd_places",
+    "following",
+    "traffic",
+]
