@@ -98,14 +98,10 @@ class InteractionForce(Term):
         x, v, scene = state.x, _velocity(state), state.scene
         parts = {"pair": self.pairs(state).sum(2)}
         if self.walls and scene.wall.shape[1]:
-            b, n, p = *x.shape[:2], scene.wall.shape[1]
-            force = self.wall_force(
-                x[:, :, None] - scene.wall[:, None],
-                v[:, :, None].expand(b, n, p, 2),
-                scene.wall_normal[:, None].expand(b, n, p, 2),
-            )
-            acts = scene.wall_point[:, None, :, None]
-            parts["wall"] = (force * acts).sum(2) / (self.mass * scene.wall_count)
+            wall, normal, real = scene.walls_of_each()
+            dx = x[:, :, None] - wall
+            force = self.wall_force(dx, v[:, :, None].expand_as(dx), normal.expand_as(dx))
+            parts["wall"] = (force * real[..., None]).sum(2) / (self.mass * scene.wall_count)
         return parts
 
     def forward(self, state: State) -> Tensor:

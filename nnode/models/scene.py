@@ -84,6 +84,11 @@ class Scene:
             group=batch.group,
         )
 
+    def walls_of_each(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Wall points ``(B, N or 1, P, 2)`` that each person feels, their normals, and the mask
+        ``(B, N or 1, P)`` of real ones."""
+        return self.wall[:, None], self.wall_normal[:, None], self.wall_point[:, None]
+
     def measured_at(self, t: Tensor) -> Tensor:
         """``(B, N, D)`` measured positions at time ``t`` (s), linear between samples."""
         return self._between(self.measured, t)

@@ -116,7 +116,9 @@ class Effect(Term):
 
     def options(self) -> dict[str, Any]:
         """What builds this effect again, in plain numbers."""
-        return {name: float(getattr(self, name)) for name in (*self.strengths, *self.settings)}
+        return {
+            name: float(getattr(self, name).detach()) for name in (*self.strengths, *self.settings)
+        }
 
 
 @dataclass(frozen=True)
