@@ -57,7 +57,8 @@ class CrowdEngine:
         batch: the sequences.
         sequence: ``(n,)`` position of each residual's sequence in the batch.
         block: ``(n,)`` number of its block: everyone in neighbouring windows of a sequence.
-        person: ``(n,)`` number of its person, counted through all sequences.
+        unit: ``(n,)`` number of its person, counted through all sequences.
+        people: of each unit the sequence and the place of the person.
         half: ``(n,)`` 0 or 1: windows of a person taken alternately.
 
     Raises:
@@ -74,8 +75,9 @@ class CrowdEngine:
         self.sequence = sequence.repeat(each)
         block = np.stack([sequence, number // together], 1)
         self.block = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
-        pair = np.stack([sequence, who], 1)
-        self.person = np.unique(pair, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
+        pairs, unit = np.unique(np.stack([sequence, who], 1), axis=0, return_inverse=True)
+        self.unit = unit.reshape(-1).repeat(each)
+        self.people = [[(int(b), int(i))] for b, i in pairs]
         self.half = (number % 2).repeat(each)
         self._scene: WindowScene | None = None
         self._tables: Tables | None = None
@@ -166,7 +168,7 @@ class CrowdEngine:
         """``(M, n)``: derivatives of everyone's residuals with respect to M numbers of his own.
 
         As people walk alone, the derivative with respect to one person's number is the same
-        column, restricted to the residuals where ``person`` is his. ``walker_heterogeneity``: M
+        column, restricted to the residuals of this unit. ``walker_heterogeneity``: M
         = 1, eta_i. ``gait_sway`` at ``options["f"]``: M = 2, amplitudes (m/s²) of sine and
         cosine of the clock.
         """

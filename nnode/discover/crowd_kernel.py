@@ -91,31 +91,30 @@ def accelerations(
 
 
 @njit(nogil=True, cache=True, **_OPTIONS)
-def simulate(
-    start: Any, h: float, others: Any, window: Any, meets: Any, wall: Any, points: Any,
-    fixed: Any, law: Any, q: Any,
-) -> Any:  # fmt: skip
-    """``(F, R, P, 4)`` states by the classical Runge-Kutta method with steps ``h`` (s), from
-    ``start`` ``(P, 4)``; the moments of the tables are half steps."""
-    steps = (others.shape[0] - 1) // 2
-    out = np.empty((steps + 1, q.shape[0], start.shape[0], 4))
+def advance(
+    now: Any, before: Any, after: Any, out: Any, n: int, h: float, others: Any, window: Any,
+    meets: Any, wall: Any, points: Any, fixed: Any, law: Any, q: Any,
+) -> None:  # fmt: skip
+    """Step ``n`` of ``h`` s by the classical Runge-Kutta method, from states ``now`` to ``out``.
+
+    Both are ``(R, P, 4)``. Accelerations ``before`` and ``after`` ``(R, P, 2)`` are added, linear
+    in between; the moments of the tables are half steps.
+    """
     k, y = np.empty((4, 4)), np.empty(4)
-    for r in range(q.shape[0]):
-        for p in range(start.shape[0]):
-            out[0, r, p] = start[p]
-            for n in range(steps):
-                now = out[n, r, p]
-                for stage in range(4):
-                    moment = 2 * n + (0 if stage == 0 else (2 if stage == 3 else 1))
-                    ahead = 0.0 if stage == 0 else (h if stage == 3 else h / 2)
-                    for c in range(4):
-                        y[c] = now[c] + (ahead * k[stage - 1, c] if stage else 0.0)
-                    k[stage, 0], k[stage, 1] = y[2], y[3]
-                    k[stage, 2], k[stage, 3] = _rate(
-                        y[0], y[1], y[2], y[3], others[moment, window[p]], meets[p], wall[p],
-                        points[p], fixed[p], law, q[r],
-                    )  # fmt: skip
+    for r in range(now.shape[0]):
+        for p in range(now.shape[1]):
+            for stage in range(4):
+                moment = 2 * n + (0 if stage == 0 else (2 if stage == 3 else 1))
+                share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
                 for c in range(4):
-                    slope = k[0, c] + 2 * k[1, c] + 2 * k[2, c] + k[3, c]
-                    out[n + 1, r, p, c] = now[c] + h / 6 * slope
-    return out
+                    y[c] = now[r, p, c] + (share * h * k[stage - 1, c] if stage else 0.0)
+                k[stage, 0], k[stage, 1] = y[2], y[3]
+                ax, ay = _rate(
+                    y[0], y[1], y[2], y[3], others[moment, window[p]], meets[p], wall[p],
+                    points[p], fixed[p], law, q[r],
+                )  # fmt: skip
+                k[stage, 2] = ax + (1 - share) * before[r, p, 0] + share * after[r, p, 0]
+                k[stage, 3] = ay + (1 - share) * before[r, p, 1] + share * after[r, p, 1]
+            for c in range(4):
+                slope = k[0, c] + 2 * k[1, c] + 2 * k[2, c] + k[3, c]
+                out[r, p, c] = now[r, p, c] + h / 6 * slope

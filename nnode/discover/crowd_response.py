@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import functional_call, jvp
+from torch.func import functional_call
 
 from nnode.discover import crowd_kernel
 from nnode.discover.crowd_walk import Walk
+from nnode.discover.engine import trained
 from nnode.models.effects.base import Effect
 from nnode.models.term import State
 
@@ -63,17 +62,16 @@ class Frames:
 
     def parameter_tangents(self) -> Tensor:
         """``(K, W * F, N, 2)``: derivatives of the accelerations with respect to the row."""
-        own, state = self._own(), self.state()
-        base = self._compiled(
-            self.x, self.v, self.walk.forces(self.row[None]) if self._fast else None
-        )
-        state = replace(state, rate=base)
-        out = []
-        for name, value in own.items():
-            for k in range(value.numel()):
-                one = torch.zeros_like(value).reshape(-1)
-                one[k] = 1.0
-                out.append(self._tangent(own, name, one.reshape(value.shape), state))
+        own, steps = self._own(), self._steps()
+        out: list[Tensor] = []
+        with torch.no_grad():
+            for name, value in own.items():
+                for k in range(value.numel()):
+                    half = torch.zeros_like(value).reshape(-1)
+                    half[k] = steps[len(out)] / 2
+                    half = half.reshape(value.shape)
+                    more, less = (self._changed(own, name, value + s * half) for s in (1, -1))
+                    out.append((more - less) / steps[len(out)])
         return torch.stack(out)
 
     def jacobian(self) -> Tensor:
@@ -104,38 +102,46 @@ class Frames:
         return {name: part[0] for name, part in self.walk.parameters(self.row[None]).items()}
 
     def _beyond(self, own: dict[str, Tensor], state: State) -> Tensor:
-        if not self.walk.beyond._added:
+        if not self.walk.beyond.added:
             return torch.zeros_like(state.x)
         found: Tensor = functional_call(self.walk.beyond, own, (state,))
         return found
 
-    def _tangent(self, own: dict[str, Tensor], name: str, one: Tensor, state: State) -> Tensor:
-        total = torch.zeros_like(self.x)
+    def _steps(self) -> list[float]:
+        """Differences of the parameters. An effect's force may be rough: what it does over a
+        visible difference of its strength is what a fit has to know."""
+        out = []
+        for name, p in trained(self.walk.system).items():
+            _, place, key = name.split(".", 2)
+            term = self.walk.system.terms[int(place)]
+            known = term.strengths.get(key) if isinstance(term, Effect) else None
+            size = 1e-3 * max(1.0, float(p.detach().abs().max()))
+            out += [size if known is None else abs(known.step)] * p.numel()
+        return out
+
+    def _changed(self, own: dict[str, Tensor], name: str, value: Tensor) -> Tensor:
+        """``(W * F, N, 2)`` m/s²: what depends on a parameter, at another value of it."""
         key = name.removeprefix("system.")
-        if self._fast and key in self.walk.own:
-            unit = np.zeros((1, 3))
-            unit[0, self.walk.own.index(key)] = 1.0
-            # linear in its parameters, without what does not depend on them
-            nothing = self._compiled(self.x, self.v, np.zeros((1, 3)))
-            total = self._compiled(self.x, self.v, unit) - nothing
-        if not self.walk.beyond._added:
-            return total
-        place = key.split(".")
-        term = self.walk.system.terms[int(place[1])]
-        if isinstance(term, Effect):
-            # nobody else reads an effect's parameters
-            def rate(value: Tensor) -> Tensor:
-                whole = {p: q for p, q in own.items() if p.startswith(f"system.terms.{place[1]}.")}
-                mine = {p.split(".", 3)[3]: q for p, q in whole.items()}
-                found: Tensor = functional_call(term, {**mine, place[2]: value}, (state,))
-                return found
-        else:
+        whole = {**own, name: value}
+        _, place, _ = key.split(".", 2)
+        term = self.walk.system.terms[int(place)]
+        if isinstance(term, Effect) and self._last(term):
+            start = f"system.terms.{place}."
+            mine = {n.removeprefix(start): v for n, v in whole.items() if n.startswith(start)}
+            found: Tensor = functional_call(term, mine, (self.state(),))
+            return found
+        q = None
+        if self._fast:
+            q = self.walk.forces(self.row[None])
+            if key in self.walk.own:
+                q[0, self.walk.own.index(key)] = float(value)
+        base = self._compiled(self.x, self.v, q)
+        return base + self._beyond(whole, self._bare(self.x, self.v, base))
 
-            def rate(value: Tensor) -> Tensor:
-                return self._beyond({**own, name: value}, state)
-
-        change: Tensor = jvp(rate, (own[name],), (one,))[1]
-        return total + change.detach()
+    def _last(self, effect: Effect) -> bool:
+        """Whether no other term may look at the sum with this effect."""
+        others = [t for t in self.walk.system.terms if isinstance(t, Effect) and t is not effect]
+        return all(other.rank == effect.rank for other in others)
 
     def _compiled(self, x: Tensor, v: Tensor, q: np.ndarray | None) -> Tensor:
         out = torch.zeros_like(x)

@@ -27,12 +27,12 @@ class Beyond(nn.Module):
     def __init__(self, system: Crowd, terms: list[Term]) -> None:
         super().__init__()
         self.system = system
-        self._added = terms  # a plain list: the terms' parameters belong to the system
+        self.added = terms  # a plain list: the terms' parameters belong to the system
 
     def forward(self, state: State) -> Tensor:
-        total = torch.zeros_like(state.x) if state.rate is None else state.rate
-        first = total
-        for term in self._added:
+        assert state.rate is not None
+        first = total = state.rate
+        for term in self.added:
             total = total + term(replace(state, system=self.system, rate=total))
         return total - first
 
@@ -104,6 +104,7 @@ class Walk:
         )
         self.beyond = Beyond(self.system, terms[2:] if self.compiled else terms)
         self.names = list(trained(system))
+        self._people = tuple(torch.as_tensor(index) for index in windows.person.T)
         self.sizes = [p.numel() for p in trained(system).values()]
         if self.compiled:
             relaxation, force = cast(tuple[Relaxation, SocialForce], law)
@@ -140,55 +141,86 @@ class Walk:
         return path[..., :2], path[..., 2:]
 
     def _run(self, rows: Tensor) -> Tensor:
-        windows, which, who = self.windows, *map(torch.as_tensor, self.windows.person.T)
+        windows, (which, who) = self.windows, self._people
         first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
-        if self.compiled and not self.beyond._added:
-            start = first[which, who].numpy()
-            found = crowd_kernel.simulate(
-                start, windows.step, *self.tables.arguments(), self.law, self.forces(rows)
-            )
-            return torch.from_numpy(found)
         parameters = self.parameters(rows)
-        q = self.forces(rows) if self.compiled else np.empty((len(rows), 3))
+        if self.compiled:
+            return self._compiled(parameters, rows, first[which, who])
         y, h = first.expand(len(rows), *first.shape).clone(), windows.step
         out = [y[:, which, who]]
         for k in range(windows.steps):
-            k1 = self._rate(parameters, q, 2 * k, y)
-            k2 = self._rate(parameters, q, 2 * k + 1, y + h / 2 * k1)
-            k3 = self._rate(parameters, q, 2 * k + 1, y + h / 2 * k2)
-            k4 = self._rate(parameters, q, 2 * k + 2, y + h * k3)
+            k1 = self._rate(parameters, 2 * k, y)
+            k2 = self._rate(parameters, 2 * k + 1, y + h / 2 * k1)
+            k3 = self._rate(parameters, 2 * k + 1, y + h / 2 * k2)
+            k4 = self._rate(parameters, 2 * k + 2, y + h * k3)
             y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             out.append(y[:, which, who])
         return torch.stack(out)
 
-    def _rate(self, parameters: dict[str, Tensor], q: np.ndarray, moment: int, y: Tensor) -> Tensor:
-        """``(R, W, N, 4)``: time derivative of states at one half step."""
-        which, who = map(torch.as_tensor, self.windows.person.T)
-        t = torch.tensor(moment * self.windows.step / 2, dtype=y.dtype)
-        seen = (self.windows.batch.x[moment], self.windows.batch.v[moment])
-        base = torch.zeros_like(y[..., :2])
-        if self.compiled:
-            r, p = len(y), len(which)
-            rate = crowd_kernel.accelerations(
-                y[:, which, who].reshape(r * p, 4).numpy(),
-                np.tile(np.arange(p), r),
-                np.full(r * p, moment),
-                np.repeat(np.arange(r), p),
-                *self.tables.arguments(),
-                self.law,
-                q,
-            )
-            base[:, which, who] = torch.from_numpy(rate).reshape(r, p, 2)
+    def _compiled(self, parameters: dict[str, Tensor], rows: Tensor, start: Tensor) -> Tensor:
+        """``(F, R, P, 4)``; the terms that are not compiled are evaluated once in each step.
 
-        def one(own: dict[str, Tensor], y: Tensor, rate: Tensor) -> Tensor:
-            state = State(t, y[..., :2], y[..., 2:], self.scene, rate=rate, seen=seen)
+        Their accelerations are linear between the steps. In a step they are extrapolated first,
+        and the state after it is corrected when they are known there.
+        """
+        windows, h, q = self.windows, self.windows.step, self.forces(rows)
+        out = np.empty((windows.steps + 1, len(rows), *start.shape))
+        out[0] = start.numpy()
+        fixed = (*self.tables.arguments(), self.law, q)
+        before = self._extra(parameters, q, 0, out[0])
+        after = before
+        for n in range(windows.steps):
+            crowd_kernel.advance(out[n], before, after, out[n + 1], n, h, *fixed)
+            if self.beyond.added:
+                found = self._extra(parameters, q, 2 * n + 2, out[n + 1])
+                out[n + 1, ..., :2] += h**2 / 6 * (found - after)
+                out[n + 1, ..., 2:] += h / 2 * (found - after)
+                before, after = found, 2 * found - before
+        return torch.from_numpy(out)
+
+    def _extra(
+        self, parameters: dict[str, Tensor], q: np.ndarray, moment: int, states: np.ndarray
+    ) -> np.ndarray:
+        """``(R, P, 2)`` m/s² of the terms that are not compiled."""
+        if not self.beyond.added:
+            return np.zeros((*states.shape[:2], 2))
+        (which, who), r = self._people, len(states)
+        x = self.windows.batch.x[moment].expand(r, -1, -1, -1).clone()
+        v = self.windows.batch.v[moment].expand_as(x).clone()
+        state = torch.from_numpy(states)
+        x[:, which, who], v[:, which, who] = state[..., :2], state[..., 2:]
+        rate, p = torch.zeros_like(x), len(which)
+        found = crowd_kernel.accelerations(
+            states.reshape(r * p, 4),
+            np.tile(np.arange(p), r),
+            np.full(r * p, moment),
+            np.repeat(np.arange(r), p),
+            *self.tables.arguments(),
+            self.law,
+            q,
+        )
+        rate[:, which, who] = torch.from_numpy(found).reshape(r, p, 2)
+        return self._beyond(parameters, moment, x, v, rate)[:, which, who].numpy()
+
+    def _rate(self, parameters: dict[str, Tensor], moment: int, y: Tensor) -> Tensor:
+        """``(R, W, N, 4)``: time derivative of states at one half step."""
+        x, v = y[..., :2], y[..., 2:]
+        return torch.cat([v, self._beyond(parameters, moment, x, v, torch.zeros_like(x))], -1)
+
+    def _beyond(
+        self, own: dict[str, Tensor], moment: int, x: Tensor, v: Tensor, rate: Tensor
+    ) -> Tensor:
+        t = torch.tensor(moment * self.windows.step / 2, dtype=x.dtype)
+        seen = (self.windows.batch.x[moment], self.windows.batch.v[moment])
+
+        def one(own: dict[str, Tensor], x: Tensor, v: Tensor, rate: Tensor) -> Tensor:
+            state = State(t, x, v, self.scene, rate=rate, seen=seen)
             found: Tensor = functional_call(self.beyond, own, (state,))
             return found
 
-        if len(y) == 1:
+        if len(x) == 1:
             # nothing to batch, and no price of batching
-            single = {name: value[0] for name, value in parameters.items()}
-            more = one(single, y[0], base[0])[None]
-        else:
-            more = vmap(one)(parameters, y, base)
-        return torch.cat([y[..., 2:], base + more], -1)
+            single = {name: value[0] for name, value in own.items()}
+            return one(single, x[0], v[0], rate[0])[None]
+        found: Tensor = vmap(one)(own, x, v, rate)
+        return found

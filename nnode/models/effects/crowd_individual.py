@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -100,6 +101,11 @@ class GaitSway(IndividualEffect):
         if batch.dt > 0.25:
             return []
         return [Probe({"f": 0.7 + 0.1 * i}, {"a": 0.05}) for i in range(6)]
+
+    @classmethod
+    def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
+        """The phase, from the amplitudes of the sine and the cosine of the clock."""
+        return float(np.arctan2(numbers[1], numbers[0]))
 
     def forward(self, state: State) -> Tensor:
         phase, there = self.known(state.scene, state.x)
