@@ -153,7 +153,7 @@ class CrowdEngine:
         the order of its ``steps``."""
         frames = self.linearised(system, row).frames
         state = frames.state()
-        columns = []
+        columns: list[Tensor] = []
         with torch.no_grad():
             without = effect(**probe.options)(state)
             for name, step in probe.steps.items():
