@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from nnode.data.sequence import Batch
-from nnode.models.effects import Effect
+from nnode.models.effects import Effect, Probe
 from nnode.models.scene import Scene
 from nnode.models.system import System
 
@@ -69,6 +69,21 @@ class Engine(Protocol):
     def positions(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n_raw)`` m: differences of positions as they are, neither whitened nor
         otherwise changed, for the costs that are reported."""
+        ...
+
+
+@runtime_checkable
+class Responsive(Protocol):
+    """An engine that knows how its residuals respond, without a simulation for each number."""
+
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        """``(K, n)`` derivatives of the residuals with respect to the calibrated parameters."""
+        ...
+
+    def screen_columns(
+        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe."""
         ...
 
 

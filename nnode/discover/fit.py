@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 
 from nnode.calibrate.least_squares import box_step
-from nnode.discover.engine import Engine, fill, row_of, trained
+from nnode.discover.engine import Engine, Responsive, fill, row_of, trained
 from nnode.errors import SimulationError
 from nnode.models.system import System
 from nnode.models.term import Term
@@ -108,6 +108,9 @@ class _Linear:
         A derivative that cannot be computed, because the simulation blows up, is zero.
         """
         row = trials[0]
+        if isinstance(self.engine, Responsive):
+            found = self.engine.residuals(self.system, torch.from_numpy(trials)).numpy()
+            return found, self.engine.tangents(self.system, torch.from_numpy(row)).numpy().T
         step = DIFFERENCE * np.maximum(np.abs(row), LEAST)
         step = np.where(row + step > self.high, -step, step)
         rows = np.concatenate([trials, row + np.diag(step)])

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from nnode.discover.engine import Engine, trained
+from nnode.discover.engine import Engine, Responsive, trained
 from nnode.discover.fit import Fit, sums
 from nnode.discover.individual import Individuals
 from nnode.models.effects import Effect, Probe
@@ -71,6 +71,12 @@ class Score:
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     """The traces of an effect's probes in the residuals of a calibrated model."""
     probes = effect.probes(engine.batch, fit.system)
+    if isinstance(engine, Responsive) and not effect.consecutive:
+        row = torch.from_numpy(fit.row)
+        return [
+            Trace(effect, [p], engine.screen_columns(fit.system, row, effect, p).numpy().T)
+            for p in probes
+        ]
     found: list[Trace] = []
     # probes that differ in numbers only are simulated side by side
     groups: dict[str, list[Probe]] = {}

@@ -77,23 +77,31 @@ class InteractionForce(Term):
         wall's unit normal."""
         raise NotImplementedError  # pragma: no cover - every force defines its own
 
+    def pairs(self, state: State, ahead: Tensor | float = 0.0) -> Tensor:
+        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third).
+
+        Args:
+            state: positions and velocities.
+            ahead: s; all positions are extrapolated by this time at their velocities.
+        """
+        x, v, scene = state.x, _velocity(state), state.scene
+        other, speed = state.others
+        dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
+        if isinstance(ahead, Tensor) or ahead:
+            dx = dx + ahead * dv
+        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
+        acts = (scene.agent[:, None, :] & apart)[..., None]
+        return self.pair_force(dx, dv) * (acts / (self.mass * scene.count[..., None]))
+
     def components(self, state: State) -> dict[str, Tensor]:
         """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
         x, v, scene = state.x, _velocity(state), state.scene
-        other, speed = state.others
-        force = self.pair_force(x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None])
-        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
-        acts = (scene.agent[:, None, :] & apart)[..., None]
-        parts = {"pair": (force * acts).sum(2) / (self.mass * scene.count)}
+        parts = {"pair": self.pairs(state).sum(2)}
         if self.walls and scene.wall.shape[1]:
-            b, n, p = *x.shape[:2], scene.wall.shape[1]
-            force = self.wall_force(
-                x[:, :, None] - scene.wall[:, None],
-                v[:, :, None].expand(b, n, p, 2),
-                scene.wall_normal[:, None].expand(b, n, p, 2),
-            )
-            acts = scene.wall_point[:, None, :, None]
-            parts["wall"] = (force * acts).sum(2) / (self.mass * scene.wall_count)
+            wall, normal, real = scene.walls_of_each()
+            dx = x[:, :, None] - wall
+            force = self.wall_force(dx, v[:, :, None].expand_as(dx), normal.expand_as(dx))
+            parts["wall"] = (force * real[..., None]).sum(2) / (self.mass * scene.wall_count)
         return parts
 
     def forward(self, state: State) -> Tensor:

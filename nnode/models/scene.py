@@ -30,6 +30,7 @@ class Scene:
         wall_normal: ``(B, P, 2)`` unit normals into the walkable side.
         wall_point: ``(B, P)`` True for real wall points.
         wall_count: ``(B, 1, 1)`` number of real wall points, at least 1.
+        segment: ``(B, W, 4)`` walls x1, y1, x2, y2, m; NaN in the padding.
         start: ``(B,)`` clock time of the first sample, s.
         names: of the sequences.
         kind, group: per sequence the agents' class and group names, or None.
@@ -48,6 +49,7 @@ class Scene:
     wall_normal: Tensor
     wall_point: Tensor
     wall_count: Tensor
+    segment: Tensor
     start: Tensor
     names: tuple[str, ...] = ()
     kind: tuple[tuple[str, ...] | None, ...] = ()
@@ -75,11 +77,17 @@ class Scene:
             wall_normal=normal,
             wall_point=real,
             wall_count=real.sum(1).clamp(min=1).to(batch.x.dtype)[:, None, None],
+            segment=batch.walls,
             start=batch.start,
             names=batch.names,
             kind=batch.kind,
             group=batch.group,
         )
+
+    def walls_of_each(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Wall points ``(B, N or 1, P, 2)`` that each person feels, their normals, and the mask
+        ``(B, N or 1, P)`` of real ones."""
+        return self.wall[:, None], self.wall_normal[:, None], self.wall_point[:, None]
 
     def measured_at(self, t: Tensor) -> Tensor:
         """``(B, N, D)`` measured positions at time ``t`` (s), linear between samples."""

@@ -1,7 +1,14 @@
 """Effects that a model may lack: terms with a name, a formula, units and a source."""
 
-from nnode.models.effects import following as _following
-from nnode.models.effects import traffic as _traffic
+from nnode.models.effects import (
+    crowd_force,
+    crowd_individual,
+    crowd_motion,
+    crowd_pairs,
+    crowd_places,
+    following,
+    traffic,
+)
 from nnode.models.effects.base import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
 
 __all__ = [
@@ -11,9 +18,11 @@ __all__ = [
     "Probe",
     "Setting",
     "Strength",
+    "crowd_force",
+    "crowd_individual",
+    "crowd_motion",
+    "crowd_pairs",
+    "crowd_places",
     "following",
     "traffic",
 ]
-
-#: Modules that fill the catalogue.
-FILLED_BY = (_following, _traffic)

@@ -1,0 +1,192 @@
+"""Effects between people that do not depend on the base law: a second range, friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import Batch
+from nnode.models.crowd import SocialForce, norm
+from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
+from nnode.models.system import System
+from nnode.models.term import Interval, State
+
+#: Radius of a person where the base law has none, m.
+RADIUS = 0.25
+
+
+def radius(system: System | None) -> float:
+    """m: of a person, that of the base law where it has one."""
+    force = None if system is None else system.find(SocialForce)
+    return RADIUS if force is None else force.r
+
+
+def velocity(state: State) -> Tensor:
+    """``(B, N, 2)`` m/s.
+
+    Raises:
+        ValueError: the model is of first order.
+    """
+    if state.v is None:
+        raise ValueError("a term of a second-order model needs velocities")
+    return state.v
+
+
+def heading(v: Tensor) -> Tensor:
+    """``(..., 2)``: the walking direction, a unit vector; 0 for someone who stands."""
+    return v / norm(v)[..., None]
+
+
+def right_of(direction: Tensor) -> Tensor:
+    """``(..., 2)``: the direction turned to the right by a quarter."""
+    return torch.stack([direction[..., 1], -direction[..., 0]], -1)
+
+
+def company(batch: Batch) -> bool:
+    """Whether anyone has others around."""
+    return bool((batch.agent.sum(1) > 1).any())
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """What person i (second axis) sees of person j (third axis).
+
+    Attributes:
+        d: ``(B, N, N)`` distance, m.
+        n: ``(B, N, N, 2)`` unit vector from j to i.
+        dv: ``(B, N, N, 2)`` velocity of j relative to i, m/s.
+        acts: ``(B, N, N)`` 1 where j is a real person other than i, else 0.
+    """
+
+    d: Tensor
+    n: Tensor
+    dv: Tensor
+    acts: Tensor
+
+    @classmethod
+    def of(cls, state: State) -> Neighbours:
+        """Everyone's neighbours, where ``state.others`` has them."""
+        x, v = state.x, velocity(state)
+        other, speed = state.others
+        dx = x[:, :, None] - other[:, None]
+        d = norm(dx)
+        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
+        acts = (state.scene.agent[:, None, :] & apart).to(x.dtype)
+        return cls(d, dx / d[..., None], speed[:, None] - v[:, :, None], acts)
+
+
+class PairEffect(Effect):
+    """An effect between people."""
+
+    domain = "crowd"
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        return super().probes(batch, system) if company(batch) else []
+
+
+@CATALOGUE.add
+class PairRepulsion(PairEffect):
+    """A second, wider range of the repulsion between people."""
+
+    name = "pair_repulsion"
+    formula = "sum over j of A_2 exp((2r - d_ij)/B_2) n_ij"
+    source = "Helbing, Buzna, Johansson & Werner 2005 (two ranges)"
+    strengths = {"A_2": Strength(0.0, 0.05, Interval(-2.0, 20.0), "m/s²")}
+    settings = {"B_2": Setting(0.8, Interval(0.1, 3.0), "m")}
+    kin = "pair_force"
+    separated_by = (
+        "encounters from all sides: this force is the same ahead and behind, and at every speed "
+        "of approach"
+    )
+
+    A_2: Tensor
+    B_2: Tensor
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        if not company(batch):
+            return []
+        return [Probe({"B_2": reach}, {"A_2": 0.05}) for reach in (0.4, 0.8, 1.4)]
+
+    def forward(self, state: State) -> Tensor:
+        pair = Neighbours.of(state)
+        push = self.A_2 * torch.exp((2 * radius(state.system) - pair.d) / self.B_2)
+        return ((push * pair.acts)[..., None] * pair.n).sum(2)
+
+
+@CATALOGUE.add
+class SlidingFriction(PairEffect):
+    """Friction between people who pass each other, also without contact.
+
+    It slows the sliding along the tangent t = (-n_y, n_x) over a range of ``REACH``.
+    """
+
+    name = "sliding_friction"
+    formula = "sum over j of c exp((2r - d_ij)/B) ((v_j - v_i)·t_ij) t_ij, B = 0.5 m"
+    source = "Helbing, Farkas & Vicsek 2000, with a range beyond contact"
+    strengths = {"c": Strength(0.0, 0.02, Interval(-2.0, 10.0), "1/s")}
+    kin = "velocity_of_others"
+    separated_by = "people who pass at different distances, overtaking as well as head on"
+
+    #: B, m
+    REACH = 0.5
+    c: Tensor
+
+    def forward(self, state: State) -> Tensor:
+        pair = Neighbours.of(state)
+        tangent = torch.stack([-pair.n[..., 1], pair.n[..., 0]], -1)
+        drag = self.c * torch.exp((2 * radius(state.system) - pair.d) / self.REACH)
+        slip = (pair.dv * tangent).sum(-1)
+        return ((drag * slip * pair.acts)[..., None] * tangent).sum(2)
+
+
+@CATALOGUE.add
+class Alignment(PairEffect):
+    """People adopt the velocity of those around them, the near ones most."""
+
+    name = "alignment"
+    formula = "c sum_j w_ij (v_j - v_i) / sum_j w_ij, w_ij = exp(-d_ij/R), R = 2 m"
+    source = "Vicsek et al. 1995; Cucker & Smale 2007"
+    strengths = {"c": Strength(0.0, 0.02, Interval(-2.0, 5.0), "1/s")}
+    kin = "velocity_of_others"
+    separated_by = "people who walk side by side at different speeds, far apart as well as near"
+
+    #: R, m
+    REACH = 2.0
+    c: Tensor
+
+    def forward(self, state: State) -> Tensor:
+        pair = Neighbours.of(state)
+        weight = pair.acts * torch.exp(-pair.d / self.REACH)
+        # the small number keeps someone without neighbours finite
+        share = weight / (weight.sum(2, keepdim=True) + 1e-12)
+        return self.c * (share[..., None] * pair.dv).sum(2)
+
+
+@CATALOGUE.add
+class DensitySlowdown(PairEffect):
+    """People slow down where it is dense."""
+
+    name = "density_slowdown"
+    formula = "-c rho_i v_i, rho_i = sum_j exp(-d_ij²/(2 h²)) / (2 pi h²), h = 1 m"
+    source = "Weidmann 1993; density: Helbing, Johansson & Al-Abideen 2007"
+    strengths = {"c": Strength(0.0, 0.02, Interval(-2.0, 5.0), "m²/s")}
+    kin = "speed"
+    separated_by = "the same people at different densities"
+
+    #: h, m
+    KERNEL = 1.0
+    c: Tensor
+
+    def forward(self, state: State) -> Tensor:
+        density = local_density(Neighbours.of(state), self.KERNEL)
+        return -self.c * density[..., None] * velocity(state)
+
+
+def local_density(pair: Neighbours, kernel: float) -> Tensor:
+    """``(B, N)`` 1/m²: of the others, by a Gaussian of width ``kernel`` (m)."""
+    spread = torch.exp(-(pair.d**2) / (2 * kernel**2)) / (2 * torch.pi * kernel**2)
+    return (spread * pair.acts).sum(2)
