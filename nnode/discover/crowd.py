@@ -16,7 +16,8 @@ from nnode.discover.crowd_response import Frames, propagate
 from nnode.discover.crowd_walk import Tables, Walk
 from nnode.discover.crowd_whitening import Whitening
 from nnode.discover.crowd_windows import Windows, WindowScene
-from nnode.discover.engine import fill
+from nnode.discover.engine import Squares, fill
+from nnode.discover.variables import Variable
 from nnode.models.effects.base import Effect, Probe
 from nnode.models.system import System
 
@@ -79,6 +80,7 @@ class CrowdEngine:
         self.unit = unit.reshape(-1).repeat(each)
         self.people = [[(int(b), int(i))] for b, i in pairs]
         self.half = (number % 2).repeat(each)
+        self.names = [item.name for item in sequences]
         self._scene: WindowScene | None = None
         self._tables: Tables | None = None
         self._whitening: Whitening | None = None
@@ -93,11 +95,23 @@ class CrowdEngine:
         flat = differences.reshape(len(rows), *self._matrix.shape[::2], 1)
         return (self._matrix @ flat).reshape(len(rows), -1)
 
-    def positions(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, P*L*2)`` m: differences of positions, without what start states explain."""
-        whitening = self._settled(system, rows[0])
-        found = whitening.projected(self._differences(system, rows).numpy())
-        return torch.from_numpy(found.reshape(len(rows), -1))
+    def squares(self, system: System, row: Tensor) -> Squares:
+        """Squared errors of positions, without what start states explain."""
+        whitening = self._settled(system, row)
+        found = whitening.projected(self._differences(system, row[None]).numpy())[0]
+        which = self.windows.person[:, 0]
+        squares = found.reshape(len(which), -1, 2)
+        squares = (squares**2).sum(-1)
+        each = squares.shape[1]
+        return Squares(
+            squares.ravel(),
+            self.windows.sequence[which].repeat(each),
+            (self.windows.number[which] % 2).repeat(each),
+        )
+
+    def variables(self) -> list[Variable]:
+        """What deviations of people may depend on."""
+        return []
 
     def noise_floor(self) -> float:
         """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,6 +14,29 @@ from nnode.data.sequence import Batch
 from nnode.models.effects import Effect, Probe
 from nnode.models.scene import Scene
 from nnode.models.system import System
+
+if TYPE_CHECKING:
+    from nnode.discover.variables import Variable
+
+
+@dataclass
+class Squares:
+    """Squared errors of positions.
+
+    Attributes:
+        value: ``(m,)`` m².
+        sequence, half: ``(m,)`` as in :class:`Engine`, of each error.
+    """
+
+    value: np.ndarray
+    sequence: np.ndarray
+    half: np.ndarray
+
+    def means(self) -> np.ndarray:
+        """``(S,)`` mean square error of each sequence; infinite where it blows up."""
+        total = np.bincount(self.sequence, np.nan_to_num(self.value, nan=np.inf))
+        found: np.ndarray = total / np.bincount(self.sequence)
+        return found
 
 
 class Engine(Protocol):
@@ -66,9 +89,12 @@ class Engine(Protocol):
         """Mean square error of positions that is noise of the measurement, m²."""
         ...
 
-    def positions(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n_raw)`` m: differences of positions as they are, neither whitened nor
-        otherwise changed, for the costs that are reported."""
+    def squares(self, system: System, row: Tensor) -> Squares:
+        """Squared errors of positions as they are, for the costs that are reported."""
+        ...
+
+    def variables(self) -> list[Variable]:
+        """What deviations may depend on."""
         ...
 
 

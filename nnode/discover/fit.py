@@ -169,9 +169,28 @@ def refine(
                 jacobian = ahead
             break
         jacobian = ahead if best == 0 else linear.at(row[None])[1]
+    fill(system, torch.from_numpy(row))
+    return _fit(system, row, residual, jacobian, low, high)
+
+
+def evaluated(engine: Engine, system: System) -> Fit:
+    """A model as it is, in the residuals of an engine."""
+    linear = _Linear(engine, system)
+    row = row_of(system).numpy()
+    found, jacobian = linear.at(row[None])
+    return _fit(system, row, found[0], jacobian, linear.low, linear.high)
+
+
+def _fit(
+    system: System,
+    row: np.ndarray,
+    residual: np.ndarray,
+    jacobian: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> Fit:
     gradient = jacobian.T @ residual
     at_low, at_high = (row <= low) & (gradient > 0), (row >= high) & (gradient < 0)
     moves = (jacobian**2).sum(0) > 0
-    fill(system, torch.from_numpy(row))
     names = [name for name, p in trained(system).items() for _ in range(p.numel())]
     return Fit(system, names, row, residual, jacobian, ~(at_low | at_high) & moves)

@@ -34,6 +34,7 @@ class Individuals:
             the other.
         losses: ``(S,)`` sum of squares that is left so.
         people: sequence name to its agents' numbers, from all their time.
+        halves: the same from each half of their time.
     """
 
     effect: type[IndividualEffect]
@@ -44,6 +45,7 @@ class Individuals:
     gain: float
     losses: np.ndarray
     people: dict[str, list[float]]
+    halves: tuple[dict[str, list[float]], dict[str, list[float]]]
 
 
 def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Individuals | None:
@@ -87,6 +89,10 @@ def _at(
         gain=1 - float(losses.sum()) / fit.cost,
         losses=losses,
         people=_people(engine, effect, options, full),
+        halves=(
+            _people(engine, effect, options, _amounts(gram[0], score[0], best)),
+            _people(engine, effect, options, _amounts(gram[1], score[1], best)),
+        ),
     )
 
 

@@ -159,6 +159,10 @@ class Screen:
             score.p_value = self._p_value(score.statistic)
         return sorted(best.values(), key=lambda score: -score.gain)
 
+    def critical(self, alpha: float = 0.05) -> float:
+        """The statistic that the largest one passes with probability ``alpha`` by chance."""
+        return float(np.quantile(self._largest, 1 - alpha))
+
     def _p_value(self, statistic: float) -> float:
         return float((1 + (self._largest >= statistic - 1e-9).sum()) / (1 + FLIPS))
 

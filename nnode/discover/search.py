@@ -91,6 +91,11 @@ class Step:
     rivals: list[tuple[Candidate, Comparison]]
     scores: list[Score]
 
+    @property
+    def individuals(self) -> Individuals | None:
+        """The agents' numbers, of an individual effect."""
+        return self.chosen.individuals
+
 
 @dataclass
 class Search:

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.engine import Ensemble, trained
+from nnode.discover.engine import Ensemble, Squares, trained
 from nnode.discover.smooth import noise_variance, smooth, velocity
+from nnode.discover.traffic_variables import traffic_variables
+from nnode.discover.variables import Variable
 from nnode.discover.whiten import PlatoonFilter
 from nnode.models.effects import Effect, Strength
 from nnode.models.extend import extended
@@ -114,9 +116,14 @@ class TrafficEngine:
         """``(R, n)`` whitened residuals, the largest drawn in."""
         return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen])
 
-    def positions(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` measured minus simulated positions, m."""
-        return self.deviations(system, rows)[:, self.seen]
+    def squares(self, system: System, row: Tensor) -> Squares:
+        """Squared errors of the followers' positions."""
+        away = self.deviations(system, row[None])[0][self.seen].numpy()
+        return Squares(away**2, self.sequence, self.half)
+
+    def variables(self) -> list[Variable]:
+        """What deviations of vehicles may depend on."""
+        return traffic_variables(self.smoothed)
 
     def individual(
         self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
