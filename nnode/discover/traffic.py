@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.engine import Ensemble, Squares, trained
+from nnode.discover.engine import Ensemble, Squares, fill, row_of, trained
+from nnode.discover.response import Response
 from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.traffic_variables import traffic_variables
 from nnode.discover.variables import Variable
 from nnode.discover.whiten import PlatoonFilter
-from nnode.models.effects import Effect, Strength
+from nnode.models.effects import Effect, Probe
 from nnode.models.extend import extended
 from nnode.models.system import System
-from nnode.models.term import State, Term
+from nnode.models.term import Term
 
 #: Longest step of the simulation, s; and relative to the shortest time constant of the states
 #: that terms own, for which Runge and Kutta's method is stable.
 STEP, STABLE = 0.4, 0.7
-#: Change of a vehicle's pace by which its derivative is computed.
-_PACE = 1e-3
-#: Sequences are simulated in windows of about this length, s.
-WINDOW = 10.0
+#: Sequences are compared in windows of about this length, s, each simulated from so much
+#: before (at most a share of the sequence) that its start is forgotten.
+WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
 #: Whitened residuals beyond this count less.
 LARGE = 6.0
 #: Most past samples that a filter looks at.
@@ -57,17 +58,21 @@ class TrafficEngine:
         self.sequences = sequences
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
-        self.batch = collate(part for each in parts for part in each)
+        self.batch = collate(part[0] for each in parts for part in each)
         smoothed = [_windows(_smoothed(sequence), window) for sequence in sequences]
-        self.smoothed = collate(part for each in smoothed for part in each)
+        self.smoothed = collate(part[0] for each in smoothed for part in each)
         owner = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
         leader = self.batch.agent.sum(1) - 1
         index = torch.arange(self.batch.x.shape[2])
         follower = self.batch.agent & (index != leader[:, None])
-        self.seen = self.batch.valid & follower
-        # the start is given
-        self.seen = torch.cat([torch.zeros_like(self.seen[:1]), self.seen[1:]])
+        self.follows = self.batch.valid & follower
+        # the start is given, and tells of disturbances that still go on
+        first = [part[1] for each in parts for part in each]
+        time = torch.arange(self.batch.n_samples)[:, None]
+        self.seen = self.follows & (time > torch.tensor(first))[..., None]
         self.filter = PlatoonFilter.none()
+        self._last: tuple[System, Tensor, Tensor] | None = None
+        self._response: tuple[System, Tensor, Response] | None = None
         k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
         self.block, self.sequence = b, owner[b]
         middle = np.array([(s.time[0] + s.time[-1]) / 2 for s in sequences])
@@ -85,7 +90,7 @@ class TrafficEngine:
         return float(np.average(found, weights=weight)) if found else float("nan")
 
     def simulate(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, K, B, N)`` positions, m."""
+        """``(R, K, B, N, W)`` states; their first component are positions, m."""
         batch = self.smoothed
         runs = Ensemble(system, rows, system.scene(batch))
         longest = min(STEP, STABLE * fastest(system, rows))
@@ -94,7 +99,7 @@ class TrafficEngine:
         steps = max(1, math.ceil(batch.dt / longest - 1e-9))
         h = batch.dt * stride / steps
         y = runs.start(batch)
-        rate, found = runs.rate(_time(0.0), y), [y[..., 0]]
+        rate, found = runs.rate(_time(0.0), y), [y]
         number = math.ceil((batch.n_samples - 1) / stride) * steps
         for step in range(number):
             t = step * h
@@ -102,19 +107,80 @@ class TrafficEngine:
             slope = runs.rate(_time(t + h), after)
             found += _between(y, rate, after, slope, h, stride)
             if (step + 1) % steps == 0:
-                found.append(after[..., 0])
+                found.append(after)
             y, rate = after, slope
         return torch.stack(found[: batch.n_samples], 1)
 
     def deviations(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, K, B, N)`` measured minus simulated positions, m; 0 where nothing is compared."""
+        """``(R, K, B, N)`` measured minus simulated positions, m; 0 for leaders and outside of
+        what was measured."""
         with torch.no_grad():
-            away = self.batch.x[..., 0] - self.simulate(system, rows)
-        return torch.where(self.seen, away, 0.0)
+            states = self.simulate(system, rows)
+        self._last = system, rows[0].clone(), states[0]
+        away = self.batch.x[..., 0] - states[..., 0]
+        return torch.where(self.follows, away, 0.0)
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` whitened residuals, the largest drawn in."""
         return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen])
+
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        """``(K, n)`` derivatives of the residuals, by linear response."""
+        return self._columns(self.response(system, row).parameters())
+
+    def screen_columns(
+        self, system: System, row: Tensor, effect: type[Effect], probes: list[Probe]
+    ) -> list[Tensor]:
+        """Per probe ``(S, n)`` derivatives of the residuals with respect to its strengths."""
+        response = self.response(system, row)
+        base = response.rates(response.system)
+        sources, sizes = [], []
+        for probe in probes:
+            sizes.append(max(1, len(probe.steps)))
+            if effect.memory or not probe.steps:
+                continue
+            for name, step in probe.steps.items():
+                value = effect.strengths[name].neutral + step
+                changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
+                sources.append((response.rates(changed) - base) / step)
+        if sources:
+            return list(self._columns(response.moved(torch.stack(sources))).split(sizes))
+        return [self._whole(response, row, effect, probe) for probe in probes]
+
+    def _whole(self, response: Response, row: Tensor, effect: type[Effect], probe: Probe) -> Tensor:
+        """``(1, n)`` change of the residuals by an effect of finite strength."""
+        (name, step), *_ = [*probe.steps.items(), ("", 1.0)]
+        values = {
+            **probe.options,
+            **({name: effect.strengths[name].neutral + step} if name else {}),
+        }
+        changed, _ = extended(response.system, effect(**values))
+        with torch.no_grad():
+            x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
+        return self._columns((x - response.states[..., 0])[None] / step)
+
+    def response(self, system: System, row: Tensor) -> Response:
+        """The linear response of a run, kept until another one is asked for."""
+        known = self._response
+        if known is not None and known[0] is system and torch.equal(known[1], row):
+            return known[2]
+        last = self._last
+        if last is None or last[0] is not system or not torch.equal(last[1], row):
+            self.deviations(system, row[None])
+        assert self._last is not None
+        found = Response(fill(copy.deepcopy(system), row), self.smoothed, self._last[2])
+        self._response = system, row.clone(), found
+        return found
+
+    def _columns(self, moved: Tensor) -> Tensor:
+        """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
+        assert self._response is not None or self._last is not None
+        states = self._response[2].states if self._response is not None else self._last[2]
+        away = torch.where(self.follows, self.batch.x[..., 0] - states[..., 0], 0.0)
+        residual = self.filter(away)[self.seen]
+        weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
+        found = self.filter(torch.where(self.follows, -moved, 0.0))[:, self.seen]
+        return torch.nan_to_num(found * weight)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
@@ -130,20 +196,15 @@ class TrafficEngine:
     ) -> Tensor:
         """``(N, n)``: derivatives of the residuals with respect to the pace of the vehicle at
         each place of the platoon, in all sequences at once."""
-        places = self.batch.agent.shape[1]
-        pace, _ = extended(system, _Pace(places))
-        own = trained(pace)
-        base = torch.zeros(1 + places, sum(p.numel() for p in own.values()), dtype=torch.float64)
-        column, before = 0, 0
-        for name, p in own.items():
-            if name.endswith(".pace"):
-                base[1:, column : column + places] = _PACE * torch.eye(places, dtype=torch.float64)
-            else:
-                base[:, column] = row[before]
-                before += 1
-            column += p.numel()
-        found = self.residuals(pace, base)
-        return (found[1:] - found[0]) / _PACE
+        response = self.response(system, row)
+        followers = response.scene.follower
+        places = followers.shape[1]
+        rate = response.rates(response.system)
+        # the law's own rate is what a driver's pace multiplies
+        source = torch.zeros(places, *rate.shape, dtype=torch.float64)
+        for n in range(places):
+            source[n, :, :, n, 0] = rate[:, :, n, 0] * followers[:, n]
+        return self._columns(response.moved(source))
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""
@@ -151,24 +212,6 @@ class TrafficEngine:
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
-
-
-class _Pace(Effect):
-    """The vehicle at each place of the platoon drives slower or faster by a share of its own."""
-
-    name = "pace"
-    domain = "traffic"
-    strengths: ClassVar[dict[str, Strength]] = {}
-    rank = 13
-
-    def __init__(self, places: int) -> None:
-        super().__init__()
-        self.pace = nn.Parameter(torch.zeros(places, dtype=torch.float64))
-
-    def forward(self, state: State) -> Tensor:
-        assert state.rate is not None
-        change = torch.where(state.scene.follower, self.pace, 0.0)
-        return change[..., None] * state.rate
 
 
 def drawn_in(residual: Tensor) -> Tensor:
@@ -202,8 +245,8 @@ def _time(t: float) -> Tensor:
 def _between(
     before: Tensor, start: Tensor, after: Tensor, end: Tensor, h: float, stride: int
 ) -> list[Tensor]:
-    """Positions at the samples within a step of ``h`` s, by Hermite's cubic interpolation."""
-    x0, v0, x1, v1 = (part[..., 0] for part in (before, start, after, end))
+    """States at the samples within a step of ``h`` s, by Hermite's cubic interpolation."""
+    x0, v0, x1, v1 = before, start, after, end
     found = []
     for part in range(1, stride):
         s = part / stride
@@ -212,17 +255,27 @@ def _between(
     return found
 
 
-def _windows(sequence: Sequence, length: float) -> list[Sequence]:
-    """Windows of equal length that share their boundary sample."""
+def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:
+    """Windows, and of each the number of samples after its start that are not compared.
+
+    What is compared are pieces of equal length that share their boundary sample; each is
+    preceded by the time in which a start is forgotten.
+    """
     intervals = sequence.n_samples - 1
-    number = max(1, round(intervals * sequence.dt / length)) if intervals else 1
-    ends = np.linspace(0, intervals, number + 1).round().astype(int)
+    if intervals < 1:
+        return [(sequence, 0)]
+    forget = int(min(FORGET, SHARE * intervals * sequence.dt) / sequence.dt + 1e-9)
+    number = max(1, round((intervals - forget) * sequence.dt / length))
+    ends = np.linspace(forget, intervals, number + 1).round().astype(int)
     return [
-        replace(
-            sequence,
-            time=sequence.time[first : last + 1],
-            x=sequence.x[first : last + 1],
-            v=None if sequence.v is None else sequence.v[first : last + 1],
+        (
+            replace(
+                sequence,
+                time=sequence.time[first - forget : last + 1],
+                x=sequence.x[first - forget : last + 1],
+                v=None if sequence.v is None else sequence.v[first - forget : last + 1],
+            ),
+            forget,
         )
         for first, last in pairwise(ends)
     ]

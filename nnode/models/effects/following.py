@@ -10,9 +10,22 @@ from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
 from nnode.models.effects.traffic import for_followers, gaps, law_of, rate_of
 from nnode.models.system import System
 from nnode.models.term import Interval, State
+from nnode.models.traffic import FollowTheLeader
 
 _KIN = "reaction to the vehicle ahead"
 _EXCITATION = "leaders that brake and accelerate strongly, measured often and precisely"
+
+
+def speeds_of_law(x: Tensor, v: Tensor, system: System) -> Tensor:
+    """``(B, N)`` speeds at the start as the law says, m/s; the last vehicle's is measured.
+
+    Measured speeds of followers would tell of disturbances that go on for a while, and a memory
+    that starts with them would be taken for inertia.
+    """
+    law = system.find(FollowTheLeader)
+    assert law is not None
+    speed = law.speed(gaps(x))
+    return torch.cat([speed[:, :-1], v[:, -1:, 0]], 1)
 
 
 class _SpeedAhead(Effect):
@@ -95,8 +108,8 @@ class ReactionDelay(Effect):
     separated_by = _EXCITATION
 
     def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
-        gap, opening = gaps(x), torch.diff(v[..., 0])
-        opening = torch.cat([opening, torch.zeros_like(opening[:, :1])], 1)
+        gap, speed = gaps(x), speeds_of_law(x, v, system)
+        opening = torch.cat([torch.diff(speed), torch.zeros_like(speed[:, :1])], 1)
         return torch.stack([gap - self.T / 2 * opening, self.T * opening], -1)
 
     def forward(self, state: State) -> Tensor:
@@ -135,7 +148,7 @@ class Inertia(Effect):
     separated_by = _EXCITATION
 
     def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
-        return v
+        return speeds_of_law(x, v, system)[..., None]
 
     def forward(self, state: State) -> Tensor:
         assert state.memory is not None
