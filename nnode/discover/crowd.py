@@ -70,17 +70,14 @@ class CrowdEngine:
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         which, who = self.windows.person.T
-        each = 2 * (self.windows.length - 2)
-        sequence, number = self.windows.sequence[which], self.windows.number[which]
-        together = max(1, round(span / window))
-        self.sequence = sequence.repeat(each)
-        block = np.stack([sequence, number // together], 1)
-        self.block = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
-        pairs, unit = np.unique(np.stack([sequence, who], 1), axis=0, return_inverse=True)
-        self.unit = unit.reshape(-1).repeat(each)
+        self._span = max(1, round(span / window))
+        pairs, unit = np.unique(
+            np.stack([self.windows.sequence[which], who], 1), axis=0, return_inverse=True
+        )
+        self._unit = unit.reshape(-1)
         self.people = [[(int(b), int(i))] for b, i in pairs]
-        self.half = (number % 2).repeat(each)
         self.names = [item.name for item in sequences]
+        self._label(1)
         self._scene: WindowScene | None = None
         self._tables: Tables | None = None
         self._whitening: Whitening | None = None
@@ -122,7 +119,8 @@ class CrowdEngine:
     def settle(self, system: System, row: Tensor) -> None:
         """Take a model as the one around which residuals are whitened, weighted and linearised.
 
-        Called after a fit was accepted; all residuals before it are then of no use.
+        Called after a fit was accepted; residuals from before cannot be compared with later ones,
+        and even their number may change.
         """
         walk = self._walk(system)
         x, v = walk.paths(row[None])
@@ -130,13 +128,26 @@ class CrowdEngine:
         every = self.windows.sub
         difference = self._difference(x)[0].numpy()
         turn = self._turns()
-        self._whitening = Whitening.fit(difference, start[:, ::every].numpy(), turn)
+        self._whitening = Whitening.fit(
+            difference, start[:, ::every].numpy(), turn, self.windows.variance
+        )
         matrix = torch.as_tensor(self._whitening.matrix())
         sampled = forced[:, ::every]
         p, length = sampled.shape[:2]
         self._response = matrix @ sampled.reshape(p, length * 2, -1)
         self._matrix = matrix
+        self._label(matrix.shape[1])
         self._now = None
+
+    def _label(self, each: int) -> None:
+        """Say whose ``each`` residuals of every person's window are."""
+        which = self.windows.person[:, 0]
+        sequence, number = self.windows.sequence[which], self.windows.number[which]
+        block = np.stack([sequence, number // self._span], 1)
+        self.sequence = sequence.repeat(each)
+        self.block = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
+        self.unit = self._unit.repeat(each)
+        self.half = (number % 2).repeat(each)
 
     # -- what makes it fast ----------------------------------------------------------------
 
