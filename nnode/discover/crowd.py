@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from typing import Any
@@ -13,13 +14,15 @@ from torch import Tensor
 
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.crowd_response import Frames, propagate
+from nnode.discover.crowd_variables import crowd_variables
 from nnode.discover.crowd_walk import Tables, Walk
 from nnode.discover.crowd_whitening import Whitening
 from nnode.discover.crowd_windows import Windows, WindowScene
 from nnode.discover.engine import Squares, fill
 from nnode.discover.variables import Variable
 from nnode.models.effects.base import Effect, Probe
-from nnode.models.system import System
+from nnode.models.system import Crowd, System
+from nnode.models.term import State
 
 #: A simulated person is never further than this from the measured one, m: contacts may throw
 #: somebody far away, and the rest of the run still counts.
@@ -108,7 +111,13 @@ class CrowdEngine:
 
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""
-        return []
+        scene = self.windows.scene(Crowd([]))
+        frames = scene.frames(2, self.windows.step * torch.arange(self.windows.steps + 1).double())
+        assert frames.speed is not None
+        zero = torch.zeros((), dtype=frames.speed.dtype)
+        state = State(zero, frames.measured[0], frames.speed[0], frames)
+        first = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
+        return crowd_variables(state, first)
 
     def noise_floor(self) -> float:
         """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed
@@ -171,21 +180,30 @@ class CrowdEngine:
         frames = self.linearised(system, row).frames
         return torch.stack([self._respond(rate, frames) for rate in frames.parameter_tangents()])
 
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)``: changes of the residuals by M weak additional accelerations, each a function
+        of the states, ``(B, N, 2)`` m/s²."""
+        frames = self.linearised(system, row).frames
+        with torch.no_grad():
+            return torch.stack([self._respond(rate, frames) for rate in rates(frames.state())])
+
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
     ) -> Tensor:
         """``(S, n)``: derivatives of the residuals with respect to the strengths of a probe, in
         the order of its ``steps``."""
-        frames = self.linearised(system, row).frames
-        state = frames.state()
-        columns: list[Tensor] = []
-        with torch.no_grad():
-            without = effect(**probe.options)(state)
+
+        def rates(state: State) -> list[Tensor]:
+            without, found = effect(**probe.options)(state), []
             for name, step in probe.steps.items():
                 changed = effect(**probe.options)
                 getattr(changed, name).add_(step)
-                columns.append(self._respond((changed(state) - without) / step, frames))
-        return torch.stack(columns)
+                found.append((changed(state) - without) / step)
+            return found
+
+        return self.response(system, row, rates)
 
     def individual(
         self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]

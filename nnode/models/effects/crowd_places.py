@@ -14,7 +14,7 @@ from nnode.models.system import System
 from nnode.models.term import Interval, State
 
 #: Places are looked for this far apart, m, but in no more than this many cells.
-SPACING, CELLS = 1.0, 120
+SPACING, CELLS = 0.8, 170
 #: Distance at which an absent wall stands, m.
 FAR = 1e4
 
