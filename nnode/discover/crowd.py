@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from typing import Any
@@ -13,13 +14,15 @@ from torch import Tensor
 
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.crowd_response import Frames, propagate
+from nnode.discover.crowd_variables import crowd_variables
 from nnode.discover.crowd_walk import Tables, Walk
 from nnode.discover.crowd_whitening import Whitening
 from nnode.discover.crowd_windows import Windows, WindowScene
 from nnode.discover.engine import Squares, fill
 from nnode.discover.variables import Variable
 from nnode.models.effects.base import Effect, Probe
-from nnode.models.system import System
+from nnode.models.system import Crowd, System
+from nnode.models.term import State
 
 #: A simulated person is never further than this from the measured one, m: contacts may throw
 #: somebody far away, and the rest of the run still counts.
@@ -70,17 +73,14 @@ class CrowdEngine:
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         which, who = self.windows.person.T
-        each = 2 * (self.windows.length - 2)
-        sequence, number = self.windows.sequence[which], self.windows.number[which]
-        together = max(1, round(span / window))
-        self.sequence = sequence.repeat(each)
-        block = np.stack([sequence, number // together], 1)
-        self.block = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
-        pairs, unit = np.unique(np.stack([sequence, who], 1), axis=0, return_inverse=True)
-        self.unit = unit.reshape(-1).repeat(each)
+        self._span = max(1, round(span / window))
+        pairs, unit = np.unique(
+            np.stack([self.windows.sequence[which], who], 1), axis=0, return_inverse=True
+        )
+        self._unit = unit.reshape(-1)
         self.people = [[(int(b), int(i))] for b, i in pairs]
-        self.half = (number % 2).repeat(each)
         self.names = [item.name for item in sequences]
+        self._label(1)
         self._scene: WindowScene | None = None
         self._tables: Tables | None = None
         self._whitening: Whitening | None = None
@@ -111,7 +111,13 @@ class CrowdEngine:
 
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""
-        return []
+        scene = self.windows.scene(Crowd([]))
+        frames = scene.frames(2, self.windows.step * torch.arange(self.windows.steps + 1).double())
+        assert frames.speed is not None
+        zero = torch.zeros((), dtype=frames.speed.dtype)
+        state = State(zero, frames.measured[0], frames.speed[0], frames)
+        first = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
+        return crowd_variables(state, first)
 
     def noise_floor(self) -> float:
         """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed
@@ -122,7 +128,8 @@ class CrowdEngine:
     def settle(self, system: System, row: Tensor) -> None:
         """Take a model as the one around which residuals are whitened, weighted and linearised.
 
-        Called after a fit was accepted; all residuals before it are then of no use.
+        Called after a fit was accepted; residuals from before cannot be compared with later ones,
+        and even their number may change.
         """
         walk = self._walk(system)
         x, v = walk.paths(row[None])
@@ -130,13 +137,26 @@ class CrowdEngine:
         every = self.windows.sub
         difference = self._difference(x)[0].numpy()
         turn = self._turns()
-        self._whitening = Whitening.fit(difference, start[:, ::every].numpy(), turn)
+        self._whitening = Whitening.fit(
+            difference, start[:, ::every].numpy(), turn, self.windows.variance
+        )
         matrix = torch.as_tensor(self._whitening.matrix())
         sampled = forced[:, ::every]
         p, length = sampled.shape[:2]
         self._response = matrix @ sampled.reshape(p, length * 2, -1)
         self._matrix = matrix
+        self._label(matrix.shape[1])
         self._now = None
+
+    def _label(self, each: int) -> None:
+        """Say whose ``each`` residuals of every person's window are."""
+        which = self.windows.person[:, 0]
+        sequence, number = self.windows.sequence[which], self.windows.number[which]
+        block = np.stack([sequence, number // self._span], 1)
+        self.sequence = sequence.repeat(each)
+        self.block = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
+        self.unit = self._unit.repeat(each)
+        self.half = (number % 2).repeat(each)
 
     # -- what makes it fast ----------------------------------------------------------------
 
@@ -160,21 +180,30 @@ class CrowdEngine:
         frames = self.linearised(system, row).frames
         return torch.stack([self._respond(rate, frames) for rate in frames.parameter_tangents()])
 
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)``: changes of the residuals by M weak additional accelerations, each a function
+        of the states, ``(B, N, 2)`` m/s²."""
+        frames = self.linearised(system, row).frames
+        with torch.no_grad():
+            return torch.stack([self._respond(rate, frames) for rate in rates(frames.state())])
+
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
     ) -> Tensor:
         """``(S, n)``: derivatives of the residuals with respect to the strengths of a probe, in
         the order of its ``steps``."""
-        frames = self.linearised(system, row).frames
-        state = frames.state()
-        columns: list[Tensor] = []
-        with torch.no_grad():
-            without = effect(**probe.options)(state)
+
+        def rates(state: State) -> list[Tensor]:
+            without, found = effect(**probe.options)(state), []
             for name, step in probe.steps.items():
                 changed = effect(**probe.options)
                 getattr(changed, name).add_(step)
-                columns.append(self._respond((changed(state) - without) / step, frames))
-        return torch.stack(columns)
+                found.append((changed(state) - without) / step)
+            return found
+
+        return self.response(system, row, rates)
 
     def individual(
         self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]

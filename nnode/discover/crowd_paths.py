@@ -80,8 +80,7 @@ class Smoother:
             keep = 1 / (1 + PENALTIES[:, None] * value)
             left += ((1 - keep) ** 2 * power).sum(1)
             freedom += (1 - keep).sum(1) * y.shape[1]
-        total = sum(y.size for y in stacks.values())
-        best = int(np.argmin(left * total / freedom**2))
+        best = int(np.argmin(left / freedom**2))
         self.penalty = float(PENALTIES[best])
         self.variance = float(left[best] / freedom[best])
 

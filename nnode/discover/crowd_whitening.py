@@ -10,6 +10,9 @@ import numpy as np
 NUMERICAL = 3e-4
 #: A person's window counts half where its residuals are this many times as large as usual.
 OUTLYING = 3.0
+#: Directions in which the differences vary less than this many times as much as the
+#: measurement's noise are left out, but no more than all but the FEWEST largest.
+TELLING, FEWEST = 1.25, 4
 #: Rounds in which weights and covariances are found.
 ROUNDS = 4
 
@@ -19,12 +22,13 @@ class Whitening:
     """A linear map of the differences ``(P, L, 2)`` of the P people of all windows.
 
     Unknown start states are projected out, the rest is turned to the walking direction and
-    filtered by the inverse root of its covariance, which is one for all people.
+    filtered by the inverse root of its covariance, which is one for all people. Directions of
+    it in which there is little but noise of the measurement are left out.
 
     Attributes:
         project: ``(P, L*2, L*2)``: takes the part that a start state explains out of x, y.
         turn: ``(P, 2, 2)``: from x, y to along and across the walking direction.
-        filter: ``(2, L-2, L)``: of the differences along and across.
+        filter: ``(M, 2, L)``: M filters of the differences along and across.
         weight: ``(P,)``: of the squares of each person's window, bounded influence.
         covariance: ``(2, L, L)`` m², of the projected differences.
     """
@@ -36,13 +40,16 @@ class Whitening:
     covariance: np.ndarray
 
     @classmethod
-    def fit(cls, difference: np.ndarray, start: np.ndarray, turn: np.ndarray) -> Whitening:
+    def fit(
+        cls, difference: np.ndarray, start: np.ndarray, turn: np.ndarray, variance: float
+    ) -> Whitening:
         """The map for the differences of a model.
 
         Args:
             difference: ``(P, L, 2)`` m.
             start: ``(P, L, 2, 4)`` responses of the positions to the start state.
             turn: ``(P, 2, 2)``.
+            variance: m², of the measurement's noise.
         """
         p, length = difference.shape[:2]
         basis, _ = np.linalg.qr(start.reshape(p, 2 * length, 4))
@@ -53,12 +60,12 @@ class Whitening:
         for _ in range(ROUNDS):
             total = np.einsum("p,pcl,pcm->clm", weight, left, left) / weight.sum()
             covariance = total + NUMERICAL**2 * np.eye(length)
-            roots = np.stack([_inverse_root(part) for part in covariance])
-            size = (np.einsum("ckl,pcl->pck", roots, left) ** 2).mean((1, 2))
+            filters = _filters(covariance, variance)
+            size = (np.einsum("mcl,pcl->pm", filters, left) ** 2).mean(1)
             # outliers are measured against the usual person, not against each other
             usual = max(float(np.median(size)), 1e-12)
             weight = 1 / (1 + size / usual / OUTLYING**2)
-        return cls(project, turn, roots, weight, covariance)
+        return cls(project, turn, filters, weight, covariance)
 
     def projected(self, difference: np.ndarray) -> np.ndarray:
         """``(..., P, L, 2)`` m: the differences without what start states explain."""
@@ -67,15 +74,22 @@ class Whitening:
         return out.reshape(difference.shape)
 
     def matrix(self) -> np.ndarray:
-        """``(P, 2*(L-2), L*2)``: the whole map, weights included."""
-        c, k, _ = self.filter.shape
-        p = len(self.weight)
-        turned = np.einsum("ckl,pcd->pckld", self.filter, self.turn).reshape(p, c * k, -1)
+        """``(P, M, L*2)``: the whole map, weights included."""
+        p, m = len(self.weight), len(self.filter)
+        turned = np.einsum("mcl,pcd->pmld", self.filter, self.turn).reshape(p, m, -1)
         out: np.ndarray = turned @ self.project
         return out * np.sqrt(self.weight)[:, None, None]
 
 
-def _inverse_root(covariance: np.ndarray) -> np.ndarray:
-    """``(L-2, L)``: inverse root without the two directions that start states took away."""
-    value, vector = np.linalg.eigh(covariance)
-    return np.asarray((vector[:, 2:] / np.sqrt(value[2:])).T)
+def _filters(covariance: np.ndarray, variance: float) -> np.ndarray:
+    """``(M, 2, L)``: from the ``(2, L, L)`` covariances of the differences along and across."""
+    found = []
+    for c, part in enumerate(covariance):
+        value, vector = np.linalg.eigh(part)
+        # start states took away two directions
+        telling = np.flatnonzero(value > TELLING * (variance + NUMERICAL**2))
+        first = int(np.clip(len(value) - len(telling), 2, max(2, len(value) - FEWEST)))
+        own = np.zeros((len(value) - first, *covariance.shape[::2]))
+        own[:, c] = (vector[:, first:] / np.sqrt(value[first:])).T
+        found.append(own)
+    return np.concatenate(found)

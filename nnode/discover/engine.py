@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ from nnode.data.sequence import Batch
 from nnode.models.effects import Effect, Probe
 from nnode.models.scene import Scene
 from nnode.models.system import System
+from nnode.models.term import State
 
 if TYPE_CHECKING:
     from nnode.discover.variables import Variable
@@ -104,6 +106,13 @@ class Responsive(Protocol):
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)`` derivatives of the residuals with respect to the calibrated parameters."""
+        ...
+
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)`` changes of the residuals by M weak additional terms, each a function of
+        the states ``(B, N, D)`` in m/s or m/s²."""
         ...
 
     def screen_columns(

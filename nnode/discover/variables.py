@@ -12,7 +12,7 @@ from scipy import stats
 from torch import Tensor, nn
 
 from nnode.discover.compare import Comparison, compare, heldout
-from nnode.discover.engine import Engine, trained
+from nnode.discover.engine import Engine, Responsive, trained
 from nnode.discover.fit import Fit, sums
 from nnode.discover.score import Screen
 from nnode.models.effects import Effect, Strength
@@ -113,6 +113,13 @@ class Curves:
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
     """``(n, M)`` changes of the residuals per unit of the curve's heights."""
+    if isinstance(engine, Responsive):
+
+        def rates(state: State) -> list[Tensor]:
+            weights, way = hats(variable.value(state), variable.knots), variable.direction(state)
+            return [weight[..., None] * way for weight in weights.unbind(-1)]
+
+        return engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
     system, _ = extended(fit.system, Curve(variable))
     number = len(variable.knots)
     rows = torch.zeros(number, sum(p.numel() for p in trained(system).values())).double()

@@ -94,7 +94,7 @@ class PairRepulsion(PairEffect):
     name = "pair_repulsion"
     formula = "sum over j of A_2 exp((2r - d_ij)/B_2) n_ij"
     source = "Helbing, Buzna, Johansson & Werner 2005 (two ranges)"
-    strengths = {"A_2": Strength(0.0, 0.05, Interval(-2.0, 20.0), "m/s²")}
+    strengths = {"A_2": Strength(0.0, 0.05, Interval(-0.2, 20.0), "m/s²")}
     settings = {"B_2": Setting(0.8, Interval(0.1, 3.0), "m")}
     kin = "pair_force"
     separated_by = (

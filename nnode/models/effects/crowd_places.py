@@ -14,7 +14,7 @@ from nnode.models.system import System
 from nnode.models.term import Interval, State
 
 #: Places are looked for this far apart, m, but in no more than this many cells.
-SPACING, CELLS = 1.0, 120
+SPACING, CELLS = 0.8, 170
 #: Distance at which an absent wall stands, m.
 FAR = 1e4
 
@@ -52,7 +52,7 @@ class WallRepulsion(Effect):
     formula = "sum over walls w of A_w exp((r - d_w)/B_w) n_w"
     source = "Helbing & Molnár 1995"
     domain = "crowd"
-    strengths = {"A_w": Strength(0.0, 0.05, Interval(-5.0, 20.0), "m/s²")}
+    strengths = {"A_w": Strength(0.0, 0.05, Interval(-0.5, 20.0), "m/s²")}
     settings = {"B_w": Setting(0.4, Interval(0.05, 2.0), "m")}
     separated_by = "people at different distances from walls on both sides"
 
