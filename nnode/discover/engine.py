@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -77,6 +77,24 @@ class Engine(Protocol):
         """
         ...
 
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        """``(K, n)`` derivatives of the residuals with respect to the calibrated parameters."""
+        ...
+
+    def screen_columns(
+        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe; one
+        row for the effect as a whole where the probe varies none."""
+        ...
+
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to factors of M further rates
+        ``(B, N, D)``, m/s or m/s², that are functions of the state."""
+        ...
+
     def individual(
         self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
     ) -> Tensor:
@@ -97,28 +115,6 @@ class Engine(Protocol):
 
     def variables(self) -> list[Variable]:
         """What deviations may depend on."""
-        ...
-
-
-@runtime_checkable
-class Responsive(Protocol):
-    """An engine that knows how its residuals respond, without a simulation for each number."""
-
-    def tangents(self, system: System, row: Tensor) -> Tensor:
-        """``(K, n)`` derivatives of the residuals with respect to the calibrated parameters."""
-        ...
-
-    def response(
-        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
-    ) -> Tensor:
-        """``(M, n)`` changes of the residuals by M weak additional terms, each a function of
-        the states ``(B, N, D)`` in m/s or m/s²."""
-        ...
-
-    def screen_columns(
-        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
-    ) -> Tensor:
-        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe."""
         ...
 
 

@@ -10,13 +10,11 @@ import torch
 from scipy import stats
 
 from nnode.calibrate.least_squares import box_step
-from nnode.discover.engine import Engine, Responsive, fill, row_of, trained
+from nnode.discover.engine import Engine, fill, row_of, trained
 from nnode.errors import SimulationError
 from nnode.models.system import System
 from nnode.models.term import Term
 
-#: Differences of parameters, relative to their size and at least so much.
-DIFFERENCE, LEAST = 1e-4, 0.1
 #: Dampings that are tried side by side, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
 
@@ -105,19 +103,12 @@ class _Linear:
     def at(self, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals ``(T, n)`` of all trials ``(T, K)``, derivatives ``(n, K)`` at the first.
 
-        A derivative that cannot be computed, because the simulation blows up, is zero.
+        The derivatives are zero where the first trial blows up.
         """
-        row = trials[0]
-        if isinstance(self.engine, Responsive):
-            found = self.engine.residuals(self.system, torch.from_numpy(trials)).numpy()
-            return found, self.engine.tangents(self.system, torch.from_numpy(row)).numpy().T
-        step = DIFFERENCE * np.maximum(np.abs(row), LEAST)
-        step = np.where(row + step > self.high, -step, step)
-        rows = np.concatenate([trials, row + np.diag(step)])
-        found = self.engine.residuals(self.system, torch.from_numpy(rows)).numpy()
-        jacobian = (found[len(trials) :] - found[0]).T / step
-        jacobian[:, ~np.isfinite(jacobian).all(0)] = 0.0
-        return found[: len(trials)], jacobian
+        found = self.engine.residuals(self.system, torch.from_numpy(trials)).numpy()
+        if not np.isfinite(found[0]).all():
+            return found, np.zeros((found.shape[1], trials.shape[1]))
+        return found, self.engine.tangents(self.system, torch.from_numpy(trials[0])).numpy().T
 
 
 def refine(

@@ -20,11 +20,10 @@ import numpy as np
 import torch
 from scipy import stats
 
-from nnode.discover.engine import Engine, Responsive, trained
+from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit, sums
 from nnode.discover.individual import Individuals
 from nnode.models.effects import Effect, Probe
-from nnode.models.extend import extended
 
 #: Sign flips that a p-value comes from.
 FLIPS = 1999
@@ -71,58 +70,11 @@ class Score:
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     """The traces of an effect's probes in the residuals of a calibrated model."""
     probes = effect.probes(engine.batch, fit.system)
-    if isinstance(engine, Responsive) and not effect.consecutive:
-        row = torch.from_numpy(fit.row)
-        return [
-            Trace(effect, [p], engine.screen_columns(fit.system, row, effect, p).numpy().T)
-            for p in probes
-        ]
-    found: list[Trace] = []
-    # probes that differ in numbers only are simulated side by side
-    groups: dict[str, list[Probe]] = {}
-    for probe in probes:
-        words = {k: v for k, v in probe.options.items() if not isinstance(v, float)}
-        groups.setdefault(repr(sorted(words.items())), []).append(probe)
-    for group in groups.values():
-        columns = _columns(engine, fit, effect, group)
-        if effect.consecutive:
-            found.append(Trace(effect, group, np.concatenate(columns, 1)))
-        else:
-            found += [Trace(effect, [p], c) for p, c in zip(group, columns, strict=True)]
-    return found
-
-
-def _columns(
-    engine: Engine, fit: Fit, effect: type[Effect], probes: list[Probe]
-) -> list[np.ndarray]:
-    system, place = extended(fit.system, effect(**probes[0].options))
-    own = trained(system)
-    base = dict(zip(fit.names, fit.row, strict=True))
-    rows, amounts = [], []
-    for probe in probes:
-        values = {**effect(**probe.options).options(), **probe.options}
-        for strength in probe.steps or [None]:
-            now = dict(values)
-            amount = 1.0
-            if strength is not None:
-                amount = probe.steps[strength]
-                now[strength] = effect.strengths[strength].neutral + amount
-            rows.append([_value(name, place, now, base) for name in own])
-            amounts.append(amount)
-    changed = engine.residuals(system, torch.tensor(rows, dtype=torch.float64)).numpy()
-    columns = (changed - fit.residual) / np.array(amounts)[:, None]
-    columns[~np.isfinite(columns).all(1)] = 0.0
-    sizes = [max(1, len(probe.steps)) for probe in probes]
-    return [part.T for part in np.split(columns, np.cumsum(sizes)[:-1])]
-
-
-def _value(name: str, place: int, own: dict[str, Any], base: dict[str, float]) -> float:
-    """A parameter of the extended model: the effect's own, or the one it had before."""
-    _, number, rest = name.split(".", 2)
-    if int(number) == place:
-        return float(own[rest])
-    before = int(number) - (int(number) > place)
-    return float(base[f"terms.{before}.{rest}"])
+    row = torch.from_numpy(fit.row)
+    columns = [engine.screen_columns(fit.system, row, effect, p).numpy().T for p in probes]
+    if effect.consecutive and probes:
+        return [Trace(effect, probes, np.concatenate(columns, 1))]
+    return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
 
 
 class Screen:

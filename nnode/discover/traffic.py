@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -22,7 +23,7 @@ from nnode.discover.whiten import PlatoonFilter
 from nnode.models.effects import Effect, Probe
 from nnode.models.extend import extended
 from nnode.models.system import System
-from nnode.models.term import Term
+from nnode.models.term import State, Term
 
 #: Longest step of the simulation, s; and relative to the shortest time constant of the states
 #: that terms own, for which Runge and Kutta's method is stable.
@@ -126,40 +127,60 @@ class TrafficEngine:
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)`` derivatives of the residuals, by linear response."""
-        return self._columns(self.response(system, row).parameters())
+        response = self.linear(system, row)
+        with torch.no_grad():
+            return self._columns(response, response.parameters())
 
     def screen_columns(
-        self, system: System, row: Tensor, effect: type[Effect], probes: list[Probe]
-    ) -> list[Tensor]:
-        """Per probe ``(S, n)`` derivatives of the residuals with respect to its strengths."""
-        response = self.response(system, row)
+        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(S, n)`` derivatives of the residuals with respect to a probe's strengths, by linear
+        response; the change by the effect as a whole where it has a memory or no strength."""
+        response = self.linear(system, row)
+        if effect.memory or not probe.steps:
+            return self._whole(response, effect, probe)
         base = response.rates(response.system)
-        sources, sizes = [], []
-        for probe in probes:
-            sizes.append(max(1, len(probe.steps)))
-            if effect.memory or not probe.steps:
-                continue
-            for name, step in probe.steps.items():
-                value = effect.strengths[name].neutral + step
-                changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
-                sources.append((response.rates(changed) - base) / step)
-        if sources:
-            return list(self._columns(response.moved(torch.stack(sources))).split(sizes))
-        return [self._whole(response, row, effect, probe) for probe in probes]
+        sources = []
+        for name, step in probe.steps.items():
+            value = effect.strengths[name].neutral + step
+            changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
+            sources.append((response.rates(changed) - base) / step)
+        return self._columns(response, response.moved(torch.stack(sources)))
 
-    def _whole(self, response: Response, row: Tensor, effect: type[Effect], probe: Probe) -> Tensor:
+    def _whole(self, response: Response, effect: type[Effect], probe: Probe) -> Tensor:
         """``(1, n)`` change of the residuals by an effect of finite strength."""
-        (name, step), *_ = [*probe.steps.items(), ("", 1.0)]
-        values = {
-            **probe.options,
-            **({name: effect.strengths[name].neutral + step} if name else {}),
-        }
+        values, amount = dict(probe.options), 1.0
+        for name, step in probe.steps.items():
+            values[name], amount = effect.strengths[name].neutral + step, step
         changed, _ = extended(response.system, effect(**values))
         with torch.no_grad():
             x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
-        return self._columns((x - response.states[..., 0])[None] / step)
+        return self._columns(response, (x - response.states[..., 0])[None] / amount)
 
-    def response(self, system: System, row: Tensor) -> Response:
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to factors of M further speeds.
+
+        Args:
+            rates: of a state M speeds ``(B, N, 1)``, m/s.
+        """
+        linear = self.linear(system, row)
+        system = linear.system
+        scene, lead = linear.scene, linear.scene.leader[..., None]
+
+        def one(t: Tensor, y: Tensor, rate: Tensor) -> Tensor:
+            x = torch.where(lead, scene.measured_at(t), y[..., :1])
+            speed = torch.where(lead, scene.measured_rate_at(t), rate[..., :1])
+            return torch.stack(rates(State(t, x, None, scene, system, speed)))
+
+        base = linear.rates(system)
+        with torch.no_grad():
+            found = torch.func.vmap(one)(linear.time, linear.states, base).transpose(0, 1)
+        rest = found.new_zeros(*found.shape[:-1], base.shape[-1] - 1)
+        return self._columns(linear, linear.moved(torch.cat([found, rest], -1)))
+
+    def linear(self, system: System, row: Tensor) -> Response:
         """The linear response of a run, kept until another one is asked for."""
         known = self._response
         if known is not None and known[0] is system and torch.equal(known[1], row):
@@ -168,16 +189,16 @@ class TrafficEngine:
         if last is None or last[0] is not system or not torch.equal(last[1], row):
             self.deviations(system, row[None])
         assert self._last is not None
-        found = Response(fill(copy.deepcopy(system), row), self.smoothed, self._last[2])
+        fixed = fill(copy.deepcopy(system), row)
+        with torch.no_grad():
+            found = Response(fixed, self.smoothed, self._last[2])
         self._response = system, row.clone(), found
         return found
 
-    def _columns(self, moved: Tensor) -> Tensor:
+    def _columns(self, response: Response, moved: Tensor) -> Tensor:
         """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
-        assert self._response is not None or self._last is not None
-        states = self._response[2].states if self._response is not None else self._last[2]
-        away = torch.where(self.follows, self.batch.x[..., 0] - states[..., 0], 0.0)
-        residual = self.filter(away)[self.seen]
+        away = self.batch.x[..., 0] - response.states[..., 0]
+        residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
         weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
         found = self.filter(torch.where(self.follows, -moved, 0.0))[:, self.seen]
         return torch.nan_to_num(found * weight)
@@ -196,7 +217,7 @@ class TrafficEngine:
     ) -> Tensor:
         """``(N, n)``: derivatives of the residuals with respect to the pace of the vehicle at
         each place of the platoon, in all sequences at once."""
-        response = self.response(system, row)
+        response = self.linear(system, row)
         followers = response.scene.follower
         places = followers.shape[1]
         rate = response.rates(response.system)
@@ -204,7 +225,7 @@ class TrafficEngine:
         source = torch.zeros(places, *rate.shape, dtype=torch.float64)
         for n in range(places):
             source[n, :, :, n, 0] = rate[:, :, n, 0] * followers[:, n]
-        return self._columns(response.moved(source))
+        return self._columns(response, response.moved(source))
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""

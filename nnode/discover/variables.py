@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy import stats
-from torch import Tensor, nn
+from torch import Tensor
 
 from nnode.discover.compare import Comparison, compare, heldout
-from nnode.discover.engine import Engine, Responsive, trained
+from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit, sums
 from nnode.discover.score import Screen
-from nnode.models.effects import Effect, Strength
-from nnode.models.extend import extended
 from nnode.models.term import State
 
-#: Change of a rate, m/s or m/s², by which its trace is computed.
-STEP = 0.02
 #: Strengths of smoothing of a curve, relative to its information, that are tried.
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0)
 
@@ -45,23 +40,6 @@ class Variable:
     knots: tuple[float, ...]
     direction: Callable[[State], Tensor]
     level: str = ""
-
-
-class Curve(Effect):
-    """A deviation that is a curve of one variable."""
-
-    name = "curve"
-    strengths: ClassVar[dict[str, Strength]] = {}
-    rank = 15
-
-    def __init__(self, variable: Variable) -> None:
-        super().__init__()
-        self.variable = variable
-        self.heights = nn.Parameter(torch.zeros(len(variable.knots), dtype=torch.float64))
-
-    def forward(self, state: State) -> Tensor:
-        height = (hats(self.variable.value(state), self.variable.knots) * self.heights).sum(-1)
-        return height[..., None] * self.variable.direction(state)
 
 
 def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:
@@ -113,28 +91,12 @@ class Curves:
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
     """``(n, M)`` changes of the residuals per unit of the curve's heights."""
-    if isinstance(engine, Responsive):
 
-        def rates(state: State) -> list[Tensor]:
-            weights, way = hats(variable.value(state), variable.knots), variable.direction(state)
-            return [weight[..., None] * way for weight in weights.unbind(-1)]
+    def rates(state: State) -> list[Tensor]:
+        weights, way = hats(variable.value(state), variable.knots), variable.direction(state)
+        return [weight[..., None] * way for weight in weights.unbind(-1)]
 
-        return engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
-    system, _ = extended(fit.system, Curve(variable))
-    number = len(variable.knots)
-    rows = torch.zeros(number, sum(p.numel() for p in trained(system).values())).double()
-    column, before = 0, 0
-    for name, p in trained(system).items():
-        if name.endswith(".heights"):
-            rows[:, column : column + number] = STEP * torch.eye(number).double()
-        else:
-            rows[:, column] = float(fit.row[before])
-            before += 1
-        column += p.numel()
-    found = (engine.residuals(system, rows).numpy() - fit.residual) / STEP
-    found[~np.isfinite(found).all(1)] = 0.0
-    columns: np.ndarray = found.T
-    return columns
+    return engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
 
 
 def curves(engine: Engine, fit: Fit, variables: list[Variable]) -> list[Curves]:

@@ -24,7 +24,7 @@ from nnode.models.traffic import FollowTheLeader, LighthillWhithamRichards
 
 #: A zone begins and ends over this distance, m, and a period over this time, s: their edges
 #: can then be calibrated.
-EDGE = {"m": 4.0, "s": 0.5}
+EDGE = {"m": 12.0, "s": 1.0}
 #: So many cells of a road or a time are looked at one by one.
 CELLS = 32
 
