@@ -244,6 +244,7 @@ def _write(
     path, text = folder / CHECKPOINT, model_yaml(config["model"], has_network(found.base))
     report = plain_report(found.diagnosis)
     try:
+        (folder / REPORT).unlink(missing_ok=True)  # of an earlier run: it is there when all is
         save_checkpoint(checkpoint, path)
         model = write_text(folder / MODEL, text)
         pages = {} if drawn is None else drawn()

@@ -128,7 +128,7 @@ def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Figu
         space, beside = time_space_maps(maps), approach_maps(maps)
         words = (
             "Measured minus simulated speed in time and space; platoons are simulated for two "
-            "seconds at a time. Grey: nobody was there.",
+            f"seconds at a time. Grey: nobody was there.{_laid(inputs)}",
             "The same by gap and by how fast the vehicle ahead draws away.",
         )
     else:
@@ -145,6 +145,11 @@ def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Figu
         FigureBlock("map", space, words[0], f"Map of the deviations by place. {said}."),
         FigureBlock("map_beside", beside, words[1], f"Map by the nearest agent. {said}."),
     ]
+
+
+def _laid(inputs: Inputs) -> str:
+    number = len({s.recording for s in inputs.sequences})
+    return f" The {number} recordings are laid on top of each other." if number > 1 else ""
 
 
 def _spread(map_: Deviation) -> str:

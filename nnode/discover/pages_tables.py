@@ -133,8 +133,8 @@ def faults_table(d: Diagnosis) -> TableBlock:
     return TableBlock(
         "data_faults",
         frame.head(LISTED),
-        "Faults of the measurement. Agents are named as in the data, or numbered from the last "
-        f"one on where the data have no names; the first number is 0.{cut}",
+        "Faults of the measurement. Where the data have no names for the agents, they are "
+        f"numbered in their sequence from 0 on, in a lane from the hindmost.{cut}",
         full=frame,
     )
 
@@ -177,6 +177,8 @@ def absent_table(d: Diagnosis) -> TableBlock:
         for absence in d.absences
         if absence.testable
     ]
+    if all(row["remark"] == "–" for row in rows):
+        rows = [{key: row[key] for key in row if key != "remark"} for row in rows]
     return _table(
         "absent",
         rows,

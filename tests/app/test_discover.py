@@ -196,6 +196,12 @@ def test_a_wrong_option_is_refused_in_words(given: list[str], message: str) -> N
         check_overrides(given, ROOT / "conf", "discover")
 
 
+def test_effects_can_be_given_on_the_command_line() -> None:
+    register()
+    given = "model.effects=[{name: relative_speed, kappa: 0.3}]"
+    assert check_overrides([given], ROOT / "conf", "train") == []
+
+
 def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
     full = app._model_options(model, "measured")
     return app._job(full, data, {}, {}, DiscoverOptions(**options), Path("nowhere"))
