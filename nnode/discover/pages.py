@@ -152,7 +152,7 @@ def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
         ]
         blocks += [Text("\n".join(words)), tables.places_table(d, unit)]
     else:
-        blocks.append(Text("In no variable that was looked at do they part more than by chance."))
+        blocks.append(Text("No single variable that was looked at stands out."))
     return [*blocks, *drawn.places]
 
 

@@ -7,12 +7,18 @@ from typing import Any
 import pandas as pd
 
 from nnode.data.quality import KINDS
-from nnode.discover.report import amount, in_unit
+from nnode.discover.report import amount, estimate, in_unit
 from nnode.discover.result import Diagnosis
 from nnode.study.page import TableBlock
 
 #: Faults that the page lists; its CSV has all.
 LISTED = 30
+
+
+_SIMULATED = {
+    "traffic": ", simulated as a whole",
+    "crowd": ", of everyone simulated for a short while among the measured paths of the others",
+}
 
 
 def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> TableBlock:
@@ -25,9 +31,7 @@ def coefficients_table(d: Diagnosis) -> TableBlock:
         {
             "effect": effect.name,
             "coefficient": name,
-            "value": amount(c.value),
-            "95 % from": amount(c.low),
-            "to": amount(c.high),
+            **dict(zip(("value", "95 % from", "to"), estimate(c), strict=True)),
             "unit": _unit(c.unit),
             "where": effect.where,
         }
@@ -92,8 +96,8 @@ def gap_table(d: Diagnosis) -> TableBlock:
     return _table(
         "gap",
         rows,
-        "Mean square error of positions on the sealed sequences. The noise of the measurement is "
-        "what no model can explain.",
+        f"Mean square error of positions on the sealed sequences{_SIMULATED[d.domain]}. The noise "
+        "of the measurement is what no model can explain.",
     )
 
 

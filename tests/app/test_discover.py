@@ -26,16 +26,17 @@ from nnode.discover.result import DataFault
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, Script, environment
 from tests.discover import stand_in
-from tests.discover.recorded import ZONE, corridor, lane
+from tests.discover.recorded import ALPHA, ZONE, corridor, lane
 
 #: The script with results made by hand.
 CODE = """
 import sys
 from nnode.app import discover
 from nnode.app.cli import run
+from tests.discover import stand_in
 if __name__ == "__main__":
     sys.argv[0] = "scripts/discover.py"
-    discover.CORE = "tests.discover.stand_in"
+    discover.diagnose = stand_in.diagnose
     run("discover", discover.discover)
 """
 
@@ -75,7 +76,7 @@ def test_the_command_prints_what_was_found_and_where_it_is(run: Path) -> None:
     shown = (run / "shown.txt").read_text()
     assert "verdict: named" in shown
     assert "The model lin lacks speed_zone" in shown
-    assert "  speed_zone: alpha = 0.65 [0.627, 0.68], a = 400 [392, 400] m" in shown
+    assert "  speed_zone: alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m" in shown
     assert "not to be told from speed_period: platoons at other times" in shown
     for what, name in (
         ("report", "report.json"),
@@ -235,7 +236,7 @@ def test_wrong_options_of_a_model_are_refused(model: dict[str, Any], message: st
 @pytest.fixture
 def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Results made by hand, and nothing that could be drawn."""
-    monkeypatch.setattr(app, "CORE", "tests.discover.stand_in")
+    monkeypatch.setattr(app, "diagnose", stand_in.diagnose)
 
     def never(*_: object) -> None:
         pytest.fail("something was drawn")
@@ -278,10 +279,9 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
     frame.to_csv(table, index=False)
-    real = stand_in.diagnose
 
     def nothing(*arguments: Any, faults: dict[str, Any]) -> Any:
-        found = real(*arguments, faults=faults)
+        found = stand_in.diagnose(*arguments, faults=faults)
         known = faults["lane/1"][0]
         # what the diagnosis reports itself: one fault that the reader knows, one of its own
         again = DataFault(known.kind, known.sequence, ["1"], known.time)
@@ -289,7 +289,7 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
         diagnosis = replace(found.diagnosis, verdict="none", data_faults=[again, mine])
         return replace(found, diagnosis=diagnosis)
 
-    monkeypatch.setattr(stand_in, "diagnose", nothing)
+    monkeypatch.setattr(app, "diagnose", nothing)
     report = app.diagnose_table(table, "traffic", model={"term": "lin"})
     assert report["verdict"] == "data_fault"
     faults = [(f["kind"], f["sequence"], f["agents"]) for f in report["data_faults"]]
@@ -297,3 +297,20 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
     assert sum(sequence == "lane/1" for _, sequence, _ in faults) == len(faults) - 1
     assert all(agent.startswith("v1-") for _, s, agents in faults if s == "lane/1"
                for agent in agents)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_slow_zone_of_made_up_platoons_is_named(tmp_path: Path) -> None:
+    table = lane(tmp_path / "lane.csv", sequences=10, seconds=15.0, cars=5)
+    report = app.diagnose_table(
+        table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
+        options=DiscoverOptions(effects=["speed_zone", "relative_speed"]),
+    )  # fmt: skip
+    assert report["verdict"] == "named"
+    (effect,) = report["effects"]
+    assert effect["name"] == "speed_zone"
+    assert effect["coefficients"]["alpha"]["value"] == pytest.approx(ALPHA, abs=0.02)
+    assert effect["coefficients"]["a"]["value"] == pytest.approx(ZONE[0], abs=3)
+    assert effect["coefficients"]["b"]["value"] == pytest.approx(ZONE[1], abs=3)
+    assert report["gap"]["closed"] > 0.98
+    assert (tmp_path / "run" / "report.html").is_file()
