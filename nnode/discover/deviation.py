@@ -136,7 +136,10 @@ def _crowd(s: Sequence, x: np.ndarray, number: int) -> Deviation:
 
 
 def _pieces(s: Sequence, system: System) -> list[Sequence]:
-    """Pieces of a sequence with smoothed velocities, and with the destinations of the whole."""
+    """Pieces of a sequence with smoothed velocities, and with the destinations of the whole.
+
+    They keep its name, by which effects know its agents.
+    """
     # an acceleration shows in no single step
     n = min(max(system.order, round(SPAN[system.domain] / s.dt)), s.n_samples - 1)
     goal = s.x[-1] if s.destination is None else s.destination
@@ -144,7 +147,6 @@ def _pieces(s: Sequence, system: System) -> list[Sequence]:
     return [
         replace(
             s,
-            name=f"{s.name}+{first}",
             time=s.time[first : first + n + 1],
             x=s.x[first : first + n + 1],
             v=v[first : first + n + 1],

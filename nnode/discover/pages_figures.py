@@ -11,7 +11,7 @@ from nnode.discover.deviation import Deviation, deviation, simulate, smooth_velo
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.report import amount, interval
+from nnode.discover.report import amount, individual, interval
 from nnode.plots.discover_maps import approach_maps, neighbour_maps, plane_maps, time_space_maps
 from nnode.plots.discover_marks import (
     coefficient_intervals,
@@ -202,11 +202,15 @@ def _paths(
     simulated = pair(before, after if found.diagnosis.effects else None)
     errors = ", ".join(f"{one.title} {amount(rmse(s, one.x), 2)} m" for one in simulated)
     name = f"the sealed sequence {s.name}"
+    unknown = "".join(
+        f" Its agents' numbers are not known, so that {effect} does not act here."
+        for effect in individual(found.extended)
+    )
     blocks: list[FigureBlock | MovingBlock] = [
         FigureBlock(
             "trajectories",
             trajectories(s, simulated),
-            f"Measured and simulated paths of {name}, on which nothing was calibrated.",
+            f"Measured and simulated paths of {name}, on which nothing was calibrated.{unknown}",
             f"Paths of {name}; root mean square error: {errors}.",
         ),
         FigureBlock(

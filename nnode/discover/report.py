@@ -19,6 +19,7 @@ from nnode.discover.found import Found
 from nnode.discover.result import Coefficient, Diagnosis, NamedEffect
 from nnode.files import write_text
 from nnode.models import FeedForward, System, build_model
+from nnode.models.effects import CATALOGUE
 from nnode.models.extend import effects_of
 
 REPORT = "report.json"
@@ -105,6 +106,8 @@ def sentence(diagnosis: Diagnosis) -> str:
         f"{amount(d.gap.after)} m² ({closed(d)} of what can be closed above the noise floor of "
         f"{amount(d.gap.noise_floor)} m²)"
     )
+    if any(_has_numbers(effect.name) for effect in d.effects):
+        gain += ", each agent's number being taken from the other half of his own time"
     match d.verdict:
         case "named":
             them = "it" if len(d.effects) == 1 else "them"
@@ -137,6 +140,11 @@ def sentence(diagnosis: Diagnosis) -> str:
                 f"Nothing is missing from the model {d.model} that these data could show: no "
                 "effect of the catalogue passes, and no structure is left."
             )
+
+
+def _has_numbers(name: str) -> bool:
+    effect = CATALOGUE.effects.get(name)
+    return effect is not None and effect.individual
 
 
 def closed(diagnosis: Diagnosis) -> str:
@@ -173,6 +181,11 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
         name = f"{options['name']}_calibrated"
     rest = {key: value for key, value in options.items() if key != "effects"}
     return {**rest, "name": name, **own, "effects": effects}
+
+
+def individual(system: System) -> list[str]:
+    """The effects of a model that have a number for every agent."""
+    return [effect.name for effect in effects_of(system) if effect.individual]
 
 
 def has_network(system: System) -> bool:

@@ -301,7 +301,7 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
 
 @pytest.mark.slow
 def test_the_slow_zone_of_made_up_platoons_is_named(tmp_path: Path) -> None:
-    table = lane(tmp_path / "lane.csv", sequences=10, seconds=15.0, cars=5)
+    table = lane(tmp_path / "lane.csv", sequences=12, seconds=20.0, cars=6)
     report = app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
         options=DiscoverOptions(effects=["speed_zone", "relative_speed"]),

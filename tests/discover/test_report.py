@@ -106,6 +106,14 @@ def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str
         assert "(89 % of what can be closed above the noise floor of 0.5 m²)" in sentence(d)
 
 
+def test_numbers_of_agents_are_no_prediction(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    (effect,) = d.effects
+    assert "half of his own time" not in sentence(d)
+    d = replace(d, effects=[effect, replace(effect, name="driver_heterogeneity")])
+    assert sentence(d).endswith("taken from the other half of his own time.")
+
+
 @pytest.mark.parametrize("name", ["traffic", "crowd"])
 def test_the_options_give_the_extended_model(name: str, request: pytest.FixtureRequest) -> None:
     case: Case = request.getfixturevalue(name)
