@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -57,18 +56,58 @@ def overrides(table: Path, folder: Path) -> list[str]:
             "data.domain=traffic", f"hydra.run.dir={folder}", "discover.sealed=0.4"]  # fmt: skip
 
 
+#: The diagnosis by hand, then scripts that take its model, all in one process: loading the
+#: libraries takes longer than they do.
+CHAIN = """
+import runpy
+import shutil
+import sys
+from pathlib import Path
+from nnode.app import discover
+from nnode.app.cli import run
+from tests.discover import stand_in
+
+def script(name, *arguments, root="."):
+    sys.argv = [f"{root}/scripts/{name}.py", *arguments]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+if __name__ == "__main__":
+    folder, *overrides = sys.argv[1:]
+    sys.argv = ["scripts/discover.py", *overrides]
+    discover.diagnose = stand_in.diagnose
+    run("discover", discover.discover)
+    checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
+    print("== evaluate")
+    script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={folder}/evaluate")
+    print("== plot_forces")
+    script("plot_forces", checkpoint, f"hydra.run.dir={folder}/forces")
+    print("== train")
+    for name in ("conf", "scripts"):
+        shutil.copytree(name, f"{folder}/{name}")
+    shutil.copy(f"{folder}/run/model.yaml", f"{folder}/conf/model/lin_with_speed_zone.yaml")
+    script(
+        "train", "model=lin_with_speed_zone", "solver=fused", "solver.dt=0.02", "data=table",
+        f"data.path={folder}/lane.csv", "data.domain=traffic", "trainer.max_epochs=1",
+        f"hydra.run.dir={folder}/train", root=folder,
+    )
+"""
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished diagnosis on a table in which one sequence is faulty."""
+    """A finished diagnosis on a table in which one sequence is faulty, and what takes its model."""
     folder = tmp_path_factory.mktemp("discover")
     table = lane(folder / "lane.csv", sequences=6, seconds=4.0, cars=3)
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
     frame.to_csv(table, index=False)
-    process = start(*overrides(table, folder / "run"), "discover.animation=false")
-    shown, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
-    (folder / "run" / "shown.txt").write_text(shown)
+    given = [*overrides(table, folder / "run"), "discover.animation=false"]
+    done = subprocess.run(
+        [sys.executable, "-c", CHAIN, str(folder), *given],
+        cwd=ROOT, env=environment(), capture_output=True, text=True, check=False, timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder / "run" / "shown.txt").write_text(done.stdout.partition("== evaluate")[0])
     return folder / "run"
 
 
@@ -105,13 +144,8 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     assert "python scripts/train.py model=lin_with_speed_zone data=table data.path=" in page
 
 
-def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(
-    script: Script, run: Path, tmp_path: Path
-) -> None:
-    checkpoint = f"checkpoint={run / 'checkpoints' / 'best.pt'}"
-    done = script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
+def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:
+    metrics = json.loads((run.parent / "evaluate" / "metrics.json").read_text())
     report = json.loads((run / "report.json").read_text())
     assert metrics["part"] == "heldout"
     assert metrics["trained_on"] == 0
@@ -121,33 +155,18 @@ def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(
     assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
 
 
-def test_force_plots_take_the_checkpoint(script: Script, run: Path, tmp_path: Path) -> None:
-    checkpoint = f"checkpoint={run / 'checkpoints' / 'best.pt'}"
-    done = script("plot_forces", checkpoint, f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "forces.png").stat().st_size > 10_000
-    assert list(pd.read_csv(tmp_path / "forces.csv"))[-1] == "lin_with_speed_zone"
+def test_force_plots_take_the_checkpoint(run: Path) -> None:
+    forces = run.parent / "forces"
+    assert (forces / "forces.png").stat().st_size > 10_000
+    assert list(pd.read_csv(forces / "forces.csv"))[-1] == "lin_with_speed_zone"
 
 
-def test_the_configuration_trains_from_the_estimates(run: Path, tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "conf", tmp_path / "conf")
-    shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
-    shutil.copy(run / "model.yaml", tmp_path / "conf" / "model" / "lin_with_speed_zone.yaml")
-    table = run.parent / "lane.csv"
-    done = subprocess.run(
-        [
-            sys.executable, "scripts/train.py", "model=lin_with_speed_zone", "solver=fused",
-            "data=table", f"data.path={table}", "data.domain=traffic", "trainer.max_epochs=1",
-            "solver.dt=0.02", f"hydra.run.dir={tmp_path / 'run'}",
-        ],
-        cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+def test_the_configuration_trains_from_the_estimates(run: Path) -> None:
+    result = json.loads((run.parent / "train" / "result.json").read_text())
     first = result["history"][0]
     assert first["parameters/alpha"] == pytest.approx(0.65)
     assert first["parameters/a"] == pytest.approx(ZONE[0])
-    checkpoint = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.pt")
+    checkpoint = load_checkpoint(run.parent / "train" / "checkpoints" / "last.pt")
     assert checkpoint.history[-1]["parameters/alpha"] != 0.65  # it is calibrated
 
 
