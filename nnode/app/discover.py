@@ -8,7 +8,6 @@ import signal
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -22,6 +21,7 @@ from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults, TableOptions
+from nnode.discover.diagnose import diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions, check_options
@@ -44,9 +44,6 @@ from nnode.models import System, build_model
 from nnode.models.effects.own import load_own
 
 log = logging.getLogger(__name__)
-
-#: Module of the diagnosis itself; imported when it is asked for.
-CORE = "nnode.discover.diagnose"
 
 
 @dataclass(frozen=True)
@@ -205,7 +202,6 @@ def _job(
 def _diagnose(job: Job) -> Found:
     """Run the diagnosis, and add what only its caller knows."""
     set_threads(None, job.system.domain)
-    diagnose = cast(Callable[..., Found], import_module(CORE).diagnose)
     inputs = job.inputs
     found = diagnose(job.system, inputs.sequences, job.options, faults=inputs.faults)
     diagnosis = found.diagnosis
@@ -244,6 +240,7 @@ def _write(
     path, text = folder / CHECKPOINT, model_yaml(config["model"], has_network(found.base))
     report = plain_report(found.diagnosis)
     try:
+        (folder / REPORT).unlink(missing_ok=True)  # of an earlier run: it is there when all is
         save_checkpoint(checkpoint, path)
         model = write_text(folder / MODEL, text)
         pages = {} if drawn is None else drawn()

@@ -10,6 +10,7 @@ from difflib import get_close_matches
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.models.effects import CATALOGUE
+from nnode.models.effects.own import VARIABLE
 
 
 @dataclass
@@ -70,5 +71,6 @@ def _known(option: str, names: Iterable[str], known: list[str], domain: Domain) 
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ConfigError(
             f"{option}: there is no {domain} effect {name}, expected some of "
-            f"{', '.join(known) or 'none at all'}{hint}"
+            f"{', '.join(known) or 'none at all'}{hint}; files with effects of your own are named "
+            f"in {VARIABLE}"
         )

@@ -21,6 +21,7 @@ from nnode.discover.report import (
     closed,
     has_network,
     in_unit,
+    individual,
     interval,
     sentence,
 )
@@ -78,20 +79,20 @@ def page_blocks(
     """The page in the order of the diagnosis, the verdict first."""
     d = found.diagnosis
     return [
-        *_verdict(d, drawn, has_network(found.base)),
+        *_verdict(d, drawn, found),
         *_data(d, drawn),
         *_model(d),
         *_places(d, drawn, UNITS[inputs.domain]),
         *_rest(d, drawn, UNITS[inputs.domain]),
         *_shown(d, drawn),
-        *_usage(d, commands, folder, has_network(found.base)),
+        *_usage(d, commands, folder, found),
         _provenance(d, inputs),
     ]
 
 
-def _verdict(d: Diagnosis, drawn: Figures, network: bool) -> list[Block]:
+def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
-    if network:
+    if has_network(found.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
         blocks += [tables.coefficients_table(d), *drawn.effects, tables.effects_table(d)]
@@ -104,7 +105,7 @@ def _verdict(d: Diagnosis, drawn: Figures, network: bool) -> list[Block]:
         Text(
             f"{len(d.split.get('sealed', []))} of "
             f"{len(d.split.get('sealed', [])) + len(d.split.get('open', []))} sequences were "
-            f"sealed: nothing looked at them before this comparison. {_gap_words(d)}"
+            f"sealed: nothing looked at them before this comparison. {_gap_words(d, found)}"
         ),
         tables.gap_table(d),
         *drawn.gap,
@@ -112,10 +113,16 @@ def _verdict(d: Diagnosis, drawn: Figures, network: bool) -> list[Block]:
     return blocks
 
 
-def _gap_words(d: Diagnosis) -> str:
+def _gap_words(d: Diagnosis, found: Found) -> str:
     if not d.effects:
         return "As nothing was added, the error is what the calibrated model leaves."
-    return f"The effects close {closed(d)} of the gap between the model and the noise."
+    words = f"The effects close {closed(d)} of the gap between the model and the noise."
+    for name in individual(found.extended):
+        words += (
+            f" {name} has a number for every agent: here it is estimated from one half of his "
+            "time and used in the other."
+        )
+    return words
 
 
 def _data(d: Diagnosis, drawn: Figures) -> list[Block]:
@@ -152,7 +159,7 @@ def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
         ]
         blocks += [Text("\n".join(words)), tables.places_table(d, unit)]
     else:
-        blocks.append(Text("In no variable that was looked at do they part more than by chance."))
+        blocks.append(Text("No single variable that was looked at stands out."))
     return [*blocks, *drawn.places]
 
 
@@ -191,17 +198,22 @@ def _shown(d: Diagnosis, drawn: Figures) -> list[Block]:
     return [Heading("A sealed sequence"), *drawn.paths]
 
 
-def _usage(d: Diagnosis, commands: list[str], folder: Path, network: bool) -> list[Block]:
-    weights = (
-        " The weights of the network are in the checkpoint alone; trained from the configuration "
-        "it starts anew."
-        if network
-        else ""
-    )
+def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> list[Block]:
+    more = ""
+    if has_network(found.base):
+        more += (
+            " The weights of the network are in the checkpoint alone; trained from the "
+            "configuration it starts anew."
+        )
+    for name in individual(found.extended):
+        more += (
+            f" {name} knows the agents of the open sequences; for all others it does not act, so "
+            "that errors on sealed sequences are those without it."
+        )
     words = (
         "The extended model is a model like any other: errors beside baselines on the sealed "
         "sequences, force plots, and further training from its configuration, in which every "
-        f"parameter starts at its estimate.{weights}"
+        f"parameter starts at its estimate.{more}"
     )
     code = "```sh\n" + "\n".join(commands) + "\n```"
     python = f'```python\nimport nnode\n\nmodel = nnode.load("{folder / CHECKPOINT}")\n```'

@@ -11,7 +11,7 @@ from nnode.discover.deviation import Deviation, deviation, simulate, smooth_velo
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.report import amount, interval
+from nnode.discover.report import amount, individual, interval
 from nnode.plots.discover_maps import approach_maps, neighbour_maps, plane_maps, time_space_maps
 from nnode.plots.discover_marks import (
     coefficient_intervals,
@@ -128,7 +128,7 @@ def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Figu
         space, beside = time_space_maps(maps), approach_maps(maps)
         words = (
             "Measured minus simulated speed in time and space; platoons are simulated for two "
-            "seconds at a time. Grey: nobody was there.",
+            f"seconds at a time. Grey: nobody was there.{_laid(inputs)}",
             "The same by gap and by how fast the vehicle ahead draws away.",
         )
     else:
@@ -145,6 +145,11 @@ def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Figu
         FigureBlock("map", space, words[0], f"Map of the deviations by place. {said}."),
         FigureBlock("map_beside", beside, words[1], f"Map by the nearest agent. {said}."),
     ]
+
+
+def _laid(inputs: Inputs) -> str:
+    number = len({s.recording for s in inputs.sequences})
+    return f" The {number} recordings are laid on top of each other." if number > 1 else ""
 
 
 def _spread(map_: Deviation) -> str:
@@ -197,11 +202,15 @@ def _paths(
     simulated = pair(before, after if found.diagnosis.effects else None)
     errors = ", ".join(f"{one.title} {amount(rmse(s, one.x), 2)} m" for one in simulated)
     name = f"the sealed sequence {s.name}"
+    unknown = "".join(
+        f" Its agents' numbers are not known, so that {effect} does not act here."
+        for effect in individual(found.extended)
+    )
     blocks: list[FigureBlock | MovingBlock] = [
         FigureBlock(
             "trajectories",
             trajectories(s, simulated),
-            f"Measured and simulated paths of {name}, on which nothing was calibrated.",
+            f"Measured and simulated paths of {name}, on which nothing was calibrated.{unknown}",
             f"Paths of {name}; root mean square error: {errors}.",
         ),
         FigureBlock(

@@ -7,12 +7,18 @@ from typing import Any
 import pandas as pd
 
 from nnode.data.quality import KINDS
-from nnode.discover.report import amount, in_unit
+from nnode.discover.report import amount, estimate, in_unit
 from nnode.discover.result import Diagnosis
 from nnode.study.page import TableBlock
 
 #: Faults that the page lists; its CSV has all.
 LISTED = 30
+
+
+_SIMULATED = {
+    "traffic": ", simulated as a whole",
+    "crowd": ", of everyone simulated for a short while among the measured paths of the others",
+}
 
 
 def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> TableBlock:
@@ -25,9 +31,7 @@ def coefficients_table(d: Diagnosis) -> TableBlock:
         {
             "effect": effect.name,
             "coefficient": name,
-            "value": amount(c.value),
-            "95 % from": amount(c.low),
-            "to": amount(c.high),
+            **dict(zip(("value", "95 % from", "to"), estimate(c), strict=True)),
             "unit": _unit(c.unit),
             "where": effect.where,
         }
@@ -92,8 +96,8 @@ def gap_table(d: Diagnosis) -> TableBlock:
     return _table(
         "gap",
         rows,
-        "Mean square error of positions on the sealed sequences. The noise of the measurement is "
-        "what no model can explain.",
+        f"Mean square error of positions on the sealed sequences{_SIMULATED[d.domain]}. The noise "
+        "of the measurement is what no model can explain.",
     )
 
 
@@ -133,8 +137,8 @@ def faults_table(d: Diagnosis) -> TableBlock:
     return TableBlock(
         "data_faults",
         frame.head(LISTED),
-        "Faults of the measurement. Agents are named as in the data, or numbered from the last "
-        f"one on where the data have no names; the first number is 0.{cut}",
+        "Faults of the measurement. Where the data have no names for the agents, they are "
+        f"numbered in their sequence from 0 on, in a lane from the hindmost.{cut}",
         full=frame,
     )
 
@@ -177,6 +181,8 @@ def absent_table(d: Diagnosis) -> TableBlock:
         for absence in d.absences
         if absence.testable
     ]
+    if all(row["remark"] == "–" for row in rows):
+        rows = [{key: row[key] for key in row if key != "remark"} for row in rows]
     return _table(
         "absent",
         rows,

@@ -16,9 +16,10 @@ from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.optimizers import build_optimizer
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Found
-from nnode.discover.result import Diagnosis, NamedEffect
+from nnode.discover.result import Coefficient, Diagnosis, NamedEffect
 from nnode.files import write_text
 from nnode.models import FeedForward, System, build_model
+from nnode.models.effects import CATALOGUE
 from nnode.models.extend import effects_of
 
 REPORT = "report.json"
@@ -71,6 +72,17 @@ def amount(value: float | None, digits: int = 3) -> str:
     return f"{short:g}".replace("-", "−")
 
 
+def estimate(coefficient: Coefficient) -> tuple[str, str, str]:
+    """A coefficient and the ends of its interval, with the digits that the interval leaves."""
+    c = coefficient
+    width = max(c.high - c.value, c.value - c.low)
+    if not (math.isfinite(width) and width > 0):
+        return amount(c.value, 4), amount(c.low, 4), amount(c.high, 4)
+    digits = min(max(1 - math.floor(math.log10(width)), 0), 9)
+    value, low, high = (f"{x:.{digits}f}".replace("-", "−") for x in (c.value, c.low, c.high))
+    return value, low, high
+
+
 def in_unit(unit: str) -> str:
     """A unit as it follows a number: nothing for pure numbers."""
     return "" if unit in ("", "1") else f" {unit}"
@@ -78,10 +90,11 @@ def in_unit(unit: str) -> str:
 
 def interval(effect: NamedEffect) -> str:
     """An effect's coefficients with their intervals, in one line."""
-    return ", ".join(
-        f"{name} = {amount(c.value)} [{amount(c.low)}, {amount(c.high)}]{in_unit(c.unit)}"
-        for name, c in effect.coefficients.items()
-    )
+    parts = []
+    for name, c in effect.coefficients.items():
+        value, low, high = estimate(c)
+        parts.append(f"{name} = {value} [{low}, {high}]{in_unit(c.unit)}")
+    return ", ".join(parts)
 
 
 def sentence(diagnosis: Diagnosis) -> str:
@@ -93,6 +106,8 @@ def sentence(diagnosis: Diagnosis) -> str:
         f"{amount(d.gap.after)} m² ({closed(d)} of what can be closed above the noise floor of "
         f"{amount(d.gap.noise_floor)} m²)"
     )
+    if any(_has_numbers(effect.name) for effect in d.effects):
+        gain += ", each agent's number being taken from the other half of his own time"
     match d.verdict:
         case "named":
             them = "it" if len(d.effects) == 1 else "them"
@@ -125,6 +140,11 @@ def sentence(diagnosis: Diagnosis) -> str:
                 f"Nothing is missing from the model {d.model} that these data could show: no "
                 "effect of the catalogue passes, and no structure is left."
             )
+
+
+def _has_numbers(name: str) -> bool:
+    effect = CATALOGUE.effects.get(name)
+    return effect is not None and effect.individual
 
 
 def closed(diagnosis: Diagnosis) -> str:
@@ -161,6 +181,11 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
         name = f"{options['name']}_calibrated"
     rest = {key: value for key, value in options.items() if key != "effects"}
     return {**rest, "name": name, **own, "effects": effects}
+
+
+def individual(system: System) -> list[str]:
+    """The effects of a model that have a number for every agent."""
+    return [effect.name for effect in effects_of(system) if effect.individual]
 
 
 def has_network(system: System) -> bool:
@@ -214,16 +239,15 @@ def checkpoint_of(
     speed = None
     if model.domain == "traffic":
         speed = best_common_speed([collate([sequences[i] for i in found.open])])
-    parts = {"train": found.open, "heldout": found.sealed}
+    used = {*found.open, *found.sealed}
+    dropped = [i for i in range(len(sequences)) if i not in used]
+    parts = {"train": found.open, "heldout": found.sealed, "dropped": dropped}
     return Checkpoint(
         config=config,
         manifest=manifest,
         model=model.state_dict(),
         optimizer=build_optimizer(model, optimizer, int(config["seed"])).state_dict(),
         progress=dict(UNTRAINED),
-        split={
-            **{part: [sequences[i].name for i in places] for part, places in parts.items()},
-            "dropped": [],
-        },
+        split={part: [sequences[i].name for i in places] for part, places in parts.items()},
         free_speed=speed,
     )

@@ -13,7 +13,7 @@ from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
-from nnode.models.effects.own import load_own
+from nnode.models.effects.own import VARIABLE, load_own
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
 
@@ -136,7 +136,7 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
             hint = f"; did you mean {near[0]}?" if near else ""
             raise ConfigError(
                 f"model.effects: there is no {model.domain} effect {name}, expected one of "
-                f"{', '.join(known)}{hint}"
+                f"{', '.join(known)}{hint}; files with effects of your own are named in {VARIABLE}"
             )
         try:
             added.append(CATALOGUE.effects[name](**values))

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from nnode.discover.deviation import Deviation
 from nnode.plots.style import DIVERGING, FONT, GREY, SEQUENTIAL, SMALL_FONT, dress, new_figure
 
-#: Cells along the longer side of a map.
-CELLS = 48
+#: Fewest and most cells along a side of a coloured map: about PER_CELL values make up one.
+CELLS, PER_CELL = (12, 48), 3
 #: A mean of fewer values is not shown in maps of arrows.
 LEAST = 3
 #: The scale of colours and arrows ends at this percentile of the map before.
@@ -28,7 +28,8 @@ def time_space_maps(maps: Mapping[str, Deviation]) -> Figure:
         maps: title to deviation, one panel each; the first one sets the scale.
     """
     first = next(iter(maps.values()))
-    edges = (_edges(first.time, CELLS), _edges(first.position[:, 0], CELLS))
+    cells = _number(first)
+    edges = (_edges(first.time, cells), _edges(first.position[:, 0], cells))
     return _coloured(
         {name: (d.time, d.position[:, 0], d.value[:, 0]) for name, d in maps.items()},
         edges,
@@ -40,8 +41,9 @@ def approach_maps(maps: Mapping[str, Deviation]) -> Figure:
     """Measured minus simulated speed by the gap and by how fast the vehicle ahead draws away."""
     first = next(iter(maps.values()))
     # few extreme values would leave the bulk a few cells
+    cells = min(_number(first), 24)
     edges = tuple(
-        _edges(np.clip(c, *np.nanpercentile(c, [1, 99])) if np.isfinite(c).any() else c, 24)
+        _edges(np.clip(c, *np.nanpercentile(c, [1, 99])) if np.isfinite(c).any() else c, cells)
         for c in first.beside.T
     )
     return _coloured(
@@ -76,6 +78,10 @@ def draw_walls(ax: Axes, walls: np.ndarray | None) -> None:
     """Walls as thick lines."""
     for x1, y1, x2, y2 in [] if walls is None else walls:
         ax.plot([x1, x2], [y1, y2], color="black", linewidth=2, solid_capstyle="butt", zorder=1)
+
+
+def _number(map_: Deviation) -> int:
+    return int(np.clip(np.sqrt(len(map_.time) / PER_CELL), *CELLS))
 
 
 def _edges(values: np.ndarray, cells: int) -> np.ndarray:

@@ -105,6 +105,7 @@ def sealed_costs(
     positive = np.concatenate([b, a])
     if (positive > 0).all():
         ax.set_yscale("log")
+        ax.tick_params(which="minor", labelsize=SMALL_FONT, width=0.6, color=GREY)
     handles = [
         Line2D([], [], linestyle="", label="as it was given, calibrated", **BEFORE),
         Line2D([], [], linestyle="", label="with the effects", **AFTER),

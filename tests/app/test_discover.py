@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -26,16 +25,17 @@ from nnode.discover.result import DataFault
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, Script, environment
 from tests.discover import stand_in
-from tests.discover.recorded import ZONE, corridor, lane
+from tests.discover.recorded import ALPHA, ZONE, corridor, lane
 
 #: The script with results made by hand.
 CODE = """
 import sys
 from nnode.app import discover
 from nnode.app.cli import run
+from tests.discover import stand_in
 if __name__ == "__main__":
     sys.argv[0] = "scripts/discover.py"
-    discover.CORE = "tests.discover.stand_in"
+    discover.diagnose = stand_in.diagnose
     run("discover", discover.discover)
 """
 
@@ -56,18 +56,58 @@ def overrides(table: Path, folder: Path) -> list[str]:
             "data.domain=traffic", f"hydra.run.dir={folder}", "discover.sealed=0.4"]  # fmt: skip
 
 
+#: The diagnosis by hand, then scripts that take its model, all in one process: loading the
+#: libraries takes longer than they do.
+CHAIN = """
+import runpy
+import shutil
+import sys
+from pathlib import Path
+from nnode.app import discover
+from nnode.app.cli import run
+from tests.discover import stand_in
+
+def script(name, *arguments, root="."):
+    sys.argv = [f"{root}/scripts/{name}.py", *arguments]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+if __name__ == "__main__":
+    folder, *overrides = sys.argv[1:]
+    sys.argv = ["scripts/discover.py", *overrides]
+    discover.diagnose = stand_in.diagnose
+    run("discover", discover.discover)
+    checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
+    print("== evaluate")
+    script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={folder}/evaluate")
+    print("== plot_forces")
+    script("plot_forces", checkpoint, f"hydra.run.dir={folder}/forces")
+    print("== train")
+    for name in ("conf", "scripts"):
+        shutil.copytree(name, f"{folder}/{name}")
+    shutil.copy(f"{folder}/run/model.yaml", f"{folder}/conf/model/lin_with_speed_zone.yaml")
+    script(
+        "train", "model=lin_with_speed_zone", "solver=fused", "solver.dt=0.02", "data=table",
+        f"data.path={folder}/lane.csv", "data.domain=traffic", "trainer.max_epochs=1",
+        f"hydra.run.dir={folder}/train", root=folder,
+    )
+"""
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished diagnosis on a table in which one sequence is faulty."""
+    """A finished diagnosis on a table in which one sequence is faulty, and what takes its model."""
     folder = tmp_path_factory.mktemp("discover")
     table = lane(folder / "lane.csv", sequences=6, seconds=4.0, cars=3)
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
     frame.to_csv(table, index=False)
-    process = start(*overrides(table, folder / "run"), "discover.animation=false")
-    shown, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
-    (folder / "run" / "shown.txt").write_text(shown)
+    given = [*overrides(table, folder / "run"), "discover.animation=false"]
+    done = subprocess.run(
+        [sys.executable, "-c", CHAIN, str(folder), *given],
+        cwd=ROOT, env=environment(), capture_output=True, text=True, check=False, timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder / "run" / "shown.txt").write_text(done.stdout.partition("== evaluate")[0])
     return folder / "run"
 
 
@@ -75,7 +115,7 @@ def test_the_command_prints_what_was_found_and_where_it_is(run: Path) -> None:
     shown = (run / "shown.txt").read_text()
     assert "verdict: named" in shown
     assert "The model lin lacks speed_zone" in shown
-    assert "  speed_zone: alpha = 0.65 [0.627, 0.68], a = 400 [392, 400] m" in shown
+    assert "  speed_zone: alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m" in shown
     assert "not to be told from speed_period: platoons at other times" in shown
     for what, name in (
         ("report", "report.json"),
@@ -104,13 +144,8 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     assert "python scripts/train.py model=lin_with_speed_zone data=table data.path=" in page
 
 
-def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(
-    script: Script, run: Path, tmp_path: Path
-) -> None:
-    checkpoint = f"checkpoint={run / 'checkpoints' / 'best.pt'}"
-    done = script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
+def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:
+    metrics = json.loads((run.parent / "evaluate" / "metrics.json").read_text())
     report = json.loads((run / "report.json").read_text())
     assert metrics["part"] == "heldout"
     assert metrics["trained_on"] == 0
@@ -120,33 +155,18 @@ def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(
     assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
 
 
-def test_force_plots_take_the_checkpoint(script: Script, run: Path, tmp_path: Path) -> None:
-    checkpoint = f"checkpoint={run / 'checkpoints' / 'best.pt'}"
-    done = script("plot_forces", checkpoint, f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "forces.png").stat().st_size > 10_000
-    assert list(pd.read_csv(tmp_path / "forces.csv"))[-1] == "lin_with_speed_zone"
+def test_force_plots_take_the_checkpoint(run: Path) -> None:
+    forces = run.parent / "forces"
+    assert (forces / "forces.png").stat().st_size > 10_000
+    assert list(pd.read_csv(forces / "forces.csv"))[-1] == "lin_with_speed_zone"
 
 
-def test_the_configuration_trains_from_the_estimates(run: Path, tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "conf", tmp_path / "conf")
-    shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
-    shutil.copy(run / "model.yaml", tmp_path / "conf" / "model" / "lin_with_speed_zone.yaml")
-    table = run.parent / "lane.csv"
-    done = subprocess.run(
-        [
-            sys.executable, "scripts/train.py", "model=lin_with_speed_zone", "solver=fused",
-            "data=table", f"data.path={table}", "data.domain=traffic", "trainer.max_epochs=1",
-            "solver.dt=0.02", f"hydra.run.dir={tmp_path / 'run'}",
-        ],
-        cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+def test_the_configuration_trains_from_the_estimates(run: Path) -> None:
+    result = json.loads((run.parent / "train" / "result.json").read_text())
     first = result["history"][0]
     assert first["parameters/alpha"] == pytest.approx(0.65)
     assert first["parameters/a"] == pytest.approx(ZONE[0])
-    checkpoint = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.pt")
+    checkpoint = load_checkpoint(run.parent / "train" / "checkpoints" / "last.pt")
     assert checkpoint.history[-1]["parameters/alpha"] != 0.65  # it is calibrated
 
 
@@ -196,6 +216,12 @@ def test_a_wrong_option_is_refused_in_words(given: list[str], message: str) -> N
         check_overrides(given, ROOT / "conf", "discover")
 
 
+def test_effects_can_be_given_on_the_command_line() -> None:
+    register()
+    given = "model.effects=[{name: relative_speed, kappa: 0.3}]"
+    assert check_overrides([given], ROOT / "conf", "train") == []
+
+
 def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
     full = app._model_options(model, "measured")
     return app._job(full, data, {}, {}, DiscoverOptions(**options), Path("nowhere"))
@@ -229,7 +255,7 @@ def test_wrong_options_of_a_model_are_refused(model: dict[str, Any], message: st
 @pytest.fixture
 def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Results made by hand, and nothing that could be drawn."""
-    monkeypatch.setattr(app, "CORE", "tests.discover.stand_in")
+    monkeypatch.setattr(app, "diagnose", stand_in.diagnose)
 
     def never(*_: object) -> None:
         pytest.fail("something was drawn")
@@ -272,10 +298,9 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
     frame.to_csv(table, index=False)
-    real = stand_in.diagnose
 
     def nothing(*arguments: Any, faults: dict[str, Any]) -> Any:
-        found = real(*arguments, faults=faults)
+        found = stand_in.diagnose(*arguments, faults=faults)
         known = faults["lane/1"][0]
         # what the diagnosis reports itself: one fault that the reader knows, one of its own
         again = DataFault(known.kind, known.sequence, ["1"], known.time)
@@ -283,7 +308,7 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
         diagnosis = replace(found.diagnosis, verdict="none", data_faults=[again, mine])
         return replace(found, diagnosis=diagnosis)
 
-    monkeypatch.setattr(stand_in, "diagnose", nothing)
+    monkeypatch.setattr(app, "diagnose", nothing)
     report = app.diagnose_table(table, "traffic", model={"term": "lin"})
     assert report["verdict"] == "data_fault"
     faults = [(f["kind"], f["sequence"], f["agents"]) for f in report["data_faults"]]
@@ -291,3 +316,20 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
     assert sum(sequence == "lane/1" for _, sequence, _ in faults) == len(faults) - 1
     assert all(agent.startswith("v1-") for _, s, agents in faults if s == "lane/1"
                for agent in agents)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_slow_zone_of_made_up_platoons_is_named(tmp_path: Path) -> None:
+    table = lane(tmp_path / "lane.csv", sequences=12, seconds=20.0, cars=6)
+    report = app.diagnose_table(
+        table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
+        options=DiscoverOptions(effects=["speed_zone", "relative_speed"]),
+    )  # fmt: skip
+    assert report["verdict"] == "named"
+    (effect,) = report["effects"]
+    assert effect["name"] == "speed_zone"
+    assert effect["coefficients"]["alpha"]["value"] == pytest.approx(ALPHA, abs=0.02)
+    assert effect["coefficients"]["a"]["value"] == pytest.approx(ZONE[0], abs=3)
+    assert effect["coefficients"]["b"]["value"] == pytest.approx(ZONE[1], abs=3)
+    assert report["gap"]["closed"] > 0.98
+    assert (tmp_path / "run" / "report.html").is_file()

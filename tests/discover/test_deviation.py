@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from nnode.data.sequence import Sequence
 from nnode.discover.deviation import deviation, in_own_frame, nearest, simulate, smooth_velocity
 from nnode.models import Crowd, Relaxation, Traffic
+from nnode.models.build import add_effects
 from nnode.models.traffic import Linear
 
 
@@ -39,6 +40,14 @@ def test_a_leader_that_is_simulated_counts() -> None:
     assert leaders.sum() == 7
     assert found.value[leaders, 0] == pytest.approx(17.0 - 20.0)
     assert found.beside[~leaders, 1] == pytest.approx(1.0)
+
+
+def test_numbers_of_agents_act_in_every_piece() -> None:
+    system = Traffic([Linear(20.0, 8.0)], leader="measured")
+    add_effects(system, [{"name": "driver_heterogeneity", "people": {"r/1": [0.125, 0.0]}}])
+    # 1.125 times 16 m/s is what was measured
+    found = deviation(system, [platoon(18.0, 18.0)])
+    assert found.value[:, 0] == pytest.approx(0.0, abs=1e-9)
 
 
 def person(acceleration: tuple[float, float], n: int = 31) -> Sequence:

@@ -19,6 +19,7 @@ from nnode.discover.pages_figures import Figures, telling
 from nnode.discover.report import sentence
 from nnode.discover.result import DataFault
 from nnode.models import build_model
+from nnode.models.build import add_effects
 from nnode.study.page import Heading, Text
 from tests.discover.conftest import Case
 
@@ -139,6 +140,15 @@ def test_a_network_is_told_to_hide_effects(traffic: Case) -> None:
     words = plain(case)
     assert any(text.startswith("**The model is a network.**") for text in words)
     assert any("weights of the network are in the checkpoint alone" in text for text in words)
+
+
+def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> None:
+    case = deepcopy(traffic)
+    people = {case.inputs.sequences[0].name: [0.1, 0.0, -0.1, 0.0]}
+    add_effects(case.found.extended, [{"name": "driver_heterogeneity", "people": people}])
+    words = plain(case)
+    assert any("driver_heterogeneity has a number for every agent" in text for text in words)
+    assert any("for all others it does not act" in text for text in words)
 
 
 def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:

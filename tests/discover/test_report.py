@@ -16,6 +16,7 @@ from nnode.calibrate.options import TrainerOptions
 from nnode.discover.report import (
     amount,
     checkpoint_of,
+    estimate,
     extended_options,
     has_network,
     interval,
@@ -25,7 +26,7 @@ from nnode.discover.report import (
     sentence,
     write_report,
 )
-from nnode.discover.result import Alternative, DataFault, Gap, Verdict
+from nnode.discover.result import Alternative, Coefficient, DataFault, Gap, Verdict
 from nnode.models import build_model
 from nnode.models.build import add_effects
 from nnode.models.extend import effects_of
@@ -61,7 +62,22 @@ def test_amounts_in_words(value: float | None, text: str) -> None:
 
 def test_coefficients_in_words(traffic: Case) -> None:
     (effect,) = traffic.found.diagnosis.effects
-    assert interval(effect).startswith("alpha = 0.65 [0.627, 0.68], a = 400 [392, 400] m")
+    assert interval(effect).startswith("alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m")
+
+
+@pytest.mark.parametrize(
+    ("low", "value", "high", "words"),
+    [
+        (399.756, 399.8268, 399.897, ("399.827", "399.756", "399.897")),
+        (-12.2, -11.0, -9.1, ("−11.0", "−12.2", "−9.1")),
+        (150.0, 400.0, 700.0, ("400", "150", "700")),
+        (float("nan"), 0.12345, float("nan"), ("0.1235", "–", "–")),
+    ],
+)
+def test_an_estimate_has_the_digits_that_its_interval_leaves(
+    low: float, value: float, high: float, words: tuple[str, str, str]
+) -> None:
+    assert estimate(Coefficient(value, low, high, "m")) == words
 
 
 @pytest.mark.parametrize(
@@ -88,6 +104,14 @@ def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str
     assert sentence(d).endswith(".")
     if verdict == "named":
         assert "(89 % of what can be closed above the noise floor of 0.5 m²)" in sentence(d)
+
+
+def test_numbers_of_agents_are_no_prediction(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    (effect,) = d.effects
+    assert "half of his own time" not in sentence(d)
+    d = replace(d, effects=[effect, replace(effect, name="driver_heterogeneity")])
+    assert sentence(d).endswith("taken from the other half of his own time.")
 
 
 @pytest.mark.parametrize("name", ["traffic", "crowd"])
