@@ -27,6 +27,8 @@ from nnode.models.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
 FLIPS = 1999
+#: So many blocks' worth of independent residuals are added to the blocks that give an error.
+PRIOR = 12.0
 
 
 @dataclass
@@ -89,6 +91,7 @@ class Screen:
     def __init__(self, fit: Fit, block: np.ndarray, seed: int = 0) -> None:
         self.fit, self.block = fit, block
         self.residual = fit.residual
+        self.variance = fit.cost / len(fit.residual)
         self._basis = _orthonormal(fit.tangents)
         self._flips = np.random.default_rng(seed).choice([-1.0, 1.0], (FLIPS, int(block.max()) + 1))
         self._largest = np.zeros(FLIPS)
@@ -121,8 +124,9 @@ class Screen:
     def _single(self, trace: Trace) -> Score:
         z = self.beyond(trace.columns)
         parts = sums(z * self.residual[:, None], self.block)
-        statistic = self._joint(parts)
-        amount, error, gain = self._estimate(z, parts)
+        grams = self._grams(z)
+        statistic = self._joint(parts, grams)
+        amount, error, gain = self._estimate(parts, grams)
         (probe,) = trace.probes
         options, amounts, errors = dict(probe.options), {}, {}
         for name, value, width in zip(probe.steps, amount, error, strict=False):
@@ -136,16 +140,19 @@ class Screen:
     def _individual(self, found: Individuals) -> Score:
         """Only products of halves that agree speak for an effect."""
         products = found.products
-        scale = float(np.sqrt((products**2).sum()))
-        each = products / scale if scale > 0 else products
-        rng = np.random.default_rng(len(products))
-        flipped = rng.choice([-1.0, 1.0], (FLIPS, len(each))) @ each
-        self._largest = np.maximum(self._largest, flipped)
+        number = len(products)
+        rng = np.random.default_rng(number)
+        signs = np.concatenate([np.ones((1, number)), rng.choice([-1.0, 1.0], (FLIPS, number))])
+        total = signs @ products
+        # the products of independent scores have variance 1
+        rest = (products**2).sum() - total**2 / number + PRIOR
+        each = total / np.sqrt(rest * number / (number + PRIOR))
+        self._largest = np.maximum(self._largest, each[1:])
         (name,) = found.effect.strengths
         options = {**found.options, name: found.sigma, "people": found.people}
         error = (found.interval[1] - found.interval[0]) / 4
         return Score(
-            found.effect, options, float(each.sum()), 1.0, found.gain,
+            found.effect, options, float(each[0]), 1.0, found.gain,
             {name: found.sigma}, {name: error},
         )  # fmt: skip
 
@@ -153,30 +160,37 @@ class Screen:
         """The best interval of neighbouring cells."""
         z = self.beyond(trace.columns)
         parts = sums(z * self.residual[:, None], self.block)
+        grams = self._grams(z)
         cells = z.shape[1]
         first, last = np.triu_indices(cells)
         cumulative = np.concatenate([np.zeros((len(parts), 1)), parts.cumsum(1)], 1)
         each = cumulative[:, last + 1] - cumulative[:, first]
-        scale = np.sqrt((each**2).sum(0))
-        usable = scale > 1e-9 * scale.max()
-        each = np.where(usable, each, 0) / np.where(usable, scale, 1)
-        self._largest = np.maximum(self._largest, np.abs(self._flips @ each).max(1))
-        statistic = np.abs(each.sum(0))
-        gram = np.zeros((cells + 1, cells + 1))
-        gram[1:, 1:] = (z.T @ z).cumsum(0).cumsum(1)
-        size = (
-            gram[last + 1, last + 1]
-            - gram[first, last + 1]
-            - gram[last + 1, first]
-            + gram[first, first]
-        )
-        total = each.sum(0) * scale
-        size = np.where(usable & (size > 1e-9 * max(size.max(), 1e-300)), size, np.inf)
+        square = np.zeros((len(parts), cells + 1, cells + 1))
+        square[:, 1:, 1:] = grams.cumsum(1).cumsum(2)
+        sizes = (
+            square[:, last + 1, last + 1] - square[:, first, last + 1]
+            - square[:, last + 1, first] + square[:, first, first]
+        )  # fmt: skip
+        size = sizes.sum(0)
+        usable = size > 1e-9 * max(size.max(), 1e-300)
+        each, sizes, size = each[:, usable], sizes[:, usable], size[usable]
+        if not size.size:
+            return []
+        first, last = first[usable], last[usable]
+        statistic = self._standardised(each, sizes, np.ones((1, len(each))))
+        flipped = self._standardised(each, sizes, self._flips)
+        self._largest = np.maximum(self._largest, flipped.max(1))
+        total = each.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
         i = int(np.argmax(gain))
         (name,) = trace.effect.strengths
         strength = trace.effect.strengths[name]
-        amount, error = -total[i] / size[i], scale[i] / size[i]
+        amount = -total[i] / size[i]
+        rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
+        blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
+        error = (
+            np.sqrt((blocks * rest + PRIOR * self.variance * size[i]) / (blocks + PRIOR)) / size[i]
+        )
         options = dict(trace.probes[0].options)
         options["a"] = trace.probes[first[i]].options["a"]
         options["b"] = trace.probes[last[i]].options["b"]
@@ -190,26 +204,77 @@ class Screen:
             )
         ]  # fmt: skip
 
-    def _joint(self, parts: np.ndarray) -> float:
-        """A statistic of the k sums ``(blocks, k)`` together, and its values under flips."""
-        spread = parts.T @ parts
-        scale = np.sqrt(np.maximum(np.diag(spread), 1e-300))
-        inverse = np.linalg.pinv(spread / np.outer(scale, scale), rcond=1e-6)
-        each = parts / scale
-        flipped = self._flips @ each
-        squares = np.einsum("fi,ij,fj->f", flipped, inverse, flipped)
-        own = float(each.sum(0) @ inverse @ each.sum(0))
-        k = parts.shape[1]
-        self._largest = np.maximum(self._largest, _normal(squares, k))
-        return float(_normal(np.array([own]), k)[0])
+    def _standardised(self, parts: np.ndarray, sizes: np.ndarray, signs: np.ndarray) -> np.ndarray:
+        """``(F, C)`` absolute sums on the scale of a standard normal variable.
 
-    def _estimate(self, z: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        inverse = np.linalg.pinv(z.T @ z, rcond=1e-10)
+        What the effect itself explains is no part of the error; otherwise no statistic could
+        exceed the root of the number of blocks. Where few blocks carry the information, the
+        error is drawn towards the one that independent residuals would give.
+
+        Args:
+            parts, sizes: ``(blocks, C)`` scores and their information.
+            signs: ``(F, blocks)``.
+        """
+        total, squares, size = signs @ parts, (parts**2).sum(0), sizes.sum(0)
+        amount = total / size
+        rest = squares - 2 * amount * (signs @ (parts * sizes)) + amount**2 * (sizes**2).sum(0)
+        blocks = size**2 / (sizes**2).sum(0)
+        variance = (blocks * np.maximum(rest, 0) + PRIOR * self.variance * size) / (blocks + PRIOR)
+        return _wallace(total**2 / variance, blocks + PRIOR - 1)
+
+    def _grams(self, z: np.ndarray) -> np.ndarray:
+        """``(blocks, k, k)`` information of the directions in each block."""
+        found = np.zeros((int(self.block.max()) + 1, z.shape[1], z.shape[1]))
+        order = np.argsort(self.block, kind="stable")
+        ends = np.flatnonzero(np.diff(self.block[order])) + 1
+        for rows in np.split(order, ends):
+            found[self.block[rows[0]]] = z[rows].T @ z[rows]
+        return found
+
+    def _joint(self, parts: np.ndarray, grams: np.ndarray) -> float:
+        """A statistic of the k sums ``(blocks, k)`` together; keeps its values under flips."""
+        k = parts.shape[1]
+        if k == 1:
+            sizes = grams[:, :, 0]
+            flipped = self._standardised(parts, sizes, self._flips)
+            self._largest = np.maximum(self._largest, flipped[:, 0])
+            return float(self._standardised(parts, sizes, np.ones((1, len(parts))))[0, 0])
+        signs = np.concatenate([np.ones((1, len(parts))), self._flips])
+        total = signs @ parts
+        amount = total @ np.linalg.pinv(grams.sum(0), rcond=1e-10)
+        rest = signs[:, :, None] * parts - np.einsum("bij,fj->fbi", grams, amount)
+        whole = grams.sum(0)
+        size = np.trace(grams, axis1=1, axis2=2)
+        blocks = float(size.sum() ** 2 / (size**2).sum())
+        spread = np.einsum("fbi,fbj->fij", rest, rest)
+        spread = (blocks * spread + PRIOR * self.variance * whole) / (blocks + PRIOR)
+        spread += 1e-12 * np.trace(whole) * np.eye(k)
+        squares = np.einsum("fi,fi->f", total, np.linalg.solve(spread, total[..., None])[..., 0])
+        degrees = np.array(blocks + PRIOR - 1)
+        found = _normal(_wallace(squares, degrees) ** 2, k)
+        self._largest = np.maximum(self._largest, found[1:])
+        return float(found[0])
+
+    def _estimate(
+        self, parts: np.ndarray, grams: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        inverse = np.linalg.pinv(grams.sum(0), rcond=1e-10)
         total = parts.sum(0)
         amount = -inverse @ total
-        cov = inverse @ (parts.T @ parts) @ inverse
+        rest = parts + np.einsum("bij,j->bi", grams, amount)
+        cov = inverse @ (rest.T @ rest) @ inverse
         gain = float(total @ inverse @ total / (self.residual @ self.residual))
         return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
+
+
+def _wallace(squares: np.ndarray, degrees: np.ndarray) -> np.ndarray:
+    """Squares of Student's t on the scale of a normal variable.
+
+    Source: Wallace 1959, Annals of Mathematical Statistics 30.
+    """
+    factor = (8 * degrees + 1) / (8 * degrees + 3)
+    found: np.ndarray = factor * np.sqrt(degrees * np.log1p(squares / degrees))
+    return found
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.engine import Engine, row_of
@@ -20,8 +21,8 @@ from nnode.models.system import System
 
 log = logging.getLogger(__name__)
 
-#: An effect must remove this share of the held-out cost.
-FLOOR = 0.01
+#: An effect must remove this share of the squared errors of positions.
+FLOOR = 0.02
 #: Effects whose trace explains this share of what the best one explains are calibrated too.
 RIVAL = 0.25
 #: At most so many effects are calibrated in a round.
@@ -45,6 +46,7 @@ class Candidate:
         fit: of the extended model.
         losses: ``(S,)`` held-out cost of each sequence.
         gain: over the model without it.
+        removed: share of the squared errors of positions that it removed.
         individuals: of an individual effect.
     """
 
@@ -52,6 +54,7 @@ class Candidate:
     fit: Fit
     losses: np.ndarray
     gain: Comparison
+    removed: float
     individuals: Individuals | None = None
 
     @property
@@ -190,6 +193,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     most = max(score.gain for score in scores)
     tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
     before = heldout(found.fit, engine.sequence)
+    square = _square(engine, found.fit)
     candidates: list[Candidate] = []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
@@ -202,12 +206,13 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         if one is not None:
             # numbers from one half of the time, tried on the other
             losses = before * one.losses / sums(found.fit.residual**2, engine.sequence)
-        candidates.append(Candidate(score, fit, losses, compare(before, losses), one))
+        removed = 1 - _square(engine, fit) / square
+        candidates.append(Candidate(score, fit, losses, compare(before, losses), removed, one))
     candidates.sort(key=lambda c: -c.gain.gain)
     passing = [
         c for c in candidates
         if c.score.p_value <= alpha
-        and c.gain.gain >= FLOOR
+        and c.removed >= FLOOR
         and c.gain.low > 0
         and c.strength_excludes_neutral(engine.sequence)
     ]  # fmt: skip
@@ -223,6 +228,11 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         if test.p_value > APART and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals, scores)
+
+
+def _square(engine: Engine, fit: Fit) -> float:
+    """Mean square error of positions, m²."""
+    return float(engine.squares(fit.system, torch.from_numpy(fit.row)).means().mean())
 
 
 def _calibrated(engine: Engine, before: Fit, score: Score, hopeless: float) -> Fit:
@@ -292,7 +302,7 @@ def _pruned(engine: Engine, found: Search) -> Search:
         for step in found.steps:
             fit = refine(engine, without(found.fit.system, step.chosen.name))
             test = compare(heldout(fit, engine.sequence), losses)
-            if (test.low <= 0 or test.gain < FLOOR) and (worst is None or test.gain < worst[0]):
+            if (test.low <= 0) and (worst is None or test.gain < worst[0]):
                 worst = test.gain, step, fit
         if worst is None:
             break

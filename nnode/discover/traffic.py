@@ -34,7 +34,7 @@ WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
 #: Whitened residuals beyond this count less.
 LARGE = 6.0
 #: Most past samples that a filter looks at.
-ORDER = 4
+ORDER = 6
 
 
 class TrafficEngine:
