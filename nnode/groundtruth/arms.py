@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from nnode.errors import ConfigError
-from nnode.groundtruth import faults, traffic_catalogue
+from nnode.groundtruth import crowd_catalogue, faults, traffic_catalogue
 from nnode.groundtruth.case import ARMS, Case
 
 NULLS = ("white", "autocorrelated", "heterogeneous")
@@ -23,6 +23,19 @@ TRAFFIC_PAIRS = (
     ("speed_zone", "speed_period"),
     ("time_gap", "speed_zone"),
     ("free_flow_speed", "vehicle_class"),
+)
+
+CROWD_PAIRS = (
+    ("drift", "group_cohesion"),
+    ("preferred_speed", "wall_repulsion"),
+    ("obstacle", "preferred_speed"),
+    ("side_preference", "drift"),
+    ("alignment", "wall_repulsion"),
+    ("group_cohesion", "pair_repulsion"),
+    ("attraction", "drift"),
+    ("gait_sway", "preferred_speed"),
+    ("density_slowdown", "side_preference"),
+    ("sliding_friction", "wall_repulsion"),
 )
 
 
@@ -52,7 +65,25 @@ def _traffic() -> dict[str, list[Hides]]:
     }
 
 
-_HIDES = {"traffic": _traffic}
+def _crowd() -> dict[str, list[Hides]]:
+    return {
+        "single": [Hides((name,)) for name in crowd_catalogue.CATALOGUE],
+        "pair": [Hides(pair) for pair in CROWD_PAIRS],
+        "null": [Hides((), variant) for variant in NULLS],
+        "outside": [Hides((name,)) for name in crowd_catalogue.OUTSIDE],
+        "near_miss": [
+            Hides(("obstacle",), "smooth"),
+            Hides(("attraction",), "smooth"),
+            Hides(("group_cohesion",), "heavy_tails"),
+            Hides(("preferred_speed",), "heavy_tails"),
+            Hides((), "heavy_tails"),
+        ],
+        "no_excitation": [Hides((name,)) for name in crowd_catalogue.NEEDS_EXCITATION],
+        "fault": [Hides((), kind) for kind in faults.KINDS],
+    }
+
+
+_HIDES = {"traffic": _traffic, "crowd": _crowd}
 
 
 def hides(domain: str, arm: str) -> list[Hides]:
