@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 #: Farther away than this many ranges B beyond contact the base force is not worth counting.
-_RANGES = 9.0
+_RANGES = 11.0
 #: Reach of alignment, of sliding friction and of the density's kernel, m.
 ALIGNMENT_REACH, FRICTION_REACH, KERNEL = 2.0, 0.5, 1.0
 #: Distance within which somebody who comes towards counts, and how sharply that ends, m.
