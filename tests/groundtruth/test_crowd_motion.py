@@ -142,7 +142,7 @@ def walk(step: float, hidden: Hidden, x, v, goal):
 
 def test_another_integrator_finds_the_same_motion_and_errors_fall_sixteenfold():
     rng = np.random.default_rng(5)
-    x = np.array([[0.0, 0], [3.0, 0.3], [0.5, 1.5], [3.2, 1.4]])
+    x = np.array([[0.0, 1], [3.0, 1.3], [0.5, 2.5], [3.2, 2.4]])
     v = np.array([[1.2, 0], [-1.1, 0], [1.3, 0], [-1.0, 0]]) + rng.normal(0, 0.05, (4, 2))
     goal = x + 30 * np.sign(v)
     hidden = Hidden(align=0.3, A_w=0.3, B_w=0.4, A_2=0.2, dense=0.2)
