@@ -51,7 +51,7 @@ def _traffic() -> dict[str, list[Hides]]:
     return {
         "single": [Hides((name,)) for name in traffic_catalogue.CATALOGUE],
         "pair": [Hides(pair) for pair in TRAFFIC_PAIRS],
-        "null": [Hides((), variant) for variant in NULLS],
+        "nothing": [Hides((), variant) for variant in NULLS],
         "outside": [Hides((name,)) for name in traffic_catalogue.OUTSIDE],
         "near_miss": [
             Hides(("speed_zone",), "smooth"),
@@ -69,7 +69,7 @@ def _crowd() -> dict[str, list[Hides]]:
     return {
         "single": [Hides((name,)) for name in crowd_catalogue.CATALOGUE],
         "pair": [Hides(pair) for pair in CROWD_PAIRS],
-        "null": [Hides((), variant) for variant in NULLS],
+        "nothing": [Hides((), variant) for variant in NULLS],
         "outside": [Hides((name,)) for name in crowd_catalogue.OUTSIDE],
         "near_miss": [
             Hides(("obstacle",), "smooth"),
@@ -120,16 +120,11 @@ def cases(
         effects: keeps the cases that hide at least one of these.
 
     Raises:
-        ConfigError: an unknown domain, arm, strength or effect.
+        ConfigError: an unknown domain, arm or strength.
     """
     wanted = None if effects is None else set(effects)
     found = []
     seeds, noises, sizes, strengths = list(seeds), list(noises), list(sizes), list(strengths)
-    known = {name for item in hides(domain, arm) for name in item.effects}
-    if wanted is not None and known and not wanted & known:
-        raise ConfigError(
-            f"effects={sorted(wanted)}: {domain}, arm {arm}, hides {', '.join(sorted(known))}"
-        )
     for item in hides(domain, arm):
         if wanted is not None and not wanted & set(item.effects):
             continue

@@ -18,7 +18,7 @@ from nnode.groundtruth.traffic_replay import Recording, cost_by_sequence
 from nnode.groundtruth.traffic_road import BURN_IN, SUBSTEPS, Road, lay_out, surroundings
 
 #: Standard deviation of drivers' velocities, m/s.
-AMPLITUDES = Range(preferred=(0.02, 1.0), extreme=(0.005, 2.0), idle=(0.1, 0.4), probe=0.05)
+AMPLITUDES = Range(preferred=(0.02, 0.6), extreme=(0.005, 1.5), idle=(0.1, 0.4), probe=0.05)
 #: Standard deviation of the factor on W where drivers differ and that is a nuisance.
 _NUISANCE = (0.04, 0.1)
 #: Largest product of a delay and W' that may occur.

@@ -58,7 +58,7 @@ def test_an_oracle_explains_sound_data_and_the_base_law_does_not(effect):
 
 
 def test_nothing_hidden_leaves_the_base_law_true():
-    made = CrowdCase(small(arm="null", variant="white", noise=0.0))
+    made = CrowdCase(small(arm="nothing", variant="white", noise=0.0))
     assert made.costs(made.truth).base.mean() < 4e-6
 
 
@@ -76,7 +76,7 @@ def test_people_who_walk_the_same_way_hide_what_needs_encounters(effect):
 
 
 def test_people_mostly_stay_in_the_corridor_and_apart():
-    made = CrowdCase(small(arm="null", variant="autocorrelated", n_sequences=6))
+    made = CrowdCase(small(arm="nothing", variant="autocorrelated", n_sequences=6))
     x, v = made.simulate(made.truth)
     outside = (x[..., 1] < 0) | (x[..., 1] > made.scene.width)
     assert outside.mean() < 0.02
@@ -108,7 +108,7 @@ def test_heterogeneity_has_the_standard_deviation_that_the_truth_tells():
 
 
 def test_all_arms_have_cases():
-    for arm in ("single", "pair", "null", "outside", "near_miss", "no_excitation", "fault"):
+    for arm in ("single", "pair", "nothing", "outside", "near_miss", "no_excitation", "fault"):
         found = cases("crowd", arm, seeds=[0])
         assert found
         assert all(name in EFFECTS for case in found for name in case.effects)

@@ -90,7 +90,7 @@ def test_pairs_count_what_was_found_and_match_one_to_one():
 
 
 def test_heterogeneous_drivers_may_be_named_where_they_are():
-    quiet, nuisance = truth(arm="null"), truth(arm="null")
+    quiet, nuisance = truth(arm="nothing"), truth(arm="nothing")
     nuisance["nuisance"] = [{"name": "driver_heterogeneity", "coefficients": {}}]
     assert score(quiet, report(verdict="none"))["right"]
     assert not score(quiet, report("driver_heterogeneity"))["right"]
@@ -177,4 +177,4 @@ def test_crowds_compare_shares_as_their_costs_are_not_measured_alike():
 
 
 def test_nothing_hidden_has_no_closure():
-    assert score(truth(arm="null"), report(verdict="none"))["closure"] is None
+    assert score(truth(arm="nothing"), report(verdict="none"))["closure"] is None
