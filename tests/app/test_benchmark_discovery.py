@@ -24,7 +24,7 @@ def stand_in(path: Path, domain: str, **given: Any) -> dict[str, Any]:
     CALLS.append({"domain": domain, **given})
     table = pd.read_csv(path)
     names = sorted(f"trajectories/{name}" for name in table["sequence"].unique())
-    if table["x"].groupby([table["sequence"], table["agent"]]).diff().abs().max() > 10:
+    if table["x"].groupby([table["sequence"], table["agent"]]).diff().abs().max() > 6.5:
         raise DataError("too far within one step")
     kappa = {"value": 0.4, "low": 0.0, "high": 1.0, "unit": "1"}
     return {
