@@ -71,8 +71,10 @@ def test_the_table_is_read_with_classes_lengths_and_a_clock(tmp_path):
     assert len(set(agents)) == len(agents)
 
 
-@pytest.mark.parametrize("strength", ["weak", "medium", "strong"])
-@pytest.mark.parametrize("effect", ["relative_speed", "inertia", "speed_zone"])
+@pytest.mark.parametrize(
+    ("effect", "strength"),
+    [("relative_speed", "medium"), ("inertia", "weak"), ("speed_zone", "strong")],
+)
 def test_an_oracle_removes_the_share_that_was_asked_for(effect, strength):
     case = small(effect, strength=strength, n_sequences=10)
     made = TrafficCase(case)
