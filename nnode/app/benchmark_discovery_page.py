@@ -49,6 +49,19 @@ def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int) -> list[
             digits=0,
         ),
     ]
+    methods = tables.by_method(rows)
+    if len(methods):
+        blocks += [
+            Heading("Beside its peers"),
+            TableBlock(
+                "methods",
+                methods,
+                "Percent of the same cases, and medians. The peers choose columns of the "
+                "diagnosis's own library, on its residuals and its split; effects with a number "
+                "per agent are not among them, and cases that hide one are left out.",
+                digits={**dict.fromkeys(methods.columns, 0), "closure (median)": 2},
+            ),
+        ]
     effects = tables.by_effect(frame)
     if len(effects):
         blocks += [

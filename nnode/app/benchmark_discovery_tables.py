@@ -200,3 +200,40 @@ def over_noise_and_size(frame: pd.DataFrame, domain: str) -> pd.DataFrame:
     part = frame[(frame["domain"] == domain) & (frame["arm"] == "single")]
     part = part.assign(exact=part["exact"].astype(float))
     return part.pivot_table(index="noise", columns="n_sequences", values="exact", aggfunc="mean")
+
+
+def by_method(rows: list[dict[str, Any]]) -> pd.DataFrame:
+    """The diagnosis beside its peers on the same cases, by domain; empty where there are none.
+
+    Cases that hide heterogeneity are left out: it is not among the peers' columns.
+    """
+    lines = []
+    for row in rows:
+        if (
+            not row["peers"]
+            or "heterogeneity" in row["hidden"]
+            or row["variant"] == "heterogeneous"
+        ):
+            continue
+        for method, scored in {"diagnosis": row, **row["peers"]}.items():
+            lines.append({"domain": row["domain"], "arm": row["arm"], "method": method, **scored})
+    frame = pd.DataFrame(lines)
+    if frame.empty:
+        return frame
+    found = []
+    for (domain, method), part in frame.groupby(["domain", "method"], sort=False):
+        asked, idle = part[part["exact"].notna()], part[part["arm"] == "nothing"]
+        closure = asked["closure"].astype(float)
+        found.append(
+            {
+                "domain": domain,
+                "method": method,
+                "cases": len(part),
+                "exact": 100 * asked["exact"].astype(float).mean(),
+                "right class": 100 * asked["class_right"].astype(float).mean(),
+                "named where nothing is hidden": 100 * (idle["named"] != "nothing").mean(),
+                "closure (median)": closure.median(),
+                "worse than the base": 100 * asked["worse"].astype(float).mean(),
+            }
+        )
+    return pd.DataFrame(found)

@@ -47,7 +47,14 @@ def diagnosis(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def config(**options: Any) -> Any:
-    given = {"workers": 1, "seeds": 1, "nothing_seeds": 1, "sizes": [3], "strengths": ["full"]}
+    given = {
+        "workers": 1,
+        "seeds": 1,
+        "nothing_seeds": 1,
+        "sizes": [3],
+        "strengths": ["full"],
+        "peers": False,
+    }
     chosen = DiscoveryBenchmarkOptions(**{**given, **options})
     return OmegaConf.structured(DiscoveryBenchmarkConfig(benchmark_discovery=chosen))
 
