@@ -37,7 +37,7 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     if workers < 1:
         raise ConfigError(f"benchmark_discovery.workers={workers} must be at least 1")
     results = run_tasks(
-        [task_of(case, options.peers) for case in chosen],
+        [task_of(case, case.seed < options.first_seed + options.peer_seeds) for case in chosen],
         folder,
         workers=workers,
         fingerprint=sources(),

@@ -18,11 +18,12 @@ from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
 from nnode.discover.diagnose import divide, engine_of
 from nnode.discover.engine import Engine, fill, row_of
-from nnode.discover.fit import Fit
+from nnode.discover.fit import Fit, refine
 from nnode.discover.inputs import read_inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.score import Trace, traces
 from nnode.discover.search import settled
+from nnode.errors import SimulationError
 from nnode.groundtruth.regression import PEERS, Library
 from nnode.models import build_model
 from nnode.models.effects import CATALOGUE, Effect
@@ -93,9 +94,10 @@ def peers_on_table(
     reports = {}
     for name, choose in PEERS.items():
         theta = choose(library, seed)
-        system = _with(fit, columns, values, theta)
         names = list(dict.fromkeys(columns[j].effect.name for j in np.flatnonzero(theta)))
-        after = before if not names else _cost(whole, system)
+        after = before
+        if names:
+            after = _cost(whole, _calibrated(engine, _with(fit, columns, values, theta)))
         reports[name] = {
             "verdict": "named" if names else "none",
             "effects": [{"name": n, "coefficients": {}, "alternatives": []} for n in names],
@@ -103,6 +105,14 @@ def peers_on_table(
             "split": split,
         }
     return reports
+
+
+def _calibrated(engine: Engine, system: System) -> System:
+    """The chosen effects are calibrated as those of the diagnosis: only the choice differs."""
+    try:
+        return refine(engine, system).system
+    except SimulationError:
+        return system
 
 
 def _cost(engine: Engine, system: System) -> float:

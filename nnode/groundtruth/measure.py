@@ -69,7 +69,7 @@ def _share(error: float, of: float) -> float | None:
 def overlap(hidden: list[dict[str, Any]], named: list[dict[str, Any]]) -> float | None:
     """Intersection over union of a true and an estimated zone or period; the worst of several.
 
-    None where none is hidden, or none of those was named.
+    None where none is hidden, or none of those was named with its edges.
     """
     found = []
     for effect in hidden:
@@ -77,9 +77,10 @@ def overlap(hidden: list[dict[str, Any]], named: list[dict[str, Any]]) -> float 
         got = next((item for item in named if item["name"] == name), None)
         if name not in EDGES or got is None:
             continue
-        first, last = EDGES[name]
-        a, b = (effect["coefficients"][key]["value"] for key in (first, last))
-        c, d = (got["coefficients"][key]["value"] for key in (first, last))
+        if not all(key in got["coefficients"] for key in EDGES[name]):
+            continue
+        a, b = (effect["coefficients"][key]["value"] for key in EDGES[name])
+        c, d = (got["coefficients"][key]["value"] for key in EDGES[name])
         shared = max(0.0, min(b, d) - max(a, c))
         found.append(shared / max(max(b, d) - min(a, c), 1e-12))
     return min(found) if found else None
