@@ -103,6 +103,32 @@ class BenchmarkConfig:
 
 
 @dataclass
+class DiscoveryBenchmarkOptions:
+    """Which truths ``scripts/benchmark_discovery.py`` hides, how strongly, in how much data."""
+
+    domains: list[str] = field(default_factory=lambda: ["traffic", "crowd"])
+    arms: list[str] | None = None  # null: all
+    effects: list[str] | None = None  # null: all; else only cases that hide one of these
+    seeds: int = 10  # per effect, pair or fault
+    nothing_seeds: int = 70  # per kind of nothing, of which there are three
+    first_seed: int = 0
+    strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
+    noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
+    sizes: list[int] = field(default_factory=lambda: [20])  # numbers of sequences
+    peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
+    workers: int | None = None  # processes; null: one per core
+
+
+@dataclass
+class DiscoveryBenchmarkConfig:
+    """``scripts/benchmark_discovery.py``: the diagnosis against hidden truths."""
+
+    benchmark_discovery: DiscoveryBenchmarkOptions = field(
+        default_factory=DiscoveryBenchmarkOptions
+    )
+
+
+@dataclass
 class StudyConfig:
     """``scripts/study.py``: the paper's studies on the real recordings."""
 
@@ -125,6 +151,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "benchmark_schema"): BenchmarkConfig,
     (None, "study_schema"): StudyConfig,
+    (None, "benchmark_discovery_schema"): DiscoveryBenchmarkConfig,
     (None, "discover_schema"): DiscoverConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),

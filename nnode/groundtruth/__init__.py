@@ -16,7 +16,7 @@ __all__ = ["ARMS", "STRENGTHS", "TABLE", "TRUTH", "WALLS", "Case", "generate"]
 
 
 def generate(case: Case, folder: Path) -> dict[str, Any]:
-    """Write a case's files: the table ``trajectories.csv``, and ``truth.json``.
+    """Write a case's ``trajectories.csv``, its ``truth.json`` and, of crowds, ``walls.csv``.
 
     Args:
         folder: made where it is missing.
@@ -27,6 +27,11 @@ def generate(case: Case, folder: Path) -> dict[str, Any]:
     Raises:
         ConfigError: an effect that the domain does not know.
     """
+    # compiled code is loaded for one domain alone
+    if case.domain == "crowd":
+        from nnode.groundtruth.crowd_files import write_crowd
+
+        return write_crowd(case, folder)
     from nnode.groundtruth.traffic_files import write_traffic
 
     return write_traffic(case, folder)

@@ -9,7 +9,6 @@ import numpy as np
 _ROUNDS = 30
 #: Relative to a parameter's scale.
 _DIFFERENCE = 1e-5
-#: The search ends where a step lowers the sum of squares by less than this share.
 _ENOUGH = 1e-7
 
 
@@ -19,6 +18,7 @@ def least_squares(
     *,
     low: np.ndarray,
     scale: np.ndarray,
+    enough: float = _ENOUGH,
 ) -> np.ndarray:
     """Parameters ``(p,)`` of a local minimum of the sum of squares, by Levenberg and Marquardt.
 
@@ -27,6 +27,7 @@ def least_squares(
         start: first guess.
         low: smallest admissible values.
         scale: typical sizes of the parameters.
+        enough: the search ends where a step lowers the sum of squares by less than this share.
     """
     here = np.maximum(start, low)
     r = residuals(here)
@@ -54,7 +55,7 @@ def least_squares(
             return here
         gain, here, r, best = 1 - total / best, there, after, total
         damping = max(damping / 10, 1e-9)
-        if gain < _ENOUGH or best == 0:
+        if gain < enough or best == 0:
             return here
     return here
 

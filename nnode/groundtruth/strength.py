@@ -4,14 +4,59 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
+
+from nnode.groundtruth.case import STRENGTHS, Case
 
 #: Two effects hidden together should not differ in their misfit by more than this factor.
 _BALANCE = 3.0
 #: A share is reached where it is this close.
 _CLOSE = 0.02
 _ROUNDS = 6
+#: So often coefficients are rescaled; the misfit is not quite quadratic in them.
+_RESCALINGS = 3
+
+
+@dataclass(frozen=True)
+class Range:
+    """Standard deviations of the noise of drivers or walkers.
+
+    Attributes:
+        preferred: coefficients are rescaled to keep it here,
+        extreme: and it goes no farther than this where that does not suffice.
+        idle: where there is nothing for it to be set against.
+        probe: so small that displacements are linear in it.
+    """
+
+    preferred: tuple[float, float]
+    extreme: tuple[float, float]
+    idle: tuple[float, float]
+    probe: float
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Mean squared errors (m²) on measured data.
+
+    Attributes:
+        base: ``(S,)`` of the recalibrated base law.
+        oracle: ``(S,)`` of the truth without noise of drivers or walkers.
+        floor: of the measurement.
+        recalibrated: parameters of the base law that fit best.
+    """
+
+    base: np.ndarray
+    oracle: np.ndarray
+    floor: float
+    recalibrated: dict[str, float]
+
+    @property
+    def share(self) -> float:
+        """Of the excess over the floor, what the truth removes."""
+        excess = float(self.base.mean()) - self.floor
+        return float(self.base.mean() - self.oracle.mean()) / excess if excess > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -92,4 +137,52 @@ def scaled(misfits: dict[str, float], factor: float) -> dict[str, float]:
         even = min(1.0, float(np.sqrt(_BALANCE * least / max(misfit, 1e-12))))
         outweighed = len(misfits) > 1 and misfit < 0.5 * max(misfits.values())
         found[name] = even * (max(factor, 1.0) if outweighed else factor)
+    return found
+
+
+class Subject(Protocol):
+    """A case whose strength is to be set; see :class:`nnode.groundtruth.traffic.TrafficCase`."""
+
+    case: Case
+    truth: Any
+
+    def misfit(self, names: list[str]) -> float: ...
+
+    def spread(self, probe: float) -> float: ...
+
+    def costs(self, truth: Any) -> Costs: ...
+
+    def rescale(self, factors: dict[str, float]) -> bool: ...
+
+
+def set_strength(subject: Subject, rng: np.random.Generator, limits: Range) -> Amplitude:
+    """Choose the noise of drivers or walkers, and where it must the coefficients.
+
+    Both are set in ``subject.truth``.
+    """
+    case, share = subject.case, STRENGTHS[subject.case.strength]
+    silent = case.arm == "no_excitation" or case.variant == "white"
+    if silent or (case.effects and share == 1.0):
+        return Amplitude(share=share, value=0.0)
+    if not case.effects or "leader_speed" in case.effects:
+        # a leader at the wrong speed is beyond all noise that could be set against it
+        value = float(rng.uniform(*limits.idle))
+        subject.truth = replace(subject.truth, amplitude=value)
+        return Amplitude(share=share, value=value)
+    for left in range(_RESCALINGS, -1, -1):
+        together = subject.misfit(list(case.effects))
+        alone = dict.fromkeys(case.effects, together)
+        if len(alone) > 1:
+            alone = {name: subject.misfit([name]) for name in case.effects}
+        first = amplitude_for(together, subject.spread(limits.probe), share, limits.extreme)
+        within = float(np.clip(first.wanted, *limits.preferred))
+        # the misfit grows about as the square of the coefficient, as noise does
+        if not left or not subject.rescale(scaled(alone, within / first.wanted)):
+            break
+
+    def reached(value: float) -> float:
+        return subject.costs(replace(subject.truth, amplitude=value)).share
+
+    found = refine(replace(first, alone=alone), reached, limits.extreme)
+    subject.truth = replace(subject.truth, amplitude=found.value)
     return found

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nnode.groundtruth.case import STRENGTHS, Case, check_effects
-from nnode.groundtruth.strength import Amplitude, amplitude_for, refine, scaled
+from nnode.groundtruth.case import Case, check_effects
+from nnode.groundtruth.strength import Amplitude, Costs, Range, set_strength
 from nnode.groundtruth.traffic_catalogue import (
     EFFECTS,
     SMOOTH_EDGE,
@@ -17,16 +17,8 @@ from nnode.groundtruth.traffic_motion import LAWS, Hidden, simulate
 from nnode.groundtruth.traffic_replay import Recording, cost_by_sequence
 from nnode.groundtruth.traffic_road import BURN_IN, SUBSTEPS, Road, lay_out, surroundings
 
-#: Standard deviation of drivers' velocities, m/s: coefficients are rescaled to keep it here,
-AMPLITUDES = (0.02, 1.0)
-#: and it goes no farther than this where that does not suffice.
-EXTREME_AMPLITUDES = (0.005, 2.0)
-#: So often coefficients are rescaled; the misfit is not quite quadratic in them.
-_RESCALINGS = 3
-#: The same where nothing is hidden and residuals are to be correlated.
-_IDLE_AMPLITUDES = (0.1, 0.4)
-#: Drivers' noise whose displacements are measured, m/s; small enough to be linear.
-_PROBE = 0.05
+#: Standard deviation of drivers' velocities, m/s.
+AMPLITUDES = Range(preferred=(0.02, 0.6), extreme=(0.005, 1.5), idle=(0.1, 0.4), probe=0.05)
 #: Standard deviation of the factor on W where drivers differ and that is a nuisance.
 _NUISANCE = (0.04, 0.1)
 #: Largest product of a delay and W' that may occur.
@@ -60,29 +52,6 @@ class Truth:
             if name == "speed_period":
                 fields["period_ramp"] = self.edge
         return Hidden(**fields)
-
-
-@dataclass(frozen=True)
-class Costs:
-    """Mean squared errors (m²) on measured data.
-
-    Attributes:
-        base: ``(S,)`` of the recalibrated base law.
-        oracle: ``(S,)`` of the truth without drivers' noise.
-        floor: of the measurement.
-        recalibrated: parameters of the base law that fit best.
-    """
-
-    base: np.ndarray
-    oracle: np.ndarray
-    floor: float
-    recalibrated: dict[str, float]
-
-    @property
-    def share(self) -> float:
-        """Of the excess over the floor, what the truth removes."""
-        excess = float(self.base.mean()) - self.floor
-        return float(self.base.mean() - self.oracle.mean()) / excess if excess > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +97,7 @@ class TrafficCase:
         self.road: Road = lay_out(case, around)
         self.truth = Truth(effects, edge=edge)
         self._keep_stable()
-        self.amplitude = self._set_strength(rng)
+        self.amplitude: Amplitude = set_strength(self, rng, AMPLITUDES)
 
     def measured(self, motion: Motion) -> np.ndarray:
         """``(S, K + 1, N)`` positions with the error of their measurement, m."""
@@ -215,39 +184,9 @@ class TrafficCase:
         total = sum(effects[name][key] for name, key in late)
         factor = _STABLE / (self.steepest() * total)
         if factor < 1:
-            self._rescale({name: factor for name, _ in late})
+            self.rescale({name: factor for name, _ in late})
 
-    def _set_strength(self, rng: np.random.Generator) -> Amplitude:
-        """Choose the drivers' noise, and where it must the coefficients; keeps both."""
-        case = self.case
-        share = STRENGTHS[case.strength]
-        silent = case.arm == "no_excitation" or case.variant == "white"
-        if silent or (case.effects and share == 1.0):
-            return Amplitude(share=share, value=0.0)
-        if not case.effects or "leader_speed" in case.effects:
-            # a leader at the wrong speed is beyond all noise that could be set against it
-            value = float(rng.uniform(*_IDLE_AMPLITUDES))
-            self.truth = replace(self.truth, amplitude=value)
-            return Amplitude(share=share, value=value)
-        for left in range(_RESCALINGS, -1, -1):
-            alone = {name: self._misfit([name]) for name in case.effects}
-            misfit, spread = self._misfit(list(case.effects)), self._spread()
-            first = amplitude_for(misfit, spread, share, EXTREME_AMPLITUDES)
-            within = float(np.clip(first.wanted, *AMPLITUDES))
-            # the misfit grows about as the square of the coefficient, as noise does
-            factors = scaled(alone, within / first.wanted)
-            if not left or not self._rescale(factors):
-                break
-
-        def reached(value: float) -> float:
-            truth = replace(self.truth, amplitude=value)
-            return self.costs(truth).share
-
-        found = refine(replace(first, alone=alone), reached, EXTREME_AMPLITUDES)
-        self.truth = replace(self.truth, amplitude=found.value)
-        return found
-
-    def _rescale(self, factors: dict[str, float]) -> bool:
+    def rescale(self, factors: dict[str, float]) -> bool:
         """Scale effects as far as their ranges go; whether anything changed."""
         changed = dict(self.truth.effects)
         for name, factor in factors.items():
@@ -263,17 +202,17 @@ class TrafficCase:
         self.truth = replace(self.truth, effects=changed)
         return not same
 
-    def _misfit(self, names: list[str]) -> float:
+    def misfit(self, names: list[str]) -> float:
         """Mean squared misfit (m²) of the recalibrated base law to some of the effects alone."""
         kept = {k: v for k, v in self.truth.effects.items() if k in names}
         motion = self.simulate(replace(self.truth, effects=kept, amplitude=0.0))
         return float(self.base_cost(motion.x)[0].mean())
 
-    def _spread(self) -> float:
-        """Mean squared displacement (m²) by drivers' noise of 1 m/s."""
-        truth = replace(self.truth, amplitude=_PROBE)
+    def spread(self, probe: float) -> float:
+        """Mean squared displacement (m²) by noise of 1 m/s, probed with a smaller one."""
+        truth = replace(self.truth, amplitude=probe)
         motion = self.simulate(truth)
-        return float(self.oracle_cost(motion.x, motion, truth).mean()) / _PROBE**2
+        return float(self.oracle_cost(motion.x, motion, truth).mean()) / probe**2
 
     def costs(self, truth: Truth) -> Costs:
         """Costs on measured data."""

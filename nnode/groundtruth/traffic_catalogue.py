@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -275,16 +274,3 @@ NEEDS_EXCITATION = (
 
 #: Widths over which the edges of near misses are smeared, m and s.
 SMOOTH_EDGE = {"speed_zone": (30.0, 70.0), "speed_period": (8.0, 20.0)}
-
-
-def described(name: str, coefficients: Coefficients) -> dict[str, Any]:
-    """An effect as plain JSON, for the truth."""
-    effect = EFFECTS[name]
-    return {
-        "name": name,
-        "formula": effect.formula,
-        "coefficients": {
-            key: {"value": value, "unit": effect.units.get(key, "1")}
-            for key, value in coefficients.items()
-        },
-    }

@@ -1,0 +1,97 @@
+"""One case of the benchmark of the diagnosis: generate, diagnose, score."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import nnode
+from nnode.errors import NNodeError
+from nnode.groundtruth import TABLE, WALLS, Case, generate
+from nnode.groundtruth.score import score
+from nnode.study.runner import Task
+
+#: Base models by their name in the truth: the term that is calibrated.
+TERMS = {"lin": "lin", "log": "log", "sf": "social_force"}
+
+#: Verdict where a diagnosis ended with an error of its own.
+ERROR = "error"
+
+#: Sources on which a result depends: it does not hold when they have changed.
+_SOURCES = ("app/discover.py", "app/benchmark_discovery_task.py")
+_PACKAGES = ("discover", "groundtruth", "models", "data", "calibrate", "solvers")
+
+
+#: What of a peer's score is kept.
+_KEPT = ("named", "exact", "class_right", "found", "false_names", "closure", "worse", "right")
+
+
+def diagnose_case(case: dict[str, Any], peers: bool = False) -> dict[str, Any]:
+    """The score of one diagnosis, and how long it took.
+
+    The truth stays outside the folder that the diagnosis is given.
+
+    Args:
+        case: of :class:`nnode.groundtruth.Case`, as plain JSON.
+        peers: scores of the peers as well, by name.
+    """
+    # imported here: all workers read this file, and tests put another diagnosis in its place
+    from nnode.app import benchmark_discovery_peers, discover
+    from nnode.discover.options import DiscoverOptions
+
+    what = Case.from_dict(case)
+    with TemporaryDirectory(prefix="nnode-case-") as made, TemporaryDirectory() as given:
+        start = time.monotonic()
+        truth = generate(what, Path(made))
+        generated = time.monotonic() - start
+        for name in (TABLE, WALLS):
+            if (Path(made) / name).exists():
+                (Path(made) / name).rename(Path(given) / name)
+        model = truth["model"]
+        told: dict[str, Any] = {
+            "model": {"name": model["name"], "term": TERMS[model["name"]], **model["options"]},
+            "walls": Path(given) / WALLS if what.domain == "crowd" else None,
+            "leader": model.get("leader", "measured"),
+            "seed": what.seed,
+        }
+        table, start, failure = Path(given) / TABLE, time.monotonic(), ""
+        try:
+            options = DiscoverOptions(workers=1, page=False, animation=False)
+            report = discover.diagnose_table(table, what.domain, **told, options=options)
+        except NNodeError as error:
+            report, failure = {"verdict": ERROR, "effects": []}, f"{type(error).__name__}: {error}"
+        seconds = time.monotonic() - start
+        others: dict[str, Any] = {}
+        if peers and not failure:
+            found = benchmark_discovery_peers.peers_on_table(table, what.domain, **told)
+            for name, other in found.items():
+                scored = score(truth, other)
+                others[name] = {key: scored[key] for key in _KEPT}
+    return {
+        **score(truth, report),
+        "seconds": seconds,
+        "seconds_to_generate": generated,
+        "laps": report.get("seconds", {}),
+        "peers": others,
+        "failure": failure,
+    }
+
+
+def task_of(case: Case, peers: bool) -> Task:
+    """A case as a task that is kept; larger ones start first."""
+    size = case.n_sequences * (1.0 if case.domain == "traffic" else 2.0)
+    return Task(case.key, diagnose_case, {"case": case.to_dict(), "peers": peers}, cost=size)
+
+
+def sources() -> str:
+    """A digest of all code that takes part: kept results of other code do not hold."""
+    root = Path(nnode.__file__).parent
+    paths = [root / name for name in _SOURCES]
+    paths += [path for package in _PACKAGES for path in (root / package).rglob("*.py")]
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
