@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nnode.discover.variables import Variable, knots_of
+from nnode.models.crowd import dot
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
     heading,
@@ -70,7 +71,7 @@ def _bearing(state: State) -> Tensor:
     """Degrees to the left of one's way at which the nearest person is."""
     towards, ahead = -_nearest(state)[1], _ahead(state)
     sine = ahead[..., 0] * towards[..., 1] - ahead[..., 1] * towards[..., 0]
-    return torch.rad2deg(torch.atan2(sine, (ahead * towards).sum(-1)))
+    return torch.rad2deg(torch.atan2(sine, dot(ahead, towards)))
 
 
 def _approach(state: State) -> Tensor:
@@ -78,7 +79,7 @@ def _approach(state: State) -> Tensor:
     pair = Neighbours.of(state)
     far = torch.where(pair.acts > 0, pair.d, NOBODY)
     j = far.argmin(2)[..., None]
-    closing = -(pair.dv * -pair.n).sum(-1)
+    closing = dot(pair.dv, pair.n)
     return closing.gather(2, j)[..., 0]
 
 

@@ -215,7 +215,9 @@ def _crossed_costs(
         if isinstance(effect, IndividualEffect):
             kind = type(effect)
             fit: Fit = evaluated(engine, plain)
-            one = individuals(engine, fit, kind)
+            # an agent's number means something at this setting only
+            own = {name: float(getattr(effect, name)) for name in effect.settings}
+            one = individuals(engine, fit, kind, own)
             if one is not None:
                 numbers[effect.name] = one.halves
     parts = []

@@ -6,11 +6,12 @@ not differ the two halves have nothing to do with each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
+from scipy import stats
 
 from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit, sums
@@ -18,6 +19,9 @@ from nnode.models.effects import IndividualEffect
 
 #: Standard deviations, relative to the one that the halves have in common, that are tried.
 SPREADS = (0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0)
+
+#: Rounds in which a setting is looked for more closely, and by how much each time.
+CLOSER, CLOSER_BY = 2, 0.4
 
 
 @dataclass
@@ -35,6 +39,7 @@ class Individuals:
         losses: ``(S,)`` sum of squares that is left so.
         people: sequence name to its agents' numbers, from all their time.
         halves: the same from each half of their time.
+        settings: intervals of 95 % of settings that were chosen among neighbouring ones.
     """
 
     effect: type[IndividualEffect]
@@ -46,14 +51,65 @@ class Individuals:
     losses: np.ndarray
     people: dict[str, list[float]]
     halves: tuple[dict[str, list[float]], dict[str, list[float]]]
+    settings: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Individuals | None:
-    """The best setting of an individual effect; None where it cannot act on these data."""
+def individuals(
+    engine: Engine,
+    fit: Fit,
+    effect: type[IndividualEffect],
+    options: dict[str, Any] | None = None,
+) -> Individuals | None:
+    """The best setting of an individual effect; None where it cannot act on these data.
+
+    Args:
+        options: its settings, where they are known.
+    """
+    if options is not None:
+        return _at(engine, fit, effect, options)
     found = [
         _at(engine, fit, effect, probe.options) for probe in effect.probes(engine.batch, fit.system)
     ]
-    return max(found, key=lambda one: one.gain, default=None)
+    best = max(found, key=lambda one: one.gain, default=None)
+    if best is None or len(best.options) != 1 or len(found) < 3:
+        return best
+    return _between(engine, fit, found, best)
+
+
+def _between(engine: Engine, fit: Fit, found: list[Individuals], best: Individuals) -> Individuals:
+    """The best value of the one setting, which the neighbouring ones only surround."""
+    (name,) = best.options
+    width = 0.0
+    for _ in range(CLOSER):
+        found = sorted(found, key=lambda one: float(one.options[name]))
+        place = found.index(best)
+        if not 0 < place < len(found) - 1:
+            return best
+        near = found[place - 1 : place + 2]
+        at = np.array([one.options[name] for one in near])
+        top = float(_vertex(at, np.array([[one.gain for one in near]]))[0])
+        width = CLOSER_BY * float(at[2] - at[0]) / 2
+        found = [_at(engine, fit, best.effect, {name: top + s * width}) for s in (-1, 0, 1)]
+        best = max(found, key=lambda one: one.gain)
+    at = np.array([one.options[name] for one in found])
+    losses = np.stack([one.losses for one in found], 1)
+    # by leaving out one sequence at a time
+    tops = _vertex(at, losses - losses.sum(0))
+    count = len(losses)
+    error = float(np.sqrt((count - 1) / count * ((tops - tops.mean()) ** 2).sum()))
+    half = float(stats.t.ppf(0.975, max(count - 1, 1))) * error
+    value = float(best.options[name])
+    return replace(best, settings={name: (value - half, value + half)})
+
+
+def _vertex(at: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """``(S,)`` where parabolas through ``(S, 3)`` gains at three places are highest; within
+    them."""
+    left = (gain[:, 1] - gain[:, 0]) / (at[1] - at[0])
+    right = (gain[:, 2] - gain[:, 1]) / (at[2] - at[1])
+    bend = np.minimum((right - left) / (at[2] - at[0]), -1e-300)
+    top: np.ndarray = (at[0] + at[1]) / 2 - left / (2 * bend)
+    return np.clip(top, at[0], at[2])
 
 
 def _at(
@@ -84,8 +140,8 @@ def _at(
         effect=effect,
         options=options,
         products=products,
-        sigma=sigma,
-        interval=(low, high),
+        sigma=effect.spread(sigma),
+        interval=(effect.spread(low), effect.spread(high)),
         gain=1 - float(losses.sum()) / fit.cost,
         losses=losses,
         people=_people(engine, effect, options, full),

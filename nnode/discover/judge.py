@@ -70,9 +70,12 @@ def _coefficients(fit: Fit, step: Step, sequence: np.ndarray) -> dict[str, Coeff
         low, high = value, value
         if full in fit.names:
             low, high = (float(end) for end in intervals[fit.names.index(full)])
-        if step.individuals is not None and name in effect.strengths:
+        if step.individuals is not None and name in effect.strengths and full not in fit.names:
             value = step.individuals.sigma
             low, high = step.individuals.interval
+        elif step.individuals is not None and name in step.individuals.settings:
+            value = float(step.individuals.options[name])
+            low, high = step.individuals.settings[name]
         found[name] = Coefficient(value, low, high, unit)
     return found
 

@@ -14,7 +14,12 @@ SMOOTHING = 1e-6
 
 def norm(vector: Tensor) -> Tensor:
     """``(..., 2)`` to ``(...)``: Euclidean length with a finite gradient everywhere."""
-    return torch.sqrt(vector.square().sum(-1) + SMOOTHING**2)
+    return torch.sqrt(dot(vector, vector) + SMOOTHING**2)
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """``(..., 2)`` twice to ``(...)``: scalar product; faster than a sum over an axis of two."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 
 
 def _positive(**options: float) -> None:
@@ -162,7 +167,7 @@ class SocialForce(InteractionForce):
         overlap = reach - d
         contact = overlap.clamp(min=0)
         push = self.A * torch.exp(overlap / self.B) + self.k * contact
-        slide = self.kappa * contact * (slip * t).sum(-1)
+        slide = self.kappa * contact * dot(slip, t)
         return push[..., None] * n + slide[..., None] * t
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:

@@ -148,16 +148,23 @@ class IndividualEffect(Effect):
         """An agent's number, from the amounts of the directions that were fitted to him."""
         return float(numbers[0])
 
+    @classmethod
+    def spread(cls, sigma: float) -> float:
+        """The strength, from the standard deviation of the amounts of each direction."""
+        return sigma
+
     def known(self, scene: Scene, like: Tensor) -> tuple[Tensor, Tensor]:
         """``(B, N)`` the agents' numbers (0 where unknown), and 1 where they are known."""
-        number = torch.zeros(scene.agent.shape, dtype=like.dtype)
-        there = torch.zeros_like(number)
-        for b, name in enumerate(scene.names):
-            own = self.people.get(name)
-            if own is not None:
-                number[b, : len(own)] = torch.tensor(own, dtype=like.dtype)
-                there[b, : len(own)] = 1.0
-        return number.to(like.device), there.to(like.device)
+        # many simulations may share a name; the first row of the tables is nobody's
+        numbers = torch.zeros(len(self.people) + 1, scene.agent.shape[1], dtype=like.dtype)
+        known = torch.zeros_like(numbers)
+        rows = {}
+        for row, (name, own) in enumerate(self.people.items(), start=1):
+            rows[name] = row
+            numbers[row, : len(own)] = torch.tensor(own, dtype=like.dtype)[: numbers.shape[1]]
+            known[row, : len(own)] = 1.0
+        index = torch.tensor([rows.get(name, 0) for name in scene.names])
+        return numbers[index].to(like.device), known[index].to(like.device)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import InteractionForce
+from nnode.models.crowd import InteractionForce, dot
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
 from nnode.models.effects.crowd_pairs import Neighbours, company, heading, velocity
 from nnode.models.system import System
@@ -57,7 +57,7 @@ class FieldOfView(ForceEffect):
 
     def forward(self, state: State) -> Tensor:
         towards = -Neighbours.of(state).n
-        cosine = (heading(velocity(state))[:, :, None] * towards).sum(-1)
+        cosine = dot(heading(velocity(state))[:, :, None], towards)
         weight = (1 - self.lambda_) * ((1 + cosine) / 2 - 1)
         return (weight[..., None] * self.base(state).pairs(state)).sum(2)
 
@@ -106,7 +106,7 @@ class EvasiveRotation(ForceEffect):
     def forward(self, state: State) -> Tensor:
         force = self.base(state).pairs(state)
         own, other = heading(velocity(state)), heading(state.others[1])
-        angle = self.theta * (1 - (own[:, :, None] * other[:, None]).sum(-1)) / 2
+        angle = self.theta * (1 - dot(own[:, :, None], other[:, None])) / 2
         turn, less = torch.sin(angle), torch.cos(angle) - 1
         fx, fy = force[..., 0], force[..., 1]
         return torch.stack([less * fx - turn * fy, turn * fx + less * fy], -1).sum(2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -70,12 +71,17 @@ class GaitSway(IndividualEffect):
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         if batch.dt > 0.25:
             return []
-        return [Probe({"f": 0.7 + 0.1 * i}, {"a": 0.05}) for i in range(6)]
+        return [Probe({"f": 0.6 + 0.05 * i}, {"a": 0.05}) for i in range(17)]
 
     @classmethod
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
         """The phase, from the amplitudes of the sine and the cosine of the clock."""
         return float(np.arctan2(numbers[1], numbers[0]))
+
+    @classmethod
+    def spread(cls, sigma: float) -> float:
+        """The amplitude: sine and cosine share its square."""
+        return math.sqrt(2) * sigma
 
     def forward(self, state: State) -> Tensor:
         phase, there = self.known(state.scene, state.x)

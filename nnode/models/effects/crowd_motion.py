@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import norm
+from nnode.models.crowd import dot, norm
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
@@ -43,8 +43,8 @@ class SidePreference(PairEffect):
     def forward(self, state: State) -> Tensor:
         pair = Neighbours.of(state)
         own, other = heading(velocity(state)), heading(state.others[1])
-        ahead = -(own[:, :, None] * pair.n).sum(-1)
-        facing = -(own[:, :, None] * other[:, None]).sum(-1)
+        ahead = -dot(own[:, :, None], pair.n)
+        facing = -dot(own[:, :, None], other[:, None])
         near = torch.sigmoid((self.REACH - pair.d) / self.EDGE)
         weight = pair.acts * ahead.clamp(min=0) * facing.clamp(min=0) * near
         met = 1 - torch.exp(-weight.sum(2))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import SocialForce, norm
+from nnode.models.crowd import SocialForce, dot, norm
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.system import System
 from nnode.models.term import Interval, State
@@ -139,7 +139,7 @@ class SlidingFriction(PairEffect):
         pair = Neighbours.of(state)
         tangent = torch.stack([-pair.n[..., 1], pair.n[..., 0]], -1)
         drag = self.c * torch.exp((2 * radius(state.system) - pair.d) / self.REACH)
-        slip = (pair.dv * tangent).sum(-1)
+        slip = dot(pair.dv, tangent)
         return ((drag * slip * pair.acts)[..., None] * tangent).sum(2)
 
 

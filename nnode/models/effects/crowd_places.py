@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import norm
+from nnode.models.crowd import dot, norm
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.effects.crowd_pairs import radius
 from nnode.models.system import System
@@ -33,8 +33,8 @@ def wall_distance(x: Tensor, segment: Tensor) -> tuple[Tensor, Tensor]:
     ends = torch.where(real[..., None], segment, 0.0)[:, None]
     start, along = ends[..., :2], ends[..., 2:] - ends[..., :2]
     offset = x[:, :, None] - start
-    length2 = along.square().sum(-1).clamp(min=1e-12)
-    share = ((offset * along).sum(-1) / length2).clamp(0, 1)
+    length2 = dot(along, along).clamp(min=1e-12)
+    share = (dot(offset, along) / length2).clamp(0, 1)
     away = offset - share[..., None] * along
     d = norm(away)
     absent = ~real[:, None]

@@ -188,7 +188,9 @@ def expected(name: str, item: Sequence, i: int) -> np.ndarray:
 
 
 def test_every_crowd_effect_is_tested_here() -> None:
-    assert {effect.name for effect in CATALOGUE.of("crowd")} == set(VALUES)
+    # other tests may register effects of their own
+    own = [e for e in CATALOGUE.of("crowd") if e.__module__.startswith("nnode.")]
+    assert {effect.name for effect in own} == set(VALUES)
 
 
 @pytest.mark.parametrize("name", VALUES)
