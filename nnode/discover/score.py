@@ -216,6 +216,10 @@ class Screen:
             signs: ``(F, blocks)``.
         """
         total, squares, size = signs @ parts, (parts**2).sum(0), sizes.sum(0)
+        empty = ~(size > 0)
+        if empty.all():
+            return np.zeros(total.shape)
+        sizes, size = np.where(empty, 1.0, sizes), np.where(empty, float(len(sizes)), size)
         amount = total / size
         rest = squares - 2 * amount * (signs @ (parts * sizes)) + amount**2 * (sizes**2).sum(0)
         blocks = size**2 / (sizes**2).sum(0)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nnode.data.sequence import Batch
+from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.discover.variables import Variable, knots_of
 from nnode.models.effects.traffic import gaps, rate_of
 from nnode.models.term import State
@@ -23,7 +23,9 @@ def _gap(state: State) -> Tensor:
 
 def _next_gap(state: State) -> Tensor:
     gap = gaps(state.x)
-    return torch.cat([gap[:, 1:], gap[:, -1:]], 1)
+    ahead = torch.cat([gap[:, 1:], gap[:, -1:]], 1)
+    # who follows the leader has no next gap
+    return torch.where(ahead > PADDING_GAP / 2, gap, ahead)
 
 
 def _rear_gap(state: State) -> Tensor:
@@ -86,7 +88,8 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         first[name] = min(first.get(name, start), start)
     since = clock - torch.tensor([first[name] for name in batch.names])[:, None]
     lead = v[:, torch.arange(len(batch)), last][..., None].expand(x.shape)
-    ahead = torch.cat([gap[..., 1:-1], gap[..., -2:-1], gap[..., -2:-1]], -1)
+    ahead = torch.cat([gap[..., 1:], gap[..., -1:]], -1)
+    ahead = torch.where(ahead.isnan() | (ahead > PADDING_GAP / 2), gap, ahead)
     behind = torch.cat([gap[..., :1], gap[..., :-1]], -1)
     rank = (last[:, None] - torch.arange(x.shape[2])).expand(x.shape)
 
