@@ -57,9 +57,9 @@ def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int) -> list[
                 "methods",
                 methods,
                 "Percent of the same cases, and medians. The peers choose columns of the "
-                "diagnosis's own library, on its residuals and its split, and what they "
-                "choose is calibrated in the same way; effects with a number per agent are not "
-                "among them, and cases that hide one are left out.",
+                "diagnosis's own library, on its residuals and its split, and what they choose is "
+                "calibrated in the same way; effects with a number per agent are not among the "
+                "columns, and cases that hide one are left out.",
                 digits={**dict.fromkeys(methods.columns, 0), "closure (median)": 2},
             ),
         ]

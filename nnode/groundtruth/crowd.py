@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nnode.groundtruth.case import Case, check_effects
+from nnode.groundtruth.case import STRENGTHS, Case, check_effects
 from nnode.groundtruth.crowd_catalogue import EFFECTS, Coefficients
 from nnode.groundtruth.crowd_motion import Base, Hidden, simulate
 from nnode.groundtruth.crowd_replay import Windows, cost_by_sequence
@@ -54,6 +54,10 @@ class Truth:
 class CrowdCase:
     """A case of crowds: draws what is hidden, sets its strength, and measures.
 
+    Args:
+        case: what is asked for.
+        truth: what acts, where it is known already; None draws it.
+
     Attributes:
         case: what was asked for.
         truth: what acts.
@@ -64,16 +68,21 @@ class CrowdCase:
         ConfigError: an effect that crowds do not know.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, truth: Truth | None = None) -> None:
         check_effects(case, EFFECTS)
         self.case = case
         self.scene: Scene = set_scene(case)
+        self._some = list(range(min(_SOME, case.n_sequences)))
+        if truth is not None:
+            self.truth = truth
+            self.amplitude = Amplitude(STRENGTHS[case.strength], truth.amplitude)
+            return
         rng = case.generator("effects")
         effects = {name: EFFECTS[name].draw(rng, self.scene.width) for name in case.effects}
         if case.variant == "heterogeneous":
             effects["walker_heterogeneity"] = {"sigma": float(rng.uniform(*_NUISANCE))}
         self.truth = Truth(effects, bell=case.variant == "smooth")
-        self.amplitude: Amplitude = set_strength(self, rng, AMPLITUDES)
+        self.amplitude = set_strength(self, rng, AMPLITUDES)
 
     def simulate(self, truth: Truth, scene: Scene | None = None) -> tuple[np.ndarray, np.ndarray]:
         """``(S, K + 1, N, 2)`` positions (m) and velocities (m/s), burnt in."""
@@ -119,7 +128,7 @@ class CrowdCase:
     def misfit(self, names: list[str]) -> float:
         """Mean squared misfit (m²) of the recalibrated base law to some of the effects alone."""
         kept = {k: v for k, v in self.truth.effects.items() if k in names}
-        some = self.scene.first(_SOME)
+        some = self.scene.only(self._some)
         x, v = self.simulate(replace(self.truth, effects=kept, amplitude=0.0), some)
         windows = Windows(some, x, v, x, self.case.dt)
         error = windows.errors(windows.recalibrated(some.base))
@@ -127,7 +136,7 @@ class CrowdCase:
 
     def spread(self, probe: float) -> float:
         """Mean squared displacement (m²) by noise of 1 m/s², probed with a smaller one."""
-        truth, some = replace(self.truth, amplitude=probe), self.scene.first(_SOME)
+        truth, some = replace(self.truth, amplitude=probe), self.scene.only(self._some)
         x, v = self.simulate(truth, some)
         windows = Windows(some, x, v, x, self.case.dt)
         return float(self._oracle(windows, truth).mean()) / probe**2

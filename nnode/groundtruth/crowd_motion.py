@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-#: Farther away than this many ranges B beyond contact the base force is not worth counting.
-_RANGES = 11.0
+#: Farther away than this many ranges B beyond contact a person's force, or a wall point's, whose
+#: share is smaller, is not worth counting.
+_RANGES, _WALL_RANGES = 11.0, 8.0
 #: Reach of alignment, of sliding friction and of the density's kernel, m.
 ALIGNMENT_REACH, FRICTION_REACH, KERNEL = 2.0, 0.5, 1.0
 #: Distance within which somebody who comes towards counts, and how sharply that ends, m.
@@ -100,7 +101,7 @@ def _walls(
 ) -> tuple[float, float]:  # fmt: skip
     """Acceleration by walls, of a person at (x, y) with the velocity (u, w)."""
     ax, ay = 0.0, 0.0
-    far = base.r + _RANGES * base.B
+    far = base.r + _WALL_RANGES * base.B
     for p in range(len(points)):
         dx, dy = x - points[p, 0], y - points[p, 1]
         if abs(dx) < far and abs(dy) < far:
@@ -131,6 +132,9 @@ def _others(
     """Acceleration of person i by everyone else."""
     n = len(x)
     ax, ay = 0.0, 0.0
+    # most effects need nothing but the base force of each pair
+    looks = fx.lambda_ != 1.0 or fx.theta != 0.0 or fx.A_2 != 0.0 or fx.friction != 0.0
+    looks = looks or fx.side != 0.0 or fx.align != 0.0 or fx.dense != 0.0
     met, weights, wx, wy, rho, mates, gx, gy = 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0
     for j in range(n):
         if j == i:
@@ -138,6 +142,14 @@ def _others(
         dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
         ux, uy = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1]
         px, py = _contact(base, 2 * base.r, dx - fx.T_a * ux, dy - fx.T_a * uy, ux, uy)
+        if group[j] == group[i] and group[i] >= 0:
+            mates += 1
+            gx -= dx
+            gy -= dy
+        if not looks:
+            ax += px / n
+            ay += py / n
+            continue
         d = math.sqrt(dx * dx + dy * dy) + 1e-12
         nx, ny = dx / d, dy / d
         facing = e[i, 0] * e[j, 0] + e[i, 1] * e[j, 1]
@@ -170,10 +182,6 @@ def _others(
             wy += weight * uy
         if fx.dense != 0.0:
             rho += math.exp(-d * d / (2 * KERNEL**2)) / (2 * math.pi * KERNEL**2)
-        if group[j] == group[i] and group[i] >= 0:
-            mates += 1
-            gx -= dx
-            gy -= dy
     if weights > 0.0:
         ax += fx.align * wx / weights
         ay += fx.align * wy / weights

@@ -73,10 +73,10 @@ class Scene:
     eta: np.ndarray
     phase: np.ndarray
 
-    def first(self, number: int) -> Scene:
-        """The first crowds alone."""
+    def only(self, places: list[int]) -> Scene:
+        """The crowds at some places alone."""
         names = ("clocks", "x", "v", "goal", "group", "kick", "error", "eta", "phase")
-        return replace(self, **{name: getattr(self, name)[:number] for name in names})
+        return replace(self, **{name: getattr(self, name)[places] for name in names})
 
 
 def set_scene(case: Case) -> Scene:

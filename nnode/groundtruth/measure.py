@@ -112,28 +112,42 @@ def located_faults(hidden: list[dict[str, Any]], reported: list[dict[str, Any]])
 
 
 def closure(truth: dict[str, Any], report: dict[str, Any]) -> float | None:
-    """Of what the truth removes of the excess cost on the sealed sequences, the share removed.
+    """What a diagnosis removes of the cost on the sealed sequences over what the truth removes.
 
-    Both are shares of the excess over the measurement's own error, each by its own measure of
-    cost: in crowds that depends on how windows begin. None without an effect, or where the
-    truth removes next to nothing on these sequences.
+    In traffic both are compared on the report's own scale. A crowd's costs depend on how the
+    states are found in which people start: models are simulated again with the reported
+    coefficients, or, where that cannot be, shares of each one's own excess are compared. None
+    without an effect, or where the truth removes next to nothing on these sequences.
     """
     sealed = {tail(name) for name in (report.get("split") or {}).get("sealed", ())}
     cost = truth["cost"]
-    base = [value for name, value in cost["base"].items() if tail(name) in sealed]
-    oracle = [value for name, value in cost["oracle"].items() if tail(name) in sealed]
+    places = [i for i, name in enumerate(cost["oracle"]) if tail(name) in sealed]
     hidden = truth["effects"] or truth["outside"] or truth["nuisance"]
-    if not base or not hidden or truth["case"]["arm"] == "no_excitation":
+    if not places or not hidden or truth["case"]["arm"] == "no_excitation":
         return None
-    before, best = sum(base) / len(base), sum(oracle) / len(oracle)
+    base, best = (
+        sum(list(cost[name].values())[i] for i in places) / len(places)
+        for name in ("base", "oracle")
+    )
     gap = report["gap"]
+    before, after, floor = gap["before"], gap["after"], gap.get("noise_floor") or 0.0
     if truth["case"]["domain"] == "traffic":
-        # one measure of cost: the truth is compared with on the report's own scale
-        possible = gap["before"] - best
-        least = _LEAST_SHARE * (gap["before"] - cost["floor"])
-        return (gap["before"] - gap["after"]) / possible if possible > max(least, 0.0) else None
-    possible = (before - best) / max(before - cost["floor"], 1e-300)
-    excess = gap["before"] - (gap.get("noise_floor") or 0.0)
-    if possible < _LEAST_SHARE or excess <= 0:
+        return _of_possible(before, after, best, cost["floor"])
+    # imported here: compiled code is loaded for crowds alone
+    from nnode.groundtruth.crowd_closure import crowd_costs
+
+    own = crowd_costs(truth, report, places)
+    if own is not None:
+        return _of_possible(*own, cost["floor"])
+    possible = (base - best) / max(base - cost["floor"], 1e-300)
+    if possible < _LEAST_SHARE or before <= floor:
         return None
-    return float((gap["before"] - gap["after"]) / excess / possible)
+    return float((before - after) / (before - floor) / possible)
+
+
+def _of_possible(before: float, after: float, best: float, floor: float) -> float | None:
+    """Share that is removed of what can be."""
+    possible = before - best
+    if possible <= max(_LEAST_SHARE * (before - floor), 0.0):
+        return None
+    return (before - after) / possible

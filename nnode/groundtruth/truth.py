@@ -90,7 +90,7 @@ def write_truth(
         "noise": {"measurement": case.sigma, **noise},
         "strength": {
             "share": amplitude.share,
-            "reached": costs.share,
+            "reached": costs.share if case.effects else None,
             "misfit": amplitude.misfit,
             "spread": amplitude.spread,
             "alone": amplitude.alone,

@@ -15,7 +15,9 @@ from nnode.groundtruth.arms import cases
 from nnode.groundtruth.case import TABLE, WALLS
 from nnode.groundtruth.crowd import CrowdCase
 from nnode.groundtruth.crowd_catalogue import CATALOGUE, EFFECTS
+from nnode.groundtruth.crowd_closure import crowd_costs
 from nnode.groundtruth.crowd_replay import Windows, cost_by_sequence
+from nnode.groundtruth.measure import closure
 
 
 def small(*effects: str, **options) -> Case:
@@ -113,3 +115,22 @@ def test_all_arms_have_cases():
         assert found
         assert all(name in EFFECTS for case in found for name in case.effects)
     assert len(cases("crowd", "single", seeds=[0])) == len(CATALOGUE) == 16
+
+
+def test_a_diagnosis_that_reports_the_truth_closes_the_whole_gap(tmp_path):
+    truth = generate(small("alignment", strength="strong", n_sequences=4), tmp_path)
+    base = {name: {"before": value, "after": value} for name, value in truth["base"].items()}
+    told = {"name": "alignment", "coefficients": truth["effects"][0]["coefficients"]}
+    report = {
+        "effects": [told],
+        "base": base,
+        "gap": {"before": 1.0, "after": 1.0, "noise_floor": 0.0},
+        "split": {"sealed": [name.split("/")[1] for name in list(truth["cost"]["oracle"])[1:3]]},
+    }
+    assert closure(truth, report) == pytest.approx(1.0, abs=1e-6)
+    assert closure(truth, {**report, "effects": []}) == pytest.approx(0.0, abs=1e-6)
+    before, after, best = crowd_costs(truth, report, [1, 2])
+    wanted = list(truth["cost"]["oracle"].values())[1:3]
+    # the truth was replayed with finer steps
+    assert (after, best) == pytest.approx((np.mean(wanted), np.mean(wanted)), rel=0.02)
+    assert before > 1.5 * best

@@ -167,7 +167,7 @@ def test_closure_is_measured_on_the_sealed_sequences():
     assert row["closure"] == pytest.approx(-0.1 / 0.9)
 
 
-def test_crowds_compare_shares_as_their_costs_are_not_measured_alike():
+def test_crowds_compare_shares_where_they_cannot_be_simulated_again():
     people = truth("field_of_view")
     people["case"]["domain"] = "crowd"
     found = report("field_of_view")
