@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nnode.data.sequence import Batch
+from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
 from nnode.models.effects.traffic import for_followers, gaps, law_of, rate_of
 from nnode.models.system import System
@@ -17,15 +17,16 @@ _EXCITATION = "leaders that brake and accelerate strongly, measured often and pr
 
 
 def speeds_of_law(x: Tensor, v: Tensor, system: System) -> Tensor:
-    """``(B, N)`` speeds at the start as the law says, m/s; the last vehicle's is measured.
+    """``(B, N)`` speeds at the start as the law says, m/s; a leader's is measured.
 
     Measured speeds of followers would tell of disturbances that go on for a while, and a memory
     that starts with them would be taken for inertia.
     """
     law = system.find(FollowTheLeader)
     assert law is not None
-    speed = law.speed(gaps(x))
-    return torch.cat([speed[:, :-1], v[:, -1:, 0]], 1)
+    gap = gaps(x)
+    # nobody, or a vehicle of the padding, is ahead of a leader
+    return torch.where(gap > PADDING_GAP / 2, v[..., 0], law.speed(gap))
 
 
 class _SpeedAhead(Effect):

@@ -1,0 +1,210 @@
+"""The residuals of platoons, their derivatives, and what they tell of hidden effects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import Sequence
+from nnode.discover.compare import compare, heldout
+from nnode.discover.engine import row_of
+from nnode.discover.fit import evaluated, refine
+from nnode.discover.individual import individuals
+from nnode.discover.score import Screen, traces
+from nnode.discover.search import search, settled
+from nnode.discover.smooth import noise_variance, smooth, velocity
+from nnode.discover.traffic import LARGE, TrafficEngine, drawn_in
+from nnode.discover.variables import curves, significant
+from nnode.models import System
+from nnode.models.build import add_effects, build_model
+from nnode.models.effects import CATALOGUE
+from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
+
+
+def model(*effects: dict[str, object]) -> System:
+    options = {"leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0}
+    found = build_model({"term": "lin", "name": "lin", **options})
+    add_effects(found, list(effects))
+    return found
+
+
+@pytest.fixture(scope="module")
+def plain() -> list[Sequence]:
+    return platoons(driver=0.2)
+
+
+@pytest.fixture(scope="module")
+def reacting() -> list[Sequence]:
+    return platoons(relative_speed(0.4), driver=0.2)
+
+
+# -- paths -----------------------------------------------------------------------------------
+
+
+def test_noise_is_recognised_and_smoothed_away() -> None:
+    t = 0.2 * np.arange(120)[:, None]
+    true = 15 * t + 3 * np.sin(0.4 * t + np.arange(4))
+    noisy = true + np.random.default_rng(0).normal(0, 0.1, true.shape)
+    assert noise_variance(noisy) == pytest.approx(0.01, rel=0.2)
+    assert np.sqrt(((smooth(noisy) - true) ** 2).mean()) < 0.05
+    speed = 15 + 1.2 * np.cos(0.4 * t + np.arange(4))
+    assert np.abs(velocity(true, 0.2) - speed).max() < 0.02
+
+
+def test_a_right_model_leaves_only_noise(plain: list[Sequence]) -> None:
+    engine = TrafficEngine(platoons(noise=0.0))
+    errors = engine.squares(model(), row_of(model()))
+    assert np.sqrt(errors.means().max()) < 2e-3
+    # nothing that a vehicle did before it forgot its start is compared
+    assert len(errors.value) == len(engine.sequence) < sum(s.x[1:, 1:].size for s in plain)
+
+
+def test_windows_share_out_what_is_compared() -> None:
+    long = platoons(number=2, seconds=40.0)
+    engine = TrafficEngine(long)
+    whole = TrafficEngine(long, np.inf)
+    assert len(engine.batch) > len(whole.batch) == 2
+    # boundary samples belong to the window before
+    assert len(engine.sequence) == len(whole.sequence)
+    assert set(engine.block[engine.sequence == 1]).isdisjoint(engine.block[engine.sequence == 0])
+
+
+def test_large_residuals_are_drawn_in() -> None:
+    r = torch.tensor([0.5, -LARGE, 10 * LARGE], dtype=torch.float64)
+    found = drawn_in(r)
+    assert found[:2].tolist() == r[:2].tolist()
+    # the square is Huber's loss
+    assert float(found[2] ** 2) == pytest.approx(2 * LARGE * 10 * LARGE - LARGE**2)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        [],
+        [{"name": "relative_speed", "kappa": 0.3}],
+        [{"name": "inertia", "tau_v": 0.6}],
+        [{"name": "reaction_delay", "T": 0.5}],
+        [{"name": "time_gap", "h": 0.1}],
+        [{"name": "multi_anticipation", "c": 0.2}],
+    ],
+)
+def test_linear_response_agrees_with_differences(
+    plain: list[Sequence], effects: list[dict[str, object]]
+) -> None:
+    engine, system = TrafficEngine(plain[:4]), model(*effects)
+    row = row_of(system)
+    found = engine.tangents(system, row)
+    step = 1e-4 * row.abs().clamp(min=0.1)
+    rows = torch.cat([row[None], row + torch.diag(step)])
+    values = engine.residuals(system, rows)
+    expected = (values[1:] - values[0]) / step[:, None]
+    apart = (found - expected).norm(dim=1) / expected.norm(dim=1)
+    assert apart.max() < 0.06
+
+
+def test_traces_agree_with_simulated_effects(plain: list[Sequence]) -> None:
+    engine = TrafficEngine(plain[:4])
+    fit = settled(engine, model())
+    (trace,) = traces(engine, fit, CATALOGUE.effects["relative_speed"])
+    other = model({"name": "relative_speed", "kappa": 0.01})
+    row = torch.cat([torch.from_numpy(fit.row), torch.tensor([0.01]).double()])
+    changed = engine.residuals(other, row[None])[0].numpy() - fit.residual
+    expected = changed / 0.01
+    apart = np.linalg.norm(trace.columns[:, 0] - expected) / np.linalg.norm(expected)
+    assert apart < 0.05
+
+
+# -- naming ----------------------------------------------------------------------------------
+
+
+def test_a_hidden_effect_is_named_and_measured(reacting: list[Sequence]) -> None:
+    engine = TrafficEngine(reacting)
+    base = settled(engine, model())
+    found = search(engine, base, CATALOGUE.of("traffic"))
+    assert [step.chosen.name for step in found.steps] == ["relative_speed"]
+    i = found.fit.names.index("terms.1.kappa")
+    low, high = found.fit.intervals(engine.sequence)[i]
+    assert found.fit.row[i] == pytest.approx(0.4, abs=0.05)
+    assert low < 0.4 < high
+
+
+def test_nothing_is_named_where_nothing_is_hidden(plain: list[Sequence]) -> None:
+    engine = TrafficEngine(plain)
+    base = settled(engine, model())
+    found = search(engine, base, CATALOGUE.of("traffic"))
+    assert not found.steps
+    assert not significant(curves(engine, base, engine.variables()), 0.01, 0.02)
+    assert base.row == pytest.approx([V0, LENGTH], rel=0.05)
+
+
+def test_curves_find_the_variable_of_an_effect() -> None:
+    def slow(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
+        return law * np.where((x[:-1] > 150) & (x[:-1] < 250), 0.8, 1.0)
+
+    engine = TrafficEngine(platoons(slow, driver=0.1))
+    fit = settled(engine, model())
+    best = curves(engine, fit, engine.variables())[0]
+    assert best.variable.name == "position"
+    assert best.gain.low > 0
+
+
+def test_drivers_who_differ_are_recognised() -> None:
+    rng = np.random.default_rng(5)
+    pace = rng.normal(0, 0.1, (40, 4))
+    made = []
+    for s in range(12):
+        own = pace[s]
+        made += [
+            Sequence(name=f"r/{s}", recording="r", time=one.time + 100 * s, x=one.x)
+            for one in platoons(lambda x, law, lead, own=own: law * (1 + own), number=1, seed=s)
+        ]
+    engine = TrafficEngine(made)
+    fit = settled(engine, model())
+    effect = CATALOGUE.effects["driver_heterogeneity"]
+    found = individuals(engine, fit, effect)  # type: ignore[arg-type]
+    assert found is not None
+    assert found.gain > 0.3
+    numbers = np.array([found.people[f"r/{s}"][:4] for s in range(12)])
+    assert np.corrcoef(numbers.ravel(), pace[:12].ravel())[0, 1] > 0.8
+
+
+# -- statistics ------------------------------------------------------------------------------
+
+
+def test_false_alarms_of_the_largest_score_are_held(plain: list[Sequence]) -> None:
+    """Residuals that depend on each other within a block, many directions, nothing hidden."""
+    engine = TrafficEngine(plain)
+    fit = evaluated(engine, model())
+    rng = np.random.default_rng(2)
+    found = [trace for name in ("relative_speed", "speed_zone", "free_flow_speed", "inertia")
+             for trace in traces(engine, fit, CATALOGUE.effects[name])]  # fmt: skip
+    alarms = 0
+    for trial in range(60):
+        common = rng.normal(size=int(engine.block.max()) + 1)[engine.block]
+        fit.residual = rng.normal(size=len(fit.residual)) + 0.3 * common
+        scores = Screen(fit, engine.block, seed=trial).scores(found)
+        alarms += min(score.p_value for score in scores) <= 0.05
+    # 3 expected; above 8 would be a chance of 0.5 %
+    assert alarms <= 8
+
+
+def test_heldout_cost_is_that_of_a_refit(reacting: list[Sequence]) -> None:
+    engine = TrafficEngine(reacting)
+    fit = settled(engine, model())
+    losses = heldout(fit, engine.sequence)
+    rest = TrafficEngine(reacting[1:])
+    rest.filter = engine.filter
+    again = refine(rest, model(), tolerance=1e-8)
+    one = TrafficEngine(reacting[:1])
+    one.filter = engine.filter
+    value = one.residuals(model(), torch.from_numpy(again.row)[None])[0]
+    assert losses[0] == pytest.approx(float(value @ value), rel=0.02)
+
+
+def test_comparison_is_bounded_by_every_sequence() -> None:
+    first, second = np.array([2.0, 2.0, 2.0, 1e9]), np.array([1.0, 1.0, 1.0, 1.0])
+    found = compare(first, second)
+    assert found.gain == pytest.approx((3 * 0.5 + 1) / 4)
+    assert compare(second, first).gain == pytest.approx(-found.gain)
+    assert found.p_value < 0.05 < compare(second, first).p_value
