@@ -53,7 +53,7 @@ def config(**options: Any) -> Any:
         "nothing_seeds": 1,
         "sizes": [3],
         "strengths": ["full"],
-        "peers": False,
+        "peer_seeds": 0,
     }
     chosen = DiscoveryBenchmarkOptions(**{**given, **options})
     return OmegaConf.structured(DiscoveryBenchmarkConfig(benchmark_discovery=chosen))
