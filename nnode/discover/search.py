@@ -11,7 +11,7 @@ import torch
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.engine import Engine, row_of
-from nnode.discover.fit import Fit, refine, sums
+from nnode.discover.fit import Fit, evaluated, refine, sums
 from nnode.discover.individual import Individuals, individuals
 from nnode.discover.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
@@ -28,13 +28,13 @@ RIVAL = 0.25
 #: At most so many effects are calibrated in a round.
 RIVALS = 5
 #: A rival whose held-out gain is below this share of the best one's is told apart from it.
-CLOSE = 0.9
+CLOSE = 0.8
 #: Calibrations of rivals end where a step lowers the cost by less than this share.
 ROUGH = 1e-3
 #: An interval is moved at most so many times.
 SHIFTS = 3
-#: Two rivals are told apart at this error probability.
-APART = 0.05
+#: Two rivals are told apart at this error probability; two of a kin at a smaller one.
+APART, KIN_APART = 0.05, 0.01
 
 
 @dataclass
@@ -161,6 +161,8 @@ def search(
             break
         found.steps.append(step)
         found.fit = settled(engine, step.chosen.fit.system, rounds=1)
+        if step.individuals is not None:
+            found.fit = _again(engine, found.fit, step.chosen)
         log.info("added %s", step.chosen.name)
     return _pruned(engine, found)
 
@@ -225,7 +227,9 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         if other is best or other.gain.gain < CLOSE * best.gain.gain:
             continue
         test = compare(other.losses, best.losses)
-        if test.p_value > APART and not _contains(other, best):
+        kin = best.score.effect.kin
+        alike = bool(kin) and kin == other.score.effect.kin
+        if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals, scores)
 
@@ -276,6 +280,20 @@ def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit 
         if found.cost < (1 - ROUGH) * (fit if best is None else best).cost:
             best = found
     return best
+
+
+def _again(engine: Engine, fit: Fit, chosen: Candidate) -> Fit:
+    """Everybody's numbers once more, around the parameters that the model has with them."""
+    kind = chosen.score.effect
+    assert issubclass(kind, IndividualEffect)
+    plain = evaluated(engine, without(fit.system, kind.name))
+    one = individuals(engine, plain, kind)
+    if one is None:
+        return fit
+    own = next(effect for effect in effects_of(fit.system) if isinstance(effect, kind))
+    system, _ = extended(plain.system, kind(**{**own.options(), "people": one.people}))
+    chosen.individuals = one
+    return refine(engine, system)
 
 
 def _simplest(candidates: list[Candidate]) -> Candidate:

@@ -140,7 +140,7 @@ def test_nothing_is_named_where_nothing_is_hidden(plain: list[Sequence]) -> None
 
 def test_curves_find_the_variable_of_an_effect() -> None:
     def slow(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
-        return law * np.where((x[:-1] > 150) & (x[:-1] < 250), 0.8, 1.0)
+        return law * np.where((x[:-1] > 250) & (x[:-1] < 330), 0.9, 1.0)
 
     engine = TrafficEngine(platoons(slow, driver=0.1))
     fit = settled(engine, model())
@@ -164,7 +164,7 @@ def test_drivers_who_differ_are_recognised() -> None:
     effect = CATALOGUE.effects["driver_heterogeneity"]
     found = individuals(engine, fit, effect)  # type: ignore[arg-type]
     assert found is not None
-    assert found.gain > 0.3
+    assert found.interval[0] > 0.04
     numbers = np.array([found.people[f"r/{s}"][:4] for s in range(12)])
     assert np.corrcoef(numbers.ravel(), pace[:12].ravel())[0, 1] > 0.8
 
