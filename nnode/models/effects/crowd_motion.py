@@ -59,7 +59,7 @@ class GroupCohesion(Effect):
     formula = "c (mean of x_j over the others of the group - x_i)"
     source = "Moussaïd et al. 2010"
     domain = "crowd"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-2.0, 5.0), "1/s²")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s²")}
     separated_by = "groups that are pulled apart"
 
     c: Tensor
@@ -85,7 +85,7 @@ class PreferredSpeed(Effect):
     formula = "c (v_pref - |v|) v/|v|"
     source = "Helbing & Molnár 1995 (relaxation to the desired speed)"
     domain = "crowd"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-2.0, 5.0), "1/s")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.02, 5.0), "1/s")}
     settings = {"v_pref": Setting(1.3, Interval(0.0, 3.0), "m/s")}
     kin = "speed"
     separated_by = "people who walk faster and slower than preferred, in thin crowds"
