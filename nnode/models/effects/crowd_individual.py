@@ -19,8 +19,10 @@ from nnode.models.term import Interval, State
 
 @CATALOGUE.add
 class WalkerHeterogeneity(IndividualEffect):
-    """Some people steer to their destination more vigorously than others; ``people`` holds
-    their eta_i."""
+    """Some people steer to their destination more vigorously than others.
+
+    ``people`` holds their eta_i.
+    """
 
     name = "walker_heterogeneity"
     domain = "crowd"
@@ -53,8 +55,10 @@ class WalkerHeterogeneity(IndividualEffect):
 
 @CATALOGUE.add
 class GaitSway(IndividualEffect):
-    """People sway from side to side as they step; ``people`` holds their phases phase_i (rad) at
-    the clock time 0."""
+    """People sway from side to side as they step.
+
+    ``people`` holds their phases phase_i (rad) at the clock time 0.
+    """
 
     name = "gait_sway"
     domain = "crowd"

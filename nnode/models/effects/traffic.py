@@ -272,8 +272,10 @@ class LeaderSpeed(Effect):
 
 @CATALOGUE.add
 class DriverHeterogeneity(IndividualEffect):
-    """Every driver has a pace of his own, with mean zero over the drivers; ``people`` holds
-    their eta_i."""
+    """Every driver has a pace of his own, with mean zero over the drivers.
+
+    ``people`` holds their eta_i.
+    """
 
     sigma: Tensor
     name = "driver_heterogeneity"
