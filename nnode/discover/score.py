@@ -135,6 +135,10 @@ class Screen:
                 np.clip(strength.neutral + value, strength.range.low, strength.range.high)
             )
             amounts[name], errors[name] = float(value), float(width)
+        if len(probe.steps) == 1 and value != 0:
+            # a strength that is not plausible speaks for something else
+            share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
+            statistic, gain = statistic * share, gain * share * (2 - share)
         return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
 
     def _individual(self, found: Individuals) -> Score:

@@ -26,8 +26,8 @@ from nnode.models.system import System
 from nnode.models.term import State, Term
 
 #: Longest step of the simulation, s; and relative to the shortest time constant of the states
-#: that terms own, for which Runge and Kutta's method is stable.
-STEP, STABLE = 0.4, 0.7
+#: that terms own, for which Runge and Kutta's method is accurate.
+STEP, STABLE = 0.4, 0.3
 #: Sequences are compared in windows of about this length, s, each simulated from so much
 #: before (at most a share of the sequence) that its start is forgotten.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2

@@ -87,3 +87,25 @@ def relative_speed(kappa: float) -> Effect:
         return found
 
     return effect
+
+
+def delayed(delay: float, number: int = 4, seconds: float = 20.0) -> list[Sequence]:
+    """Platoons of three that see their gap as it was ``delay`` s ago; small Euler steps."""
+    rng = np.random.default_rng(3)
+    step = DT / 200
+    late, every = round(delay / step), 200
+    samples, warm = round(seconds / DT) + 1, round(20 / DT)
+    found = []
+    for s in range(number):
+        lead, speed = _leader(rng, step * np.arange((samples + warm) * every))
+        gap = LENGTH * V0 / (V0 - speed[0])
+        x = np.empty((len(lead), 3))
+        x[:, 2] = lead
+        x[: late + 1] = lead[: late + 1, None] - gap * np.array([2.0, 1.0, 0.0])
+        for k in range(late, len(lead) - 1):
+            seen = np.diff(x[k - late])
+            x[k + 1, :2] = x[k, :2] + step * V0 * (1 - LENGTH / seen)
+        place = x[warm * every :: every]
+        clock = 100.0 * s + DT * np.arange(len(place))
+        found.append(Sequence(name=f"r/{s}", recording="r", time=clock, x=place[..., None]))
+    return found

@@ -19,7 +19,7 @@ from nnode.discover.variables import curves, significant
 from nnode.models import System
 from nnode.models.build import add_effects, build_model
 from nnode.models.effects import CATALOGUE
-from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
+from tests.discover.platoons import LENGTH, V0, delayed, platoons, relative_speed
 
 
 def model(*effects: dict[str, object]) -> System:
@@ -113,6 +113,16 @@ def test_traces_agree_with_simulated_effects(plain: list[Sequence]) -> None:
     expected = changed / 0.01
     apart = np.linalg.norm(trace.columns[:, 0] - expected) / np.linalg.norm(expected)
     assert apart < 0.05
+
+
+def test_a_delay_is_simulated_precisely() -> None:
+    """Data with a true delay, whose history was kept, against the filter that stands for it."""
+    sequences = delayed(0.6)
+    engine = TrafficEngine(sequences)
+    right = model({"name": "reaction_delay", "T": 0.6})
+    error = engine.squares(right, row_of(right)).means().mean()
+    assert np.sqrt(error) < 0.03
+    assert error < 0.05 * engine.squares(model(), row_of(model())).means().mean()
 
 
 # -- naming ----------------------------------------------------------------------------------
