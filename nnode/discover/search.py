@@ -136,18 +136,20 @@ def search(
     alpha: float = 0.05,
     most: int = 4,
     seed: int = 0,
+    before: list[Step] | None = None,
 ) -> Search:
     """Forwards until no effect passes, then backwards.
 
     Args:
         engine: of the open sequences.
-        fit: the calibrated model without effects, in the engine's filter.
+        fit: the calibrated model, in the engine's filter.
         effects: to look for.
         alpha: probability of naming anything where nothing is hidden.
         most: effects at most.
         seed: of the sign flips.
+        before: steps that led to ``fit``.
     """
-    found = Search(fit)
+    found = Search(fit, list(before or []))
     while True:
         own = {effect.name for effect in effects_of(found.fit.system)}
         left = [effect for effect in effects if effect.name not in own]

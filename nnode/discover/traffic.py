@@ -53,6 +53,8 @@ class TrafficEngine:
         unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
         people: of each unit, per direction the sequence and the place of its agent.
         half: ``(n,)`` 0 or 1: the two halves of a sequence's time.
+        whitened: False compares positions as they are. A filter that is fitted to what a model
+            leaves takes a lasting deviation for noise with a long memory.
     """
 
     def __init__(self, sequences: list[Sequence], window: float = WINDOW) -> None:
@@ -72,6 +74,7 @@ class TrafficEngine:
         time = torch.arange(self.batch.n_samples)[:, None]
         self.seen = self.follows & (time > torch.tensor(first))[..., None]
         self.filter = PlatoonFilter.none()
+        self.whitened = True
         self._last: tuple[System, Tensor, Tensor] | None = None
         self._response: tuple[System, Tensor, Response] | None = None
         k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
@@ -232,6 +235,9 @@ class TrafficEngine:
         shortest = int(self.batch.valid.any(-1).sum(0).min())
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
+        if not self.whitened:
+            self.filter = PlatoonFilter.none(max(float(away[self.seen].std()), 1e-9))
+            return
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
 
 
