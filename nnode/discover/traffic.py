@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.engine import Ensemble, Squares, fill, row_of, trained
+from nnode.discover.fit import limits
 from nnode.discover.response import Response
 from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.traffic_variables import traffic_variables
@@ -205,6 +207,26 @@ class TrafficEngine:
         weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
         found = self.filter(torch.where(self.follows, -moved, 0.0))[:, self.seen]
         return torch.nan_to_num(found * weight)
+
+    def near(self, system: System) -> System:
+        """A copy whose law is fitted to the smoothed speeds: simulations started from there do
+        not end in a far minimum. The regression itself is biased by noise, as a start it may."""
+        found = copy.deepcopy(system)
+        batch, scene = self.smoothed, found.scene(self.smoothed)
+        low, high = limits(found)
+        time = batch.dt * torch.arange(batch.n_samples, dtype=torch.float64)
+        every = torch.func.vmap(lambda t, x: found(t, x, scene))
+
+        def missed(row: np.ndarray) -> np.ndarray:
+            fill(found, torch.from_numpy(row))
+            with torch.no_grad():
+                speed = every(time, batch.x)[..., 0]
+            away: np.ndarray = (batch.v[..., 0] - speed)[self.follows].numpy()
+            return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
+
+        start = np.clip(row_of(found).numpy(), low, high)
+        best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
+        return fill(found, torch.from_numpy(best.x))
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
