@@ -241,7 +241,7 @@ def _crossed_costs(
             kind = type(effect)
             fit: Fit = evaluated(engine, plain)
             # an agent's number means something at this setting only
-            own = {name: float(getattr(effect, name)) for name in effect.settings}
+            own = {name: float(getattr(effect, name).detach()) for name in effect.settings}
             one = individuals(engine, fit, kind, own)
             if one is not None:
                 numbers[effect.name] = one.halves

@@ -65,7 +65,7 @@ def _coefficients(fit: Fit, step: Step, sequence: np.ndarray) -> dict[str, Coeff
     units = {name: strength.unit for name, strength in effect.strengths.items()}
     units |= {name: setting.unit for name, setting in effect.settings.items()}
     for name, unit in units.items():
-        value = float(getattr(own, name))
+        value = float(getattr(own, name).detach())
         full = f"terms.{place}.{name}"
         low, high = value, value
         if full in fit.names:

@@ -315,7 +315,8 @@ def _contains(wider: Candidate, narrower: Candidate) -> bool:
 
 
 def _pruned(engine: Engine, found: Search) -> Search:
-    """Take back effects that the later ones have made needless."""
+    """Take back effects that the later ones have made needless; who was a rival of one effect
+    and was added later is none."""
     while len(found.steps) > 1:
         losses = heldout(found.fit, engine.sequence)
         worst: tuple[float, Step, Fit] | None = None
@@ -329,4 +330,7 @@ def _pruned(engine: Engine, found: Search) -> Search:
         found.steps.remove(worst[1])
         found.fit = worst[2]
         log.info("took back %s", worst[1].chosen.name)
+    added = {step.chosen.name for step in found.steps}
+    for step in found.steps:
+        step.rivals = [rival for rival in step.rivals if rival[0].name not in added]
     return found

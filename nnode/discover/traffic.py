@@ -27,9 +27,9 @@ from nnode.models.extend import extended
 from nnode.models.system import System
 from nnode.models.term import State, Term
 
-#: Longest step of the simulation, s; and relative to the shortest time constant of the states
-#: that terms own, for which Runge and Kutta's method is accurate.
-STEP, STABLE = 0.4, 0.3
+#: Longest step of the simulation, s; steps are no longer than the shortest time constant of the
+#: states that terms own.
+STEP = 0.4
 #: Sequences are compared in windows of about this length, s, each simulated from so much
 #: before (at most a share of the sequence) that its start is forgotten.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
@@ -99,7 +99,7 @@ class TrafficEngine:
         """``(R, K, B, N, W)`` states; their first component are positions, m."""
         batch = self.smoothed
         runs = Ensemble(system, rows, system.scene(batch))
-        longest = min(STEP, STABLE * fastest(system, rows))
+        longest = min(STEP, fastest(system, rows))
         # several samples in a step, or several steps in a sample
         stride = max(1, math.floor(longest / batch.dt + 1e-9))
         steps = max(1, math.ceil(batch.dt / longest - 1e-9))
@@ -277,12 +277,18 @@ def drawn_in(residual: Tensor) -> Tensor:
 def fastest(system: System, rows: Tensor) -> float:
     """The shortest time constant of the states that terms own, s; infinite where none do."""
     names = [name for name, p in trained(system).items() for _ in range(p.numel())]
-    wanted = {f"terms.{i}.{name}" for i, term in enumerate(system.terms) for name in _fast(term)}
-    found = [float(rows[:, j].min()) for j, name in enumerate(names) if name in wanted]
+    factors = {
+        f"terms.{i}.{name}": factor
+        for i, term in enumerate(system.terms)
+        for name, factor in _fast(term).items()
+    }
+    found = [
+        factors[name] * float(rows[:, j].min()) for j, name in enumerate(names) if name in factors
+    ]
     return min(found, default=math.inf)
 
 
-def _fast(term: nn.Module) -> tuple[str, ...]:
+def _fast(term: nn.Module) -> dict[str, float]:
     assert isinstance(term, Term)
     return term.fast
 

@@ -74,14 +74,14 @@ class Term(nn.Module):
         formula: the formula, in the symbols of the parameters.
         source: where the formula stands.
         memory: number M of additional states of each agent that the term owns.
-        fast: names of parameters that are time constants of these states, s.
+        fast: parameters that these states' time constants are proportional to, with the factor.
     """
 
     name: ClassVar[str]
     formula: ClassVar[str]
     source: ClassVar[str]
     memory: ClassVar[int] = 0
-    fast: ClassVar[tuple[str, ...]] = ()
+    fast: ClassVar[dict[str, float]] = {}
 
     def __init__(self) -> None:
         super().__init__()

@@ -101,10 +101,10 @@ class ReactionDelay(Effect):
     domain = "traffic"
     formula = "W(gap(t - T))"
     source = "Newell 1961; Padé's approximation of the delay"
-    strengths = {"T": Strength(0.0, 0.3, Interval(0.15, 3.0), "s")}
+    strengths = {"T": Strength(0.0, 0.3, Interval(0.2, 3.0), "s")}
     rank = 35
     memory = 2
-    fast = ("T",)
+    fast = {"T": 0.29}  # the filter's poles lie at 3.46 / T
     kin = _KIN
     separated_by = _EXCITATION
 
@@ -141,10 +141,10 @@ class Inertia(Effect):
     domain = "traffic"
     formula = "tau_v dv/dt = W - v"
     source = "optimal velocity: Bando et al. 1995"
-    strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.15, 10.0), "s")}
+    strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.2, 10.0), "s")}
     rank = 60
     memory = 1
-    fast = ("tau_v",)
+    fast = {"tau_v": 1.0}
     kin = _KIN
     separated_by = _EXCITATION
 
