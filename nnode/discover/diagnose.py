@@ -111,7 +111,7 @@ def diagnose(
             "open": [sequences[i].name for i in opened],
             "sealed": [sequences[i].name for i in sealed],
         },
-        notes=[],
+        notes=_notes(found, gap),
         seconds=clock.seconds,
         sealed=each,
     )
@@ -191,6 +191,17 @@ def _verdict(found: Search, left: list[Curves], faulty: bool) -> Verdict:
     if left:
         return "unknown"
     return "data_fault" if faulty else "none"
+
+
+def _notes(found: Search, gap: Gap) -> list[str]:
+    """What a reader must know to take the verdict for no more than it is."""
+    if found.steps and not gap.after < gap.before:
+        return [
+            "The errors of positions on the sealed sequences did not become smaller: the effects "
+            "stand out in the open ones, but do not predict the sealed ones better. Take them as "
+            "a lead to follow, not as a finding."
+        ]
+    return []
 
 
 def _gap(

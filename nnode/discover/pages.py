@@ -92,6 +92,8 @@ def page_blocks(
 
 def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
+    if d.notes:
+        blocks.append(Text("\n".join(f"- {note}" for note in d.notes)))
     if has_network(found.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
@@ -217,10 +219,7 @@ def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> lis
     )
     code = "```sh\n" + "\n".join(commands) + "\n```"
     python = f'```python\nimport nnode\n\nmodel = nnode.load("{folder / CHECKPOINT}")\n```'
-    notes: list[Block] = []
-    if d.notes:
-        notes = [Heading("Notes", 3), Text("\n".join(f"- {note}" for note in d.notes))]
-    return [Heading("Using the extended model"), Text(f"{words}\n\n{code}\n\n{python}"), *notes]
+    return [Heading("Using the extended model"), Text(f"{words}\n\n{code}\n\n{python}")]
 
 
 def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
