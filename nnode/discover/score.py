@@ -27,6 +27,9 @@ from nnode.models.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
 FLIPS = 1999
+#: A strength of which the plausible range allows less than this share speaks for something
+#: else; the linear estimate of a strong effect may overshoot.
+FORBIDDEN = 0.2
 #: So many blocks' worth of independent residuals are added to the blocks that give an error.
 PRIOR = 12.0
 
@@ -138,7 +141,8 @@ class Screen:
         if len(probe.steps) == 1 and value != 0:
             # a strength that is not plausible speaks for something else
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
-            statistic, gain = statistic * share, gain * share * (2 - share)
+            if share < FORBIDDEN:
+                statistic, gain = statistic * share, gain * share * (2 - share)
         return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
 
     def _individual(self, found: Individuals) -> Score:
