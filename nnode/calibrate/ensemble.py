@@ -11,7 +11,7 @@ from torch import Tensor
 from nnode.calibrate.cost import Convention, sequence_costs
 from nnode.data.sequence import Batch
 from nnode.models.system import System
-from nnode.models.term import Term
+from nnode.models.term import Interval
 from nnode.solvers.fused.engine import FusedSolver
 
 
@@ -44,11 +44,10 @@ class EnsembleCost:
         self._own = {name: p for name, p in system.named_parameters() if p.requires_grad}
         self.names = list(self._own)
         self._sizes = [p.numel() for p in self._own.values()]
-        limits = _bounds(system)
-        low, high = (
-            [limits.get(name, (-math.inf, math.inf))[side] for name in self.names]
-            for side in (0, 1)
-        )
+        limits = system.bounds()
+        free = Interval()
+        low = [limits.get(name, free).low for name in self.names]
+        high = [limits.get(name, free).high for name in self.names]
         sizes = torch.tensor(self._sizes)
         self.low = torch.tensor(low, dtype=torch.float64).repeat_interleave(sizes)
         self.high = torch.tensor(high, dtype=torch.float64).repeat_interleave(sizes)
@@ -119,12 +118,3 @@ class EnsembleCost:
 
 def _leaves(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().clone().requires_grad_() for name, value in parameters.items()}
-
-
-def _bounds(system: System) -> dict[str, tuple[float, float]]:
-    found = {}
-    for i, term in enumerate(system.terms):
-        assert isinstance(term, Term)
-        for name, interval in term.bounds.items():
-            found[f"terms.{i}.{name}"] = (interval.low, interval.high)
-    return found

@@ -23,7 +23,7 @@ from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.result import Diagnosis, Gap, Verdict
 from nnode.discover.search import Search, search, settled
 from nnode.discover.traffic import TrafficEngine
-from nnode.discover.variables import Curves, curves, significant
+from nnode.discover.variables import Curves, Variable, curves, significant
 from nnode.errors import DataError
 from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.extend import effects_of
@@ -90,19 +90,20 @@ def diagnose(
     located = places(first)
     clock.lap("locate")
     effects = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
-    found, left = _searched(engine, base, effects, options)
+    found, left = _searched(engine, base, effects, variables, options)
     clock.lap("name")
     verdict = _verdict(found, left, bool(faults))
     gap, each = _gap(domain, base_system, found, [sequences[i] for i in sealed])
     clock.lap("sealed")
+    absent = absences(found)
     diagnosis = Diagnosis(
         verdict=verdict,
         domain=domain,
         model="",
         effects=[named(found, step, engine.sequence) for step in found.steps],
         data_faults=[],
-        not_testable=[one.name for one in absences(found) if not one.testable],
-        absences=absences(found),
+        not_testable=[one.name for one in absent if not one.testable],
+        absences=absent,
         places=located,
         unknown=structure(left) if left else None,
         gap=gap,
@@ -125,7 +126,11 @@ def diagnose(
 
 
 def _searched(
-    engine: Engine, base: Fit, effects: list[type[Effect]], options: DiscoverOptions
+    engine: Engine,
+    base: Fit,
+    effects: list[type[Effect]],
+    variables: list[Variable],
+    options: DiscoverOptions,
 ) -> tuple[Search, list[Curves]]:
     """What is named, and the curves of what is left.
 
@@ -136,7 +141,7 @@ def _searched(
     alpha, sure = options.alpha / looks, SURE / looks
     most, seed = options.max_effects, options.seed
     found = search(engine, base, effects, alpha=alpha, most=most, seed=seed)
-    left = significant(curves(engine, found.fit, engine.variables()), sure, LEFT)
+    left = significant(curves(engine, found.fit, variables), sure, LEFT)
     if not isinstance(engine, TrafficEngine):
         return found, left
     engine.whitened = False
@@ -144,7 +149,7 @@ def _searched(
     again = search(
         engine, fit, effects, alpha=alpha, most=most, seed=seed + 1, before=found.steps
     )  # fmt: skip
-    plain = significant(curves(engine, again.fit, engine.variables()), sure, LEFT)
+    plain = significant(curves(engine, again.fit, variables), sure, LEFT)
     engine.whitened = True
     if again.steps != found.steps:
         found = again

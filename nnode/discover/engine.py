@@ -128,6 +128,11 @@ def row_of(system: System) -> Tensor:
     return torch.cat([p.detach().double().flatten() for p in trained(system).values()])
 
 
+def names_of(system: System) -> list[str]:
+    """K names: of the parameter that each number of a row belongs to."""
+    return [name for name, p in trained(system).items() for _ in range(p.numel())]
+
+
 @torch.no_grad()
 def fill(system: System, row: Tensor) -> System:
     """Write a row into the system and return it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,10 @@ import torch
 from scipy import stats
 
 from nnode.calibrate.least_squares import box_step
-from nnode.discover.engine import Engine, fill, row_of, trained
+from nnode.discover.engine import Engine, fill, names_of, row_of
 from nnode.errors import SimulationError
 from nnode.models.system import System
-from nnode.models.term import Term
+from nnode.models.term import Interval
 
 #: Dampings that are tried side by side, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
@@ -80,17 +79,9 @@ def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:
 
 def limits(system: System) -> tuple[np.ndarray, np.ndarray]:
     """``(K,)`` lower and upper bounds of the parameters that are calibrated."""
-    known: dict[str, tuple[float, float]] = {}
-    for i, term in enumerate(system.terms):
-        assert isinstance(term, Term)
-        for name, interval in term.bounds.items():
-            known[f"terms.{i}.{name}"] = (interval.low, interval.high)
-    both = [
-        known.get(name, (-math.inf, math.inf))
-        for name, p in trained(system).items()
-        for _ in range(p.numel())
-    ]
-    return np.array([low for low, _ in both]), np.array([high for _, high in both])
+    known, free = system.bounds(), Interval()
+    both = [known.get(name, free) for name in names_of(system)]
+    return np.array([one.low for one in both]), np.array([one.high for one in both])
 
 
 class _Linear:
@@ -183,5 +174,4 @@ def _fit(
     gradient = jacobian.T @ residual
     at_low, at_high = (row <= low) & (gradient > 0), (row >= high) & (gradient < 0)
     moves = (jacobian**2).sum(0) > 0
-    names = [name for name, p in trained(system).items() for _ in range(p.numel())]
-    return Fit(system, names, row, residual, jacobian, ~(at_low | at_high) & moves)
+    return Fit(system, names_of(system), row, residual, jacobian, ~(at_low | at_high) & moves)

@@ -134,9 +134,7 @@ class Screen:
         options, amounts, errors = dict(probe.options), {}, {}
         for name, value, width in zip(probe.steps, amount, error, strict=False):
             strength = trace.effect.strengths[name]
-            options[name] = float(
-                np.clip(strength.neutral + value, strength.range.low, strength.range.high)
-            )
+            options[name] = strength.at(value)
             amounts[name], errors[name] = float(value), float(width)
         if len(probe.steps) == 1 and value != 0:
             # a strength that is not plausible speaks for something else
@@ -202,9 +200,7 @@ class Screen:
         options = dict(trace.probes[0].options)
         options["a"] = trace.probes[first[i]].options["a"]
         options["b"] = trace.probes[last[i]].options["b"]
-        options[name] = float(
-            np.clip(strength.neutral + amount, strength.range.low, strength.range.high)
-        )
+        options[name] = strength.at(amount)
         return [
             Score(
                 trace.effect, options, float(statistic.max()), 1.0, float(gain[i]),

@@ -87,12 +87,10 @@ class Step:
     Attributes:
         chosen: the candidate.
         rivals: candidates that the data cannot tell from it, with the test against each.
-        scores: of all effects before it was added.
     """
 
     chosen: Candidate
     rivals: list[tuple[Candidate, Comparison]]
-    scores: list[Score]
 
     @property
     def individuals(self) -> Individuals | None:
@@ -109,14 +107,12 @@ class Search:
         steps: in order of acceptance.
         scores: of all effects that are left, against ``fit``.
         screen: that they come from.
-        refused: candidates of the last round that were not accepted.
     """
 
     fit: Fit
     steps: list[Step] = field(default_factory=list)
     scores: list[Score] = field(default_factory=list)
     screen: Screen | None = None
-    refused: list[Candidate] = field(default_factory=list)
 
 
 def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:
@@ -221,7 +217,6 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         and c.strength_excludes_neutral(engine.sequence)
     ]  # fmt: skip
     if not passing:
-        found.refused = candidates
         return None
     best = _simplest(passing)
     rivals = []
@@ -233,7 +228,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         alike = bool(kin) and kin == other.score.effect.kin
         if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
             rivals.append((other, test))
-    return Step(best, rivals, scores)
+    return Step(best, rivals)
 
 
 def _square(engine: Engine, fit: Fit) -> float:
@@ -323,7 +318,7 @@ def _pruned(engine: Engine, found: Search) -> Search:
         for step in found.steps:
             fit = refine(engine, without(found.fit.system, step.chosen.name))
             test = compare(heldout(fit, engine.sequence), losses)
-            if (test.low <= 0) and (worst is None or test.gain < worst[0]):
+            if test.low <= 0 and (worst is None or test.gain < worst[0]):
                 worst = test.gain, step, fit
         if worst is None:
             break

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.engine import Ensemble, Squares, fill, row_of, trained
+from nnode.discover.engine import Ensemble, Squares, fill, names_of, row_of
 from nnode.discover.fit import limits
 from nnode.discover.response import Response
 from nnode.discover.smooth import noise_variance, smooth, velocity
@@ -276,14 +276,15 @@ def drawn_in(residual: Tensor) -> Tensor:
 
 def fastest(system: System, rows: Tensor) -> float:
     """The shortest time constant of the states that terms own, s; infinite where none do."""
-    names = [name for name, p in trained(system).items() for _ in range(p.numel())]
     factors = {
         f"terms.{i}.{name}": factor
         for i, term in enumerate(system.terms)
         for name, factor in _fast(term).items()
     }
     found = [
-        factors[name] * float(rows[:, j].min()) for j, name in enumerate(names) if name in factors
+        factors[name] * float(rows[:, j].min())
+        for j, name in enumerate(names_of(system))
+        if name in factors
     ]
     return min(found, default=math.inf)
 

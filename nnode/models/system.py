@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.models.scene import Scene
-from nnode.models.term import State, Term, physical_parameters
+from nnode.models.term import Interval, State, Term, physical_parameters
 
 T = TypeVar("T", bound=Term)
 
@@ -101,6 +101,14 @@ class System(nn.Module):
     def physical(self) -> dict[str, tuple[Tensor, str]]:
         """Name to (value, unit) of the parameters that have a physical meaning."""
         return physical_parameters(self)
+
+    def bounds(self) -> dict[str, Interval]:
+        """Admissible values by the names of ``named_parameters()``; others are free."""
+        return {
+            f"terms.{i}.{name}": interval
+            for i, term in enumerate(self._terms())
+            for name, interval in term.bounds.items()
+        }
 
     def project_(self) -> None:
         """Move every parameter into its admissible set."""

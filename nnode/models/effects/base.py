@@ -47,6 +47,10 @@ class Strength:
     range: Interval
     unit: str
 
+    def at(self, amount: float) -> float:
+        """The value that differs from the neutral one by an amount, or the nearest plausible."""
+        return float(np.clip(self.neutral + amount, self.range.low, self.range.high))
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -103,8 +107,7 @@ class Effect(Term):
             )
         for name, strength in self.strengths.items():
             # a time constant has no neutral value of its own: the least plausible one stands in
-            least = min(max(strength.neutral, strength.range.low), strength.range.high)
-            value = values.get(name, least)
+            value = values.get(name, strength.at(0.0))
             self.declare(name, value, unit=strength.unit, bounds=strength.range)
         for name, setting in self.settings.items():
             value = values.get(name, setting.value)
