@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nnode.discover.variables import Variable, knots_of
+from nnode.discover.variables import Variable, knots_of, lengths_of
 from nnode.models.crowd import dot
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
@@ -23,6 +23,8 @@ Of = Callable[[State], Tensor]
 
 #: Knots of a curve; of curves along the way, where short waves are possible.
 KNOTS, FINE = 9, 25
+#: The shortest and the longest waves that are looked for, along x in m and in time in s.
+WAY, CLOCK = (1.5, 10.0), (1.5, 10.0)
 #: Width of the kernel of the local density, m.
 KERNEL = 1.0
 #: Distance of the nearest person where there is none, m.
@@ -155,4 +157,15 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
         knots = knots_of(seen, most)
         for level, direction in directions.items():
             found.append(Variable(name, unit, value, knots, direction, level))
+    for name, unit, value, shortest, longest in (
+        ("position x", "m", _position(0), *WAY),
+        ("clock time", "s", _clock, *CLOCK),
+    ):
+        seen = value(state)[agent]
+        low, high = float(seen.min()), float(seen.max())
+        lengths = lengths_of(shortest, longest, high - low)
+        for level, direction in axes.items() if lengths else ():
+            found.append(
+                Variable(f"waves of {name}", unit, value, (low, high), direction, level, lengths)
+            )
     return found

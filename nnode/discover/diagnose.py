@@ -14,23 +14,23 @@ from nnode.data.quality import Fault
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.split import split
 from nnode.discover.crowd import CrowdEngine
-from nnode.discover.engine import Engine, row_of
+from nnode.discover.engine import Engine, row_of, square_of
 from nnode.discover.fit import Fit, evaluated
 from nnode.discover.found import Found
-from nnode.discover.individual import individuals
-from nnode.discover.judge import absences, named, places, structure
+from nnode.discover.individual import individuals, sharpened
+from nnode.discover.judge import STANDS_OUT, absences, named, places, structure
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.result import Diagnosis, Gap, Verdict
 from nnode.discover.search import Search, search, settled
 from nnode.discover.traffic import TrafficEngine
-from nnode.discover.variables import Curves, Variable, curves, significant
+from nnode.discover.variables import Curves, Variable, curves, weighed
 from nnode.errors import DataError
 from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.extend import effects_of
 from nnode.models.system import System
 
-#: Structure that is left counts from this share of the held-out cost on, at this error
-#: probability over all variables.
+#: Structure that is left counts from this share of the squared errors of positions on, at this
+#: error probability over all variables.
 LEFT, SURE = 0.02, 0.01
 #: Named effects do not explain the data where what is left is this share of what they removed.
 TOO_MUCH = 0.5
@@ -86,13 +86,14 @@ def diagnose(
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     variables = engine.variables()
-    first = curves(engine, base, variables)
-    located = places(first)
+    first = weighed(engine, base, curves(engine, base, variables), STANDS_OUT)
+    located = places(first, _excess(engine, base))
     clock.lap("locate")
     effects = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
     found, left = _searched(engine, base, effects, variables, options)
     clock.lap("name")
-    verdict = _verdict(found, left, bool(faults))
+    removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
+    verdict = _verdict(found, left, removed, bool(faults))
     gap, each = _gap(domain, base_system, found, [sequences[i] for i in sealed])
     clock.lap("sealed")
     absent = absences(found)
@@ -132,30 +133,24 @@ def _searched(
     variables: list[Variable],
     options: DiscoverOptions,
 ) -> tuple[Search, list[Curves]]:
-    """What is named, and the curves of what is left.
-
-    Vehicles are looked at twice, each time at half the error probability: in whitened residuals,
-    which are the sharper ones, and in positions as they are, where what lasts can be seen.
-    """
-    looks = 2 if isinstance(engine, TrafficEngine) else 1
-    alpha, sure = options.alpha / looks, SURE / looks
-    most, seed = options.max_effects, options.seed
-    found = search(engine, base, effects, alpha=alpha, most=most, seed=seed)
-    left = significant(curves(engine, found.fit, variables), sure, LEFT)
-    if not isinstance(engine, TrafficEngine):
-        return found, left
-    engine.whitened = False
-    fit = settled(engine, copy.deepcopy(found.fit.system))
-    again = search(
-        engine, fit, effects, alpha=alpha, most=most, seed=seed + 1, before=found.steps
+    """What is named, and the curves of what is left."""
+    found = search(
+        engine, base, effects, alpha=options.alpha, most=options.max_effects, seed=options.seed,
+        variables=variables,
     )  # fmt: skip
-    plain = significant(curves(engine, again.fit, variables), sure, LEFT)
-    engine.whitened = True
-    if again.steps != found.steps:
-        found = again
-    # coefficients come from the sharper residuals
-    found.fit = settled(engine, found.fit.system)
-    return found, max(left, plain, key=lambda one: one[0].gain.gain if one else 0.0)
+    return found, _left(engine, found.fit, variables)
+
+
+def _left(engine: Engine, fit: Fit, variables: list[Variable]) -> list[Curves]:
+    """The curves of what a model leaves, as far as they count."""
+    found = weighed(engine, fit, curves(engine, fit, variables), SURE)
+    return [one for one in found if one.removed > LEFT]
+
+
+def _excess(engine: Engine, fit: Fit) -> float:
+    """Share of the squared errors of positions that is not noise of the measurement."""
+    floor = engine.noise_floor()
+    return 1.0 if np.isnan(floor) else max(1 - floor / square_of(engine, fit.system), 1e-3)
 
 
 def divide(sequences: list[Sequence], options: DiscoverOptions) -> tuple[list[int], list[int]]:
@@ -186,10 +181,10 @@ def divide(sequences: list[Sequence], options: DiscoverOptions) -> tuple[list[in
     return parts.train, parts.heldout
 
 
-def _verdict(found: Search, left: list[Curves], faulty: bool) -> Verdict:
+def _verdict(found: Search, left: list[Curves], removed: float, faulty: bool) -> Verdict:
+    """Args: ``removed``: share of the squared errors that the named effects removed."""
     if found.steps:
-        removed = 1 - float(np.prod([1 - max(step.chosen.gain.gain, 0) for step in found.steps]))
-        if left and left[0].gain.gain > TOO_MUCH * removed:
+        if left and left[0].removed * (1 - removed) > TOO_MUCH * removed:
             return "unknown"
         rivals = any(step.rivals for step in found.steps)
         return "indistinguishable" if rivals else "named"
@@ -260,7 +255,7 @@ def _crossed_costs(
             own = {name: float(getattr(effect, name).detach()) for name in effect.settings}
             one = individuals(engine, fit, kind, own)
             if one is not None:
-                numbers[effect.name] = one.halves
+                numbers[effect.name] = sharpened(engine, plain, one).halves
     parts = []
     for half in (0, 1):
         for effect in effects_of(plain):

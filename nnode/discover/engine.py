@@ -57,7 +57,7 @@ class Engine(Protocol):
         unit: ``(n,)`` number of the agents whose own numbers are estimated together.
         people: of each unit, per direction the sequence and the place of the agent it belongs
             to; one entry where all directions belong to one agent.
-        half: ``(n,)`` 0 or 1: the two halves of an agent's time.
+        half: ``(n,)`` 0 or 1: the two halves of an agent's time; -1 in neither.
     """
 
     batch: Batch
@@ -131,6 +131,11 @@ def row_of(system: System) -> Tensor:
 def names_of(system: System) -> list[str]:
     """K names: of the parameter that each number of a row belongs to."""
     return [name for name, p in trained(system).items() for _ in range(p.numel())]
+
+
+def square_of(engine: Engine, system: System) -> float:
+    """Mean square error of positions, m², every sequence alike."""
+    return float(engine.squares(system, row_of(system)).means().mean())
 
 
 @torch.no_grad()

@@ -94,8 +94,8 @@ def _where(effect: type[Effect], found: dict[str, Coefficient], options: dict[st
 def absences(search: Search) -> list[Absence]:
     """What the final screening says of the effects that were not found."""
     assert search.screen is not None
-    critical = search.screen.critical()
-    return [_absence(score, critical) for score in search.scores]
+    screen = search.screen
+    return [_absence(score, screen.critical(score.effect.name)) for score in search.scores]
 
 
 def _absence(score: Score, critical: float) -> Absence:
@@ -137,14 +137,19 @@ def _relative(effect: type[Effect], name: str, error: float) -> float:
     return error / _plausible(effect, name) if error > 0 else math.inf
 
 
-def places(found: list[Curves]) -> list[Place]:
-    """Where each curve stands out, the one that explains most first."""
+def places(found: list[Curves], excess: float) -> list[Place]:
+    """Where each curve stands out, the one that explains most first.
+
+    Args:
+        found: with what they remove.
+        excess: share of the squared errors that is not noise of the measurement.
+    """
     result = []
     number = sum(len(one.heights) for one in found)
     for one in found:
         tail = normal_tail(one.statistic, number)
         best = int(np.argmin(tail))
-        if tail[best] > STANDS_OUT or one.gain.gain <= 0:
+        if tail[best] > STANDS_OUT or one.removed <= 0:
             continue
         sign = np.sign(one.statistic)
         alike = (sign == sign[best]) & (np.abs(one.statistic) > WIDE)
@@ -165,7 +170,7 @@ def places(found: list[Curves]) -> list[Place]:
                 high=knots[last],
                 deviation=mean,
                 error=float(1 / math.sqrt(weight.sum())),
-                share=one.gain.gain,
+                share=min(one.removed / excess, 1.0),
                 p_value=float(tail[best]),
                 curve={
                     "at": list(knots),
@@ -183,7 +188,7 @@ def structure(found: list[Curves]) -> Structure:
     at = np.array(best.variable.knots)
     return Structure(
         variables=[one.variable.name for one in found],
-        gain=best.gain.gain,
+        gain=best.removed,
         hint=symbolic(best.variable.name, at, best.heights, best.errors),
         curve={"at": at.tolist(), "deviation": best.heights.tolist()},
     )

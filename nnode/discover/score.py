@@ -3,11 +3,13 @@
 The trace of an effect is the change of the residuals by a small strength of it. What
 recalibration of the model's own parameters can absorb is taken out of it, so that only the rest
 counts. Sums over blocks that are independent of each other may change their sign together
-without changing their distribution where nothing is hidden; the largest statistic over all
-effects is compared with its distribution under such flips.
+without changing their distribution where nothing is hidden. Each effect's statistic is compared
+with its own distribution under such flips, and the least of these p-values over all effects with
+the distribution of the least: a search over many intervals, whose largest statistic is large by
+chance, does not raise the bar for the others.
 
 Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Westfall & Young 1993
-(maximum over hypotheses).
+(least p-value over hypotheses).
 """
 
 from __future__ import annotations
@@ -30,8 +32,10 @@ FLIPS = 1999
 #: A strength of which the plausible range allows less than this share speaks for something
 #: else; the linear estimate of a strong effect may overshoot.
 FORBIDDEN = 0.2
-#: So many blocks' worth of independent residuals are added to the blocks that give an error.
+#: So many usual blocks are added to the blocks that give an error.
 PRIOR = 12.0
+#: Median of the square of a standard normal variable.
+MEDIAN = 0.4549
 
 
 @dataclass
@@ -89,46 +93,69 @@ class Screen:
         fit: the calibrated model.
         block: ``(n,)`` see :class:`~nnode.discover.engine.Engine`.
         seed: of the sign flips.
+        flips: their number.
     """
 
-    def __init__(self, fit: Fit, block: np.ndarray, seed: int = 0) -> None:
+    def __init__(self, fit: Fit, block: np.ndarray, seed: int = 0, flips: int = FLIPS) -> None:
         self.fit, self.block = fit, block
         self.residual = fit.residual
         self.variance = fit.cost / len(fit.residual)
         self._basis = _orthonormal(fit.tangents)
-        self._flips = np.random.default_rng(seed).choice([-1.0, 1.0], (FLIPS, int(block.max()) + 1))
-        self._largest = np.zeros(FLIPS)
+        self._flips = np.random.default_rng(seed).choice([-1.0, 1.0], (flips, int(block.max()) + 1))
+        #: of each effect's name the largest statistic of its probes under each flip
+        self._chance: dict[str, np.ndarray] = {}
+        self._least = np.ones(flips + 1)
 
     def beyond(self, columns: np.ndarray) -> np.ndarray:
         """``columns`` without what the model's own parameters can do."""
         rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
         return rest
 
+    def flipped(self, parts: np.ndarray) -> np.ndarray:
+        """``(1 + F, C)`` sums of the blocks ``(blocks, C)``, as they are and with every flip."""
+        total: np.ndarray = self._flips @ parts
+        return np.concatenate([parts.sum(0)[None], total])
+
     def scores(self, found: Iterable[Trace], individual: Iterable[Individuals] = ()) -> list[Score]:
         """The best trace of each effect, the one that explains most first."""
         best = {one.effect.name: self._individual(one) for one in individual}
+        largest = {name: score.statistic for name, score in best.items()}
         for trace in found:
             scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
             for score in scores:
-                known = best.get(score.effect.name)
+                name, known = score.effect.name, best.get(score.effect.name)
+                largest[name] = max(largest.get(name, 0.0), score.statistic)
                 if known is None or score.gain > known.gain:
-                    best[score.effect.name] = score
-        for score in best.values():
-            score.p_value = self._p_value(score.statistic)
+                    best[name] = score
+        if best:
+            self._judge(best, largest)
         return sorted(best.values(), key=lambda score: -score.gain)
 
-    def critical(self, alpha: float = 0.05) -> float:
-        """The statistic that the largest one passes with probability ``alpha`` by chance."""
-        return float(np.quantile(self._largest, 1 - alpha))
+    def _judge(self, best: dict[str, Score], largest: dict[str, float]) -> None:
+        """P-values with regard to all effects."""
+        # the data themselves are one of the flips
+        every = np.stack([np.append(largest[name], self._chance[name]) for name in best])
+        rank = FLIPS + 2 - stats.rankdata(every, method="min", axis=1)
+        share = rank / (FLIPS + 1)
+        self._least = share.min(0)
+        for score, own in zip(best.values(), share[:, 0], strict=True):
+            score.p_value = float((self._least <= own + 1e-12).mean())
 
-    def _p_value(self, statistic: float) -> float:
-        return float((1 + (self._largest >= statistic - 1e-9).sum()) / (1 + FLIPS))
+    def critical(self, name: str, alpha: float = 0.05) -> float:
+        """The statistic of an effect that it passes where the least p-value of all does so with
+        probability ``alpha`` by chance."""
+        share = float(np.quantile(self._least, alpha))
+        return float(np.quantile(self._chance[name], 1 - share))
+
+    def _by_chance(self, name: str, statistics: np.ndarray) -> None:
+        """Note an effect's statistics ``(F,)`` under the flips."""
+        self._chance[name] = np.maximum(self._chance.get(name, 0.0), statistics)
 
     def _single(self, trace: Trace) -> Score:
         z = self.beyond(trace.columns)
         parts = sums(z * self.residual[:, None], self.block)
         grams = self._grams(z)
-        statistic = self._joint(parts, grams)
+        statistic, chance = self._joint(parts, grams)
         amount, error, gain = self._estimate(parts, grams)
         (probe,) = trace.probes
         options, amounts, errors = dict(probe.options), {}, {}
@@ -141,6 +168,7 @@ class Screen:
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
             if share < FORBIDDEN:
                 statistic, gain = statistic * share, gain * share * (2 - share)
+        self._by_chance(trace.effect.name, chance)
         return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
 
     def _individual(self, found: Individuals) -> Score:
@@ -153,7 +181,7 @@ class Screen:
         # the products of independent scores have variance 1
         rest = (products**2).sum() - total**2 / number + PRIOR
         each = total / np.sqrt(rest * number / (number + PRIOR))
-        self._largest = np.maximum(self._largest, each[1:])
+        self._by_chance(found.effect.name, each[1:])
         (name,) = found.effect.strengths
         options = {**found.options, name: found.sigma, "people": found.people}
         error = (found.interval[1] - found.interval[0]) / 4
@@ -183,9 +211,10 @@ class Screen:
         if not size.size:
             return []
         first, last = first[usable], last[usable]
-        statistic = self._standardised(each, sizes, np.ones((1, len(each))))
-        flipped = self._standardised(each, sizes, self._flips)
-        self._largest = np.maximum(self._largest, flipped.max(1))
+        usual = self._usual(parts, np.einsum("bii->bi", grams))
+        statistic = self._standardised(each, sizes, np.ones((1, len(each))), usual)
+        flipped = self._standardised(each, sizes, self._flips, usual)
+        self._by_chance(trace.effect.name, flipped.max(1))
         total = each.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
         i = int(np.argmax(gain))
@@ -195,7 +224,7 @@ class Screen:
         rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
         blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
         error = (
-            np.sqrt((blocks * rest + PRIOR * self.variance * size[i]) / (blocks + PRIOR)) / size[i]
+            np.sqrt((blocks * rest + PRIOR * usual * size[i]) / (blocks + PRIOR)) / size[i]
         )
         options = dict(trace.probes[0].options)
         options["a"] = trace.probes[first[i]].options["a"]
@@ -208,16 +237,31 @@ class Screen:
             )
         ]  # fmt: skip
 
-    def _standardised(self, parts: np.ndarray, sizes: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    def _usual(self, parts: np.ndarray, sizes: np.ndarray) -> float:
+        """Variance of a block's score in units of its information.
+
+        The residuals' own variance if they were independent; more where they last. The median
+        does not mind some blocks in which there is an effect.
+        """
+        known = sizes > 1e-9 * max(float(sizes.max()), 1e-300)
+        if not known.any():
+            return self.variance
+        found = float(np.median(parts[known] ** 2 / sizes[known])) / MEDIAN
+        return max(found, self.variance)
+
+    def _standardised(
+        self, parts: np.ndarray, sizes: np.ndarray, signs: np.ndarray, usual: float
+    ) -> np.ndarray:
         """``(F, C)`` absolute sums on the scale of a standard normal variable.
 
         What the effect itself explains is no part of the error; otherwise no statistic could
         exceed the root of the number of blocks. Where few blocks carry the information, the
-        error is drawn towards the one that independent residuals would give.
+        error is drawn towards the usual one.
 
         Args:
             parts, sizes: ``(blocks, C)`` scores and their information.
             signs: ``(F, blocks)``.
+            usual: see :meth:`_usual`.
         """
         total, squares, size = signs @ parts, (parts**2).sum(0), sizes.sum(0)
         empty = ~(size > 0)
@@ -227,7 +271,7 @@ class Screen:
         amount = total / size
         rest = squares - 2 * amount * (signs @ (parts * sizes)) + amount**2 * (sizes**2).sum(0)
         blocks = size**2 / (sizes**2).sum(0)
-        variance = (blocks * np.maximum(rest, 0) + PRIOR * self.variance * size) / (blocks + PRIOR)
+        variance = (blocks * np.maximum(rest, 0) + PRIOR * usual * size) / (blocks + PRIOR)
         return _wallace(total**2 / variance, blocks + PRIOR - 1)
 
     def _grams(self, z: np.ndarray) -> np.ndarray:
@@ -239,14 +283,15 @@ class Screen:
             found[self.block[rows[0]]] = z[rows].T @ z[rows]
         return found
 
-    def _joint(self, parts: np.ndarray, grams: np.ndarray) -> float:
-        """A statistic of the k sums ``(blocks, k)`` together; keeps its values under flips."""
+    def _joint(self, parts: np.ndarray, grams: np.ndarray) -> tuple[float, np.ndarray]:
+        """A statistic of the k sums ``(blocks, k)`` together, and its values under flips."""
         k = parts.shape[1]
         if k == 1:
             sizes = grams[:, :, 0]
-            flipped = self._standardised(parts, sizes, self._flips)
-            self._largest = np.maximum(self._largest, flipped[:, 0])
-            return float(self._standardised(parts, sizes, np.ones((1, len(parts))))[0, 0])
+            usual = self._usual(parts, sizes)
+            flipped = self._standardised(parts, sizes, self._flips, usual)
+            own = self._standardised(parts, sizes, np.ones((1, len(parts))), usual)
+            return float(own[0, 0]), flipped[:, 0]
         signs = np.concatenate([np.ones((1, len(parts))), self._flips])
         total = signs @ parts
         amount = total @ np.linalg.pinv(grams.sum(0), rcond=1e-10)
@@ -255,13 +300,13 @@ class Screen:
         size = np.trace(grams, axis1=1, axis2=2)
         blocks = float(size.sum() ** 2 / (size**2).sum())
         spread = np.einsum("fbi,fbj->fij", rest, rest)
-        spread = (blocks * spread + PRIOR * self.variance * whole) / (blocks + PRIOR)
+        usual = self._usual(parts, np.einsum("bii->bi", grams))
+        spread = (blocks * spread + PRIOR * usual * whole) / (blocks + PRIOR)
         spread += 1e-12 * np.trace(whole) * np.eye(k)
         squares = np.einsum("fi,fi->f", total, np.linalg.solve(spread, total[..., None])[..., 0])
         degrees = np.array(blocks + PRIOR - 1)
         found = _normal(_wallace(squares, degrees) ** 2, k)
-        self._largest = np.maximum(self._largest, found[1:])
-        return float(found[0])
+        return float(found[0]), found[1:]
 
     def _estimate(
         self, parts: np.ndarray, grams: np.ndarray

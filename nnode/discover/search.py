@@ -7,13 +7,13 @@ import logging
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from nnode.discover.compare import Comparison, compare, heldout
-from nnode.discover.engine import Engine, row_of
+from nnode.discover.engine import Engine, row_of, square_of
 from nnode.discover.fit import Fit, evaluated, refine, sums
-from nnode.discover.individual import Individuals, individuals
+from nnode.discover.individual import Individuals, individuals, sharpened
 from nnode.discover.score import Score, Screen, Trace, traces
+from nnode.discover.variables import Variable, curves
 from nnode.errors import SimulationError
 from nnode.models.effects import Effect, IndividualEffect
 from nnode.models.extend import effects_of, extended, without
@@ -29,10 +29,17 @@ RIVAL = 0.25
 RIVALS = 5
 #: A rival whose held-out gain is below this share of the best one's is told apart from it.
 CLOSE = 0.8
+#: A curve counts as better than an effect from this much more held-out gain on, at this error
+#: probability: an interval that was looked for is flattered, and no name is better than a wrong
+#: one.
+MARGIN, RATHER = 0.1, 0.35
 #: Calibrations of rivals end where a step lowers the cost by less than this share.
 ROUGH = 1e-3
 #: An interval is moved at most so many times.
 SHIFTS = 3
+#: An effect must predict sequences that a calibration left out better, at this error probability.
+#: False alarms are held by its score; an effect that acts in few sequences helps few of them.
+BETTER = 0.05
 #: Two rivals are told apart at this error probability; two of a kin at a smaller one.
 APART, KIN_APART = 0.05, 0.01
 
@@ -64,20 +71,18 @@ class Candidate:
 
     def strength_excludes_neutral(self, sequence: np.ndarray) -> bool:
         """Whether the interval of any of its strengths excludes the neutral value."""
-        if self.individuals is not None:
-            return self.individuals.interval[0] > 0
+        if self.individuals is not None and self.individuals.interval[0] <= 0:
+            return False
         intervals = self.fit.intervals(sequence)
         place = next(
             i for i, t in enumerate(self.fit.system.terms) if getattr(t, "name", "") == self.name
         )
-        strengths = self.score.effect.strengths
-        if not strengths:
-            return True
-        for name, strength in strengths.items():
-            low, high = intervals[self.fit.names.index(f"terms.{place}.{name}")]
-            if low > strength.neutral or high < strength.neutral:
-                return True
-        return False
+        known = [
+            (strength.neutral, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
+            for name, strength in self.score.effect.strengths.items()
+            if f"terms.{place}.{name}" in self.fit.names
+        ]
+        return not known or any(low > neutral or high < neutral for neutral, low, high in known)
 
 
 @dataclass
@@ -132,7 +137,7 @@ def search(
     alpha: float = 0.05,
     most: int = 4,
     seed: int = 0,
-    before: list[Step] | None = None,
+    variables: list[Variable] | None = None,
 ) -> Search:
     """Forwards until no effect passes, then backwards.
 
@@ -143,9 +148,10 @@ def search(
         alpha: probability of naming anything where nothing is hidden.
         most: effects at most.
         seed: of the sign flips.
-        before: steps that led to ``fit``.
+        variables: no effect is accepted where a curve of one of these predicts better: it is a
+            sign of something that the catalogue lacks.
     """
-    found = Search(fit, list(before or []))
+    found = Search(fit)
     while True:
         own = {effect.name for effect in effects_of(found.fit.system)}
         left = [effect for effect in effects if effect.name not in own]
@@ -155,7 +161,7 @@ def search(
         if len(found.steps) >= most:
             break
         step = _round(engine, found, look, alpha)
-        if step is None:
+        if step is None or _outdone(engine, found.fit, step.chosen, variables or []):
             break
         found.steps.append(step)
         found.fit = settled(engine, step.chosen.fit.system, rounds=1)
@@ -193,7 +199,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     most = max(score.gain for score in scores)
     tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
     before = heldout(found.fit, engine.sequence)
-    square = _square(engine, found.fit)
+    square = square_of(engine, found.fit.system)
     candidates: list[Candidate] = []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
@@ -206,14 +212,14 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         if one is not None:
             # numbers from one half of the time, tried on the other
             losses = before * one.losses / sums(found.fit.residual**2, engine.sequence)
-        removed = 1 - _square(engine, fit) / square
+        removed = 1 - square_of(engine, fit.system) / square
         candidates.append(Candidate(score, fit, losses, compare(before, losses), removed, one))
     candidates.sort(key=lambda c: -c.gain.gain)
     passing = [
         c for c in candidates
         if c.score.p_value <= alpha
         and c.removed >= FLOOR
-        and c.gain.low > 0
+        and c.gain.p_value < BETTER
         and c.strength_excludes_neutral(engine.sequence)
     ]  # fmt: skip
     if not passing:
@@ -231,9 +237,15 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     return Step(best, rivals)
 
 
-def _square(engine: Engine, fit: Fit) -> float:
-    """Mean square error of positions, m²."""
-    return float(engine.squares(fit.system, torch.from_numpy(fit.row)).means().mean())
+def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
+    """Whether a curve without a formula predicts better than an effect."""
+    for curve in curves(engine, fit, variables) if variables else []:
+        better = curve.gain.gain > (1 + MARGIN) * best.gain.gain
+        if better and curve.p_value < APART:
+            test = compare(best.losses, curve.losses)
+            if test.p_value < RATHER:
+                return True
+    return False
 
 
 def _calibrated(engine: Engine, before: Fit, score: Score, hopeless: float) -> Fit:
@@ -289,6 +301,8 @@ def _again(engine: Engine, fit: Fit, chosen: Candidate) -> Fit:
         return fit
     own = next(effect for effect in effects_of(fit.system) if isinstance(effect, kind))
     system, _ = extended(plain.system, kind(**{**own.options(), "people": one.people}))
+    one = sharpened(engine, system, one)
+    next(effect for effect in effects_of(system) if isinstance(effect, kind)).people = one.people
     chosen.individuals = one
     return refine(engine, system)
 
@@ -318,7 +332,7 @@ def _pruned(engine: Engine, found: Search) -> Search:
         for step in found.steps:
             fit = refine(engine, without(found.fit.system, step.chosen.name))
             test = compare(heldout(fit, engine.sequence), losses)
-            if test.low <= 0 and (worst is None or test.gain < worst[0]):
+            if test.p_value > BETTER and (worst is None or test.gain < worst[0]):
                 worst = test.gain, step, fit
         if worst is None:
             break

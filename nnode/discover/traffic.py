@@ -33,6 +33,9 @@ STEP = 0.4
 #: Sequences are compared in windows of about this length, s, each simulated from so much
 #: before (at most a share of the sequence) that its start is forgotten.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
+#: The halves of a sequence's time are so much of it each: drivers' moods last some seconds, and
+#: neighbouring halves would share the one between them.
+HALF = 0.36
 #: Whitened residuals beyond this count less.
 LARGE = 6.0
 #: Most past samples that a filter looks at.
@@ -54,9 +57,7 @@ class TrafficEngine:
     Attributes:
         unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
         people: of each unit, per direction the sequence and the place of its agent.
-        half: ``(n,)`` 0 or 1: the two halves of a sequence's time.
-        whitened: False compares positions as they are. A filter that is fitted to what a model
-            leaves takes a lasting deviation for noise with a long memory.
+        half: ``(n,)`` 0 or 1: the two halves of a sequence's time; -1 between them.
     """
 
     def __init__(self, sequences: list[Sequence], window: float = WINDOW) -> None:
@@ -76,14 +77,12 @@ class TrafficEngine:
         time = torch.arange(self.batch.n_samples)[:, None]
         self.seen = self.follows & (time > torch.tensor(first))[..., None]
         self.filter = PlatoonFilter.none()
-        self.whitened = True
         self._last: tuple[System, Tensor, Tensor] | None = None
         self._response: tuple[System, Tensor, Response] | None = None
         k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
         self.block, self.sequence = b, owner[b]
-        middle = np.array([(s.time[0] + s.time[-1]) / 2 for s in sequences])
         clock = self.batch.start.numpy()[b] + k * self.batch.dt
-        self.half = (clock > middle[self.sequence] + 1e-6).astype(int)
+        self.half = _parts(clock, self.sequence)
         self.unit = self.sequence
         self.people = [
             [(i, n) for n in range(self.batch.agent.shape[1])] for i in range(len(sequences))
@@ -257,10 +256,17 @@ class TrafficEngine:
         shortest = int(self.batch.valid.any(-1).sum(0).min())
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
-        if not self.whitened:
-            self.filter = PlatoonFilter.none(max(float(away[self.seen].std()), 1e-9))
-            return
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
+
+
+def _parts(clock: np.ndarray, sequence: np.ndarray) -> np.ndarray:
+    """0 early, 1 late, -1 in the middle of each sequence's time."""
+    number = int(sequence.max()) + 1
+    first, last = np.full(number, np.inf), np.full(number, -np.inf)
+    np.minimum.at(first, sequence, clock)
+    np.maximum.at(last, sequence, clock)
+    at = (clock - first[sequence]) / np.maximum(last - first, 1e-9)[sequence]
+    return np.where(at < HALF, 0, np.where(at > 1 - HALF, 1, -1))
 
 
 def drawn_in(residual: Tensor) -> Tensor:

@@ -8,9 +8,14 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
-from nnode.discover.variables import Variable, knots_of
+from nnode.discover.variables import Variable, knots_of, lengths_of
 from nnode.models.effects.traffic import gaps, rate_of
 from nnode.models.term import State
+
+#: Knots of a curve.
+KNOTS = 33
+#: The shortest and the longest waves that are looked for, along the road in m and in time in s.
+ROAD, CLOCK = (30.0, 300.0), (5.0, 60.0)
 
 
 def _followers(state: State) -> Tensor:
@@ -95,7 +100,16 @@ def traffic_variables(batch: Batch) -> list[Variable]:
 
     def of(name: str, unit: str, value: Callable[[State], Tensor], seen_values: Tensor) -> Variable:
         values = seen_values.expand(x.shape)[seen].numpy().astype(float)
-        return Variable(name, unit, value, knots_of(values), _followers)
+        return Variable(name, unit, value, knots_of(values, KNOTS), _followers)
+
+    def waves(name: str, unit: str, value: Callable[[State], Tensor], seen_values: Tensor,
+              shortest: float, longest: float) -> list[Variable]:
+        values = seen_values.expand(x.shape)[seen]
+        low, high = float(values.min()), float(values.max())
+        lengths = lengths_of(shortest, longest, high - low)
+        if not lengths:
+            return []
+        return [Variable(f"waves of {name}", unit, value, (low, high), _followers, "", lengths)]
 
     return [
         of("gap", "m", _gap, gap),
@@ -108,4 +122,6 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         of("clock time", "s", _clock, clock),
         of("time since the start", "s", _since_start(first), since),
         of("place in the platoon", "1", _rank, rank.to(x.dtype)),
+        *waves("position", "m", _position, x, *ROAD),
+        *waves("clock time", "s", _clock, clock, max(CLOCK[0], 4 * batch.dt), CLOCK[1]),
     ]  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,13 +12,27 @@ from scipy import stats
 from torch import Tensor
 
 from nnode.discover.compare import Comparison, compare, heldout
-from nnode.discover.engine import Engine
-from nnode.discover.fit import Fit, sums
+from nnode.discover.engine import Engine, fill, square_of
+from nnode.discover.fit import Fit, limits, refine, sums
 from nnode.discover.score import Screen
-from nnode.models.term import State
+from nnode.errors import SimulationError
+from nnode.models.system import System
+from nnode.models.term import Interval, State, Term
 
-#: Strengths of smoothing of a curve, relative to its information, that are tried.
-RIDGES = (1e-3, 1e-2, 1e-1, 1.0)
+#: A curve may bend about so many times; several are tried.
+BENDS = (2, 5, 12)
+#: Heights are drawn to zero by this share of their mean information.
+RIDGE = 1e-3
+#: Sign flips that p-values of curves come from: there are many curves.
+FLIPS = 7999
+#: Calibrations end where a step lowers the cost by less than this share.
+ROUGH = 1e-3
+#: At most so many curves are calibrated with the model, those that predict best.
+MOST = 6
+#: Columns that are computed at once.
+CHUNK = 128
+#: Knots over which a wave is reported, and its lengths that they span.
+WAVE_KNOTS, WAVES = 17, 2.0
 
 
 @dataclass(frozen=True)
@@ -32,6 +47,7 @@ class Variable:
             them it is constant.
         direction: of a state, ``(B, N, D)``: the deviation is a number times this.
         level: names of the direction, for pages.
+        lengths: of waves, in ``unit``, that are looked for in place of a curve.
     """
 
     name: str
@@ -40,6 +56,31 @@ class Variable:
     knots: tuple[float, ...]
     direction: Callable[[State], Tensor]
     level: str = ""
+    lengths: tuple[float, ...] = ()
+
+    def weights(self, state: State) -> Tensor:
+        """``(B, N, M)`` of the M heights of a curve, or sine and cosine of every wave."""
+        value = self.value(state)
+        if self.lengths:
+            turn = 2 * torch.pi / torch.tensor(self.lengths, dtype=value.dtype)
+            angle = value[..., None] * turn
+            return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+        return hats(value, self.knots)
+
+    def wave(self, number: int) -> Variable:
+        """One wave alone."""
+        length = self.lengths[number]
+        first = self.knots[0]
+        knots = tuple(first + float(s) * length for s in np.linspace(0, WAVES, WAVE_KNOTS))
+        return replace(self, lengths=(length,), knots=knots)
+
+    def heights(self, amounts: np.ndarray) -> np.ndarray:
+        """``(knots, ...)`` a curve at the knots by the amounts ``(M, ...)`` of its weights."""
+        if not self.lengths:
+            return amounts
+        turn = 2 * np.pi * np.array(self.knots) / self.lengths[0]
+        found: np.ndarray = np.stack([np.sin(turn), np.cos(turn)], 1) @ amounts
+        return found
 
 
 def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:
@@ -65,88 +106,216 @@ def knots_of(values: np.ndarray, most: int = 9) -> tuple[float, ...]:
     return tuple(float(knot) for knot in kept)
 
 
+def lengths_of(shortest: float, longest: float, span: float, most: int = 600) -> tuple[float, ...]:
+    """Lengths of waves that data over ``span`` tell apart; the shorter ones are left out where
+    there are too many."""
+    low, high = 1 / min(longest, span / 2), 1 / shortest
+    number = min(int((high - low) * 2 * span), most) if span > 0 else 0
+    return tuple(1 / (low + k / (2 * span)) for k in range(number))
+
+
 @dataclass
 class Curves:
     """A curve of one variable in the residuals of a calibrated model.
 
     Attributes:
-        variable: see :class:`Variable`.
-        heights, errors: at the knots, beyond what the model can do, m/s or m/s².
-        gain: over the model without it, held out by sequence.
-        p_value: that it is no better, for this variable alone.
-        statistic: ``(M,)`` of each knot, in its standard error.
+        variable: see :class:`Variable`; the best wave of several.
+        amounts: ``(M,)`` of the variable's weights, beyond what the model can do.
+        heights, errors: at the knots, m/s or m/s².
+        losses: ``(S,)`` held-out costs with the curve.
+        gain: over the model without it.
+        p_value: that there is nothing, with regard to all variables.
+        shift: ``(K,)`` of the model's own parameters beside the curve.
+        removed: share of the squared errors of positions that it removes; NaN until it is asked
+            for, see :func:`weighed`.
     """
 
     variable: Variable
+    amounts: np.ndarray
     heights: np.ndarray
     errors: np.ndarray
+    losses: np.ndarray
     gain: Comparison
-    statistic: np.ndarray
+    p_value: float
+    shift: np.ndarray
+    removed: float = float("nan")
 
     @property
-    def p_value(self) -> float:
-        """One-sided, of the held-out gain."""
-        return self.gain.p_value
+    def statistic(self) -> np.ndarray:
+        """Of each knot, in its standard error."""
+        found: np.ndarray = self.heights / self.errors
+        return found
+
+
+class Curve(Term):
+    """A curve as a term of a model: the flexible fit of what is left."""
+
+    name = "curve"
+    formula = "f(variable)"
+    source = "a curve without a formula, fitted to what a model leaves"
+
+    def __init__(self, variable: Variable, amounts: np.ndarray) -> None:
+        super().__init__()
+        self.variable = variable
+        self.amounts = torch.from_numpy(amounts)
+        self.declare("scale", 1.0, unit="1", bounds=Interval(0.0, 2.0))
+
+    def forward(self, state: State) -> Tensor:
+        amount = self.scale * (self.variable.weights(state) @ self.amounts)
+        return amount[..., None] * self.variable.direction(state)
 
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
-    """``(n, M)`` changes of the residuals per unit of the curve's heights."""
+    """``(n, M)`` changes of the residuals per unit of the curve's weights."""
+    total = 2 * len(variable.lengths) or len(variable.knots)
+    row, found = torch.from_numpy(fit.row), []
+    for first in range(0, total, CHUNK):
+        part = slice(first, first + CHUNK)
 
-    def rates(state: State) -> list[Tensor]:
-        weights, way = hats(variable.value(state), variable.knots), variable.direction(state)
-        return [weight[..., None] * way for weight in weights.unbind(-1)]
+        def rates(state: State, part: slice = part) -> list[Tensor]:
+            weights, way = variable.weights(state)[..., part], variable.direction(state)
+            return [weight[..., None] * way for weight in weights.unbind(-1)]
 
-    return engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
+        found.append(engine.response(fit.system, row, rates).numpy().T)
+    return np.concatenate(found, 1)
 
 
-def curves(engine: Engine, fit: Fit, variables: list[Variable]) -> list[Curves]:
-    """The curve of every variable by itself, the one that explains most first."""
-    screen = Screen(fit, engine.block)
+def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -> list[Curves]:
+    """The best curve or wave of every variable, the one that explains most first.
+
+    Args:
+        seed: of the sign flips, see :mod:`nnode.discover.score`.
+    """
+    screen = Screen(fit, engine.block, seed, FLIPS)
     before = heldout(fit, engine.sequence)
-    found = [_curve(engine, fit, screen, before, variable) for variable in variables]
+    looks = [_Look(engine, fit, screen, variable) for variable in variables]
+    every = np.stack([squares for look in looks for squares in look.squares])
+    rank = every.shape[1] + 1 - stats.rankdata(every, method="min", axis=1)
+    share = rank / every.shape[1]
+    least = share.min(0)
+    found, first = [], 0
+    for look in looks:
+        own = share[first : first + len(look.squares), 0].min()
+        first += len(look.squares)
+        found.append(look.best(before, float((least <= own + 1e-12).mean())))
     return sorted(found, key=lambda one: -one.gain.gain)
 
 
-def _curve(
-    engine: Engine, fit: Fit, screen: Screen, before: np.ndarray, variable: Variable
-) -> Curves:
-    z = screen.beyond(columns_of(engine, fit, variable))
-    sequence = engine.sequence
-    count = int(sequence.max()) + 1
-    gram = np.zeros((count, z.shape[1], z.shape[1]))
-    score = np.zeros((count, z.shape[1]))
-    for s in range(count):
-        own = sequence == s
-        gram[s], score[s] = z[own].T @ z[own], -z[own].T @ fit.residual[own]
-    whole, total = gram.sum(0), score.sum(0)
-    size = float(np.trace(whole)) / len(whole)
-    plain = sums(fit.residual**2, sequence)
-    best: np.ndarray | None = None
-    chosen = RIDGES[0]
-    for ridge in RIDGES:
-        penalty = ridge * size * np.eye(len(whole))
-        heights = np.linalg.solve(whole - gram + penalty, (total - score)[..., None])[..., 0]
-        change = np.einsum("sm,smn,sn->s", heights, gram, heights) - 2 * (heights * score).sum(1)
-        if best is None or change.sum() < best.sum():
-            best, chosen = change, ridge
-    assert best is not None
-    # relative to the model's own held-out cost
-    losses = before * np.maximum(1 + best / np.maximum(plain, 1e-300), 0.0)
-    inverse = np.linalg.inv(whole + chosen * size * np.eye(len(whole)))
-    heights = inverse @ total
-    blocks = sums(z * fit.residual[:, None], engine.block)
-    errors = np.sqrt(np.maximum(np.diag(inverse @ (blocks.T @ blocks) @ inverse), 1e-300))
-    return Curves(variable, heights, errors, compare(before, losses), heights / errors)
+class _Look:
+    """All curves of one variable.
+
+    Attributes:
+        squares: per kind of curve what it explains in the data and ``(1 + F,)`` under sign
+            flips: of a curve one per strength of smoothing, of waves the largest of all.
+    """
+
+    def __init__(self, engine: Engine, fit: Fit, screen: Screen, variable: Variable) -> None:
+        self.engine, self.fit, self.variable = engine, fit, variable
+        columns = columns_of(engine, fit, variable)
+        self.z = screen.beyond(columns)
+        self.parts = sums(self.z * fit.residual[:, None], engine.block)
+        self.total = screen.flipped(self.parts)
+        self.absorbed = np.linalg.lstsq(fit.jacobian, columns, rcond=1e-9)[0]
+        self.squares: list[np.ndarray] = []
+        if variable.lengths:
+            self._look_for_waves()
+        else:
+            self._look_for_curves()
+
+    def _look_for_curves(self) -> None:
+        whole = self.z.T @ self.z
+        number = len(whole)
+        bend = np.diff(np.eye(number), 2, axis=0)
+        size = max(float(np.trace(whole)) / number, 1e-300)
+        self.penalties = []
+        for bends in BENDS:
+            smooth = (number / (np.pi * bends)) ** 4 * bend.T @ bend
+            self.penalties.append(size * (smooth + RIDGE * np.eye(number)))
+            solved = np.linalg.solve(whole + self.penalties[-1], self.total.T)
+            self.squares.append((self.total.T * solved).sum(0))
+
+    def _look_for_waves(self) -> None:
+        z, total = self.z, self.total
+        sine, cosine = z[:, ::2], z[:, 1::2]
+        a, b = (sine**2).sum(0), (sine * cosine).sum(0)
+        c = (cosine**2).sum(0)
+        determinant = np.maximum(a * c - b**2, 1e-12 * (a * c + 1e-300))
+        s, t = total[:, ::2], total[:, 1::2]
+        squares = (c * s**2 - 2 * b * s * t + a * t**2) / determinant
+        self.squares.append(squares.max(1))
+        best = int(np.argmax(squares[0]))
+        own = slice(2 * best, 2 * best + 2)
+        self.variable = self.variable.wave(best)
+        self.z, self.parts, self.absorbed = z[:, own], self.parts[:, own], self.absorbed[:, own]
+        self.penalties = [np.zeros((2, 2))]
+
+    def best(self, before: np.ndarray, p_value: float) -> Curves:
+        """With the smoothing that predicts best.
+
+        Args:
+            before: ``(S,)`` held-out costs without a curve.
+            p_value: with regard to all variables.
+        """
+        sequence = self.engine.sequence
+        plain = sums(self.fit.residual**2, sequence)
+        count, number = len(plain), self.z.shape[1]
+        gram, score = np.zeros((count, number, number)), np.zeros((count, number))
+        for s in range(count):
+            own = sequence == s
+            gram[s], score[s] = self.z[own].T @ self.z[own], -self.z[own].T @ self.fit.residual[own]
+        whole, total = gram.sum(0), score.sum(0)
+        change, penalty = np.full(count, np.inf), self.penalties[0]
+        for tried in self.penalties:
+            heights = np.linalg.solve(whole - gram + tried, (total - score)[..., None])[..., 0]
+            new = np.einsum("sm,smn,sn->s", heights, gram, heights) - 2 * (heights * score).sum(1)
+            if new.sum() < change.sum():
+                change, penalty = new, tried
+        # relative to the model's own held-out cost
+        losses = before * np.maximum(1 + change / np.maximum(plain, 1e-300), 0.0)
+        inverse = np.linalg.inv(whole + penalty)
+        amounts = inverse @ total
+        shape = self.variable.heights(np.eye(number))
+        cov = shape @ inverse @ (self.parts.T @ self.parts) @ inverse @ shape.T
+        return Curves(
+            variable=self.variable,
+            amounts=amounts,
+            heights=shape @ amounts,
+            errors=np.sqrt(np.maximum(np.diag(cov), 1e-300)),
+            losses=losses,
+            gain=compare(before, losses),
+            p_value=p_value,
+            shift=-self.absorbed @ amounts,
+        )
 
 
-def significant(found: list[Curves], alpha: float, floor: float) -> list[Curves]:
-    """The curves that remove more than ``floor`` of the held-out cost, with regard to all
-    variables that were looked at."""
-    share = alpha / max(1, len(found))
-    return [
-        one for one in found
-        if one.gain.gain > floor and one.p_value < share and one.gain.low > 0
-    ]  # fmt: skip
+def with_curve(fit: Fit, curve: Curves) -> System:
+    """A model with a curve as one more term, its own parameters moved to make room for it."""
+    found = copy.deepcopy(fit.system)
+    low, high = limits(found)
+    fill(found, torch.from_numpy(np.clip(fit.row + curve.shift, low, high)))
+    found.terms.append(Curve(curve.variable, curve.amounts))
+    return found
+
+
+def weighed(engine: Engine, fit: Fit, found: list[Curves], alpha: float) -> list[Curves]:
+    """The curves that are no chance at probability ``alpha``, with what they remove.
+
+    The linear response overshoots where a curve is strong: its scale is calibrated with the
+    model.
+    """
+    before = square_of(engine, fit.system)
+    sure: list[Curves] = []
+    for one in found:
+        if one.p_value >= alpha or one.gain.gain <= 0:
+            continue
+        if len(sure) == MOST:
+            break
+        try:
+            after = square_of(engine, refine(engine, with_curve(fit, one), tolerance=ROUGH).system)
+        except SimulationError:
+            continue
+        sure.append(replace(one, removed=1 - after / before))
+    return sorted(sure, key=lambda one: -one.removed)
 
 
 def normal_tail(statistic: np.ndarray, number: int) -> np.ndarray:

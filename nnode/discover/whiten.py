@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,20 +35,25 @@ class PlatoonFilter:
     def fitted(cls, residual: Tensor, valid: Tensor, order: int) -> PlatoonFilter:
         """The filter with the least mean square of the rest.
 
+        What lasts is what is looked for: each vehicle's mean is taken out first, or the filter
+        would take it for noise with a long memory and take it out of the data.
+
         Args:
             residual: ``(K, B, N)`` m; 0 where not valid.
             valid: ``(K, B, N)`` True where a follower was measured.
             order: p.
         """
-        columns = _lagged(residual, order)
-        e, design = residual[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
+        mean = torch.where(valid, residual, 0.0).sum(0) / valid.sum(0).clamp(min=1)
+        lively = torch.where(residual != 0, residual - mean, 0.0)
+        columns = _lagged(lively, order)
+        e, design = lively[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
         gram = design.T @ design
         # a hair of damping, for platoons of two have nobody ahead who deviates
         gram += 1e-9 * max(np.trace(gram), 1e-12) * np.eye(len(gram))
         weights = np.linalg.solve(gram, design.T @ e)
-        rest = e - design @ weights
-        scale = float(np.sqrt(np.mean(rest**2)))
-        return cls(weights[:order], weights[order:], max(scale, 1e-9))
+        found = cls(weights[:order], weights[order:], 1.0)
+        scale = float(found(residual)[valid].square().mean().sqrt())
+        return replace(found, scale=max(scale, 1e-9))
 
     def __call__(self, residual: Tensor) -> Tensor:
         """``(..., K, B, N)`` whitened residuals of ``(..., K, B, N)``."""

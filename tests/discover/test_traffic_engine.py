@@ -15,7 +15,7 @@ from nnode.discover.score import Screen, traces
 from nnode.discover.search import search, settled
 from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.traffic import LARGE, TrafficEngine, drawn_in
-from nnode.discover.variables import curves, significant
+from nnode.discover.variables import curves, weighed
 from nnode.models import System
 from nnode.models.build import add_effects, build_model
 from nnode.models.effects import CATALOGUE
@@ -144,7 +144,7 @@ def test_nothing_is_named_where_nothing_is_hidden(plain: list[Sequence]) -> None
     base = settled(engine, model())
     found = search(engine, base, CATALOGUE.of("traffic"))
     assert not found.steps
-    assert not significant(curves(engine, base, engine.variables()), 0.01, 0.02)
+    assert not weighed(engine, base, curves(engine, base, engine.variables()), 0.01)
     assert base.row == pytest.approx([V0, LENGTH], rel=0.05)
 
 
