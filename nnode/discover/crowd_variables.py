@@ -161,8 +161,8 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
         ("position x", "m", _position(0), *WAY),
         ("clock time", "s", _clock, *CLOCK),
     ):
-        seen = value(state)[agent]
-        low, high = float(seen.min()), float(seen.max())
+        where = value(state)[agent]
+        low, high = float(where.min()), float(where.max())
         lengths = lengths_of(shortest, longest, high - low)
         for level, direction in axes.items() if lengths else ():
             found.append(

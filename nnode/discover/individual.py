@@ -249,7 +249,9 @@ def _contrasts(z: np.ndarray, engine: Engine) -> np.ndarray:
     acts = np.zeros((int(engine.unit.max()) + 1, z.shape[1]))
     np.add.at(acts, engine.unit, z**2)
     number = np.maximum((acts > 0).sum(1), 1)
-    return np.where(acts[engine.unit] > 0, z - z.sum(1, keepdims=True) / number[engine.unit][:, None], 0.0)
+    return np.where(
+        acts[engine.unit] > 0, z - z.sum(1, keepdims=True) / number[engine.unit][:, None], 0.0
+    )
 
 
 def _products(engine: Engine, gram: list[np.ndarray], score: list[np.ndarray]) -> np.ndarray:

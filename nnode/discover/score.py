@@ -223,9 +223,7 @@ class Screen:
         amount = -total[i] / size[i]
         rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
         blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
-        error = (
-            np.sqrt((blocks * rest + PRIOR * usual * size[i]) / (blocks + PRIOR)) / size[i]
-        )
+        error = np.sqrt((blocks * rest + PRIOR * usual * size[i]) / (blocks + PRIOR)) / size[i]
         options = dict(trace.probes[0].options)
         options["a"] = trace.probes[first[i]].options["a"]
         options["b"] = trace.probes[last[i]].options["b"]

@@ -21,7 +21,8 @@ from nnode.models.system import System
 
 log = logging.getLogger(__name__)
 
-#: An effect must remove this share of the squared errors of positions.
+#: An effect must remove this share of the squared errors of positions that the model had before
+#: anything was added to it.
 FLOOR = 0.02
 #: Effects whose trace explains this share of what the best one explains are calibrated too.
 RIVAL = 0.25
@@ -53,7 +54,7 @@ class Candidate:
         fit: of the extended model.
         losses: ``(S,)`` held-out cost of each sequence.
         gain: over the model without it.
-        removed: share of the squared errors of positions that it removed.
+        removed: share of the first model's squared errors of positions that it removed.
         individuals: of an individual effect.
     """
 
@@ -68,6 +69,15 @@ class Candidate:
     def name(self) -> str:
         """Of the effect."""
         return self.score.effect.name
+
+    @property
+    def ordered(self) -> bool:
+        """Whether an interval has kept its ends in their order."""
+        if not self.score.effect.consecutive:
+            return True
+        own = next(e for e in effects_of(self.fit.system) if e.name == self.name)
+        first, last = (float(own.get_parameter(name).detach()) for name in ("a", "b"))
+        return first < last
 
     def strength_excludes_neutral(self, sequence: np.ndarray) -> bool:
         """Whether the interval of any of its strengths excludes the neutral value."""
@@ -112,12 +122,15 @@ class Search:
         steps: in order of acceptance.
         scores: of all effects that are left, against ``fit``.
         screen: that they come from.
+        square: mean square error of positions of the model without any effect, m²; 0 until it
+            is known.
     """
 
     fit: Fit
     steps: list[Step] = field(default_factory=list)
     scores: list[Score] = field(default_factory=list)
     screen: Screen | None = None
+    square: float = 0.0
 
 
 def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:
@@ -200,19 +213,20 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
     before = heldout(found.fit, engine.sequence)
     square = square_of(engine, found.fit.system)
+    found.square = found.square or square
     candidates: list[Candidate] = []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
         one = look.of(score.effect.name)
         try:
-            fit = _calibrated(engine, found.fit, score, least)
+            fit, one = _calibrated(engine, found.fit, score, least, one)
         except SimulationError:
             continue
         losses = heldout(fit, engine.sequence)
         if one is not None:
             # numbers from one half of the time, tried on the other
             losses = before * one.losses / sums(found.fit.residual**2, engine.sequence)
-        removed = 1 - square_of(engine, fit.system) / square
+        removed = (square - square_of(engine, fit.system)) / found.square
         candidates.append(Candidate(score, fit, losses, compare(before, losses), removed, one))
     candidates.sort(key=lambda c: -c.gain.gain)
     passing = [
@@ -221,6 +235,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         and c.removed >= FLOOR
         and c.gain.p_value < BETTER
         and c.strength_excludes_neutral(engine.sequence)
+        and c.ordered
     ]  # fmt: skip
     if not passing:
         return None
@@ -248,19 +263,23 @@ def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable
     return False
 
 
-def _calibrated(engine: Engine, before: Fit, score: Score, hopeless: float) -> Fit:
-    """The model with one more effect."""
+def _calibrated(
+    engine: Engine, before: Fit, score: Score, hopeless: float, one: Individuals | None
+) -> tuple[Fit, Individuals | None]:
+    """The model with one more effect, and the agents' numbers of an individual one."""
     system, place = extended(before.system, score.effect(**score.options))
+    if one is not None:
+        system, one = _peopled(engine, system, one)
+        return refine(engine, system, tolerance=ROUGH), one
     fit = refine(engine, system, tolerance=ROUGH, hopeless=hopeless)
-    if not score.effect.consecutive:
-        return fit
-    # a strong effect bends the paths, so that the interval that a weak one would have is off
-    for _ in range(SHIFTS):
-        shifted = _shifted(engine, fit, score.effect, place)
-        if shifted is None:
-            break
-        fit = shifted
-    return fit
+    if score.effect.consecutive:
+        # a strong effect bends the paths, so that the interval of a weak one would be off
+        for _ in range(SHIFTS):
+            shifted = _shifted(engine, fit, score.effect, place)
+            if shifted is None:
+                break
+            fit = shifted
+    return fit, None
 
 
 def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit | None:
@@ -293,18 +312,25 @@ def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit 
 
 def _again(engine: Engine, fit: Fit, chosen: Candidate) -> Fit:
     """Everybody's numbers once more, around the parameters that the model has with them."""
-    kind = chosen.score.effect
+    kind, one = chosen.score.effect, chosen.individuals
     assert issubclass(kind, IndividualEffect)
-    plain = evaluated(engine, without(fit.system, kind.name))
-    one = individuals(engine, plain, kind)
-    if one is None:
-        return fit
-    own = next(effect for effect in effects_of(fit.system) if isinstance(effect, kind))
-    system, _ = extended(plain.system, kind(**{**own.options(), "people": one.people}))
-    one = sharpened(engine, system, one)
-    next(effect for effect in effects_of(system) if isinstance(effect, kind)).people = one.people
-    chosen.individuals = one
+    assert one is not None
+    if len(engine.people[0]) == 1:
+        plain = evaluated(engine, without(fit.system, kind.name))
+        one = individuals(engine, plain, kind)
+        if one is None:
+            return fit
+    system, chosen.individuals = _peopled(engine, copy.deepcopy(fit.system), one)
     return refine(engine, system)
+
+
+def _peopled(engine: Engine, system: System, one: Individuals) -> tuple[System, Individuals]:
+    """A model with an individual effect, and everybody's numbers in it."""
+    one = sharpened(engine, system, one)
+    for effect in effects_of(system):
+        if isinstance(effect, one.effect):
+            effect.people = one.people
+    return system, one
 
 
 def _simplest(candidates: list[Candidate]) -> Candidate:

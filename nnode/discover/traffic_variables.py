@@ -102,8 +102,14 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         values = seen_values.expand(x.shape)[seen].numpy().astype(float)
         return Variable(name, unit, value, knots_of(values, KNOTS), _followers)
 
-    def waves(name: str, unit: str, value: Callable[[State], Tensor], seen_values: Tensor,
-              shortest: float, longest: float) -> list[Variable]:
+    def waves(
+        name: str,
+        unit: str,
+        value: Callable[[State], Tensor],
+        seen_values: Tensor,
+        shortest: float,
+        longest: float,
+    ) -> list[Variable]:
         values = seen_values.expand(x.shape)[seen]
         low, high = float(values.min()), float(values.max())
         lengths = lengths_of(shortest, longest, high - low)

@@ -159,6 +159,7 @@ class Curve(Term):
         self.variable = variable
         self.amounts = torch.from_numpy(amounts)
         self.declare("scale", 1.0, unit="1", bounds=Interval(0.0, 2.0))
+        self.scale: Tensor
 
     def forward(self, state: State) -> Tensor:
         amount = self.scale * (self.variable.weights(state) @ self.amounts)
