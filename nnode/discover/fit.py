@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,6 +14,9 @@ from nnode.discover.engine import Engine, fill, names_of, row_of
 from nnode.errors import SimulationError
 from nnode.models.system import System
 from nnode.models.term import Interval
+
+if TYPE_CHECKING:
+    from nnode.discover.variables import Curves
 
 #: Dampings that are tried side by side, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
@@ -29,6 +33,7 @@ class Fit:
         residual: ``(n,)``.
         jacobian: ``(n, K)`` derivatives of the residuals.
         free: ``(K,)`` False where a parameter is held at a bound.
+        curves: what a deviation depends on, once that was asked for.
     """
 
     system: System
@@ -37,6 +42,7 @@ class Fit:
     residual: np.ndarray
     jacobian: np.ndarray
     free: np.ndarray
+    curves: list[Curves] | None = None
 
     @property
     def cost(self) -> float:

@@ -242,16 +242,15 @@ def _halves(
 
 
 def _contrasts(z: np.ndarray, engine: Engine) -> np.ndarray:
-    """The directions without what all agents of a unit have in common: that may be the hour or
-    the place, and speaks for no difference between them."""
+    """The directions without what all agents of a unit do in common in a half: that may be the
+    hour or the place, and speaks for no difference between them."""
     if len(engine.people[0]) == 1:
         return z
-    acts = np.zeros((int(engine.unit.max()) + 1, z.shape[1]))
-    np.add.at(acts, engine.unit, z**2)
-    number = np.maximum((acts > 0).sum(1), 1)
-    return np.where(
-        acts[engine.unit] > 0, z - z.sum(1, keepdims=True) / number[engine.unit][:, None], 0.0
-    )
+    common = z.sum(1, keepdims=True)
+    label = 3 * engine.unit + engine.half + 1
+    along, size = sums(common * z, label), sums(common**2, label)
+    found: np.ndarray = z - common * (along / np.maximum(size, 1e-300))[label]
+    return found
 
 
 def _products(engine: Engine, gram: list[np.ndarray], score: list[np.ndarray]) -> np.ndarray:

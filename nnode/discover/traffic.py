@@ -139,12 +139,15 @@ class TrafficEngine:
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
     ) -> Tensor:
         """``(S, n)`` derivatives of the residuals with respect to a probe's strengths, by linear
-        response; the change by the effect as a whole where it has a memory or no strength."""
+        response; the change by the effect as a whole where it has no strength."""
         response = self.linear(system, row)
-        if effect.memory or not probe.steps:
+        if effect.memory:
             return self._whole(response, effect, probe)
         base = response.rates(response.system)
         sources = []
+        if not probe.steps:
+            changed, _ = extended(response.system, effect(**probe.options))
+            sources.append(response.rates(changed) - base)
         for name, step in probe.steps.items():
             value = effect.strengths[name].neutral + step
             changed, _ = extended(response.system, effect(**{**probe.options, name: value}))

@@ -109,8 +109,10 @@ def knots_of(values: np.ndarray, most: int = 9) -> tuple[float, ...]:
 def lengths_of(shortest: float, longest: float, span: float, most: int = 600) -> tuple[float, ...]:
     """Lengths of waves that data over ``span`` tell apart; the shorter ones are left out where
     there are too many."""
+    if not span > 0:
+        return ()
     low, high = 1 / min(longest, span / 2), 1 / shortest
-    number = min(int((high - low) * 2 * span), most) if span > 0 else 0
+    number = min(int((high - low) * 2 * span), most)
     return tuple(1 / (low + k / (2 * span)) for k in range(number))
 
 
@@ -184,9 +186,17 @@ def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
 def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -> list[Curves]:
     """The best curve or wave of every variable, the one that explains most first.
 
+    They are kept with the fit, which is looked at more than once.
+
     Args:
         seed: of the sign flips, see :mod:`nnode.discover.score`.
     """
+    if fit.curves is None:
+        fit.curves = _curves(engine, fit, variables, seed)
+    return fit.curves
+
+
+def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> list[Curves]:
     screen = Screen(fit, engine.block, seed, FLIPS)
     before = heldout(fit, engine.sequence)
     looks = [_Look(engine, fit, screen, variable) for variable in variables]

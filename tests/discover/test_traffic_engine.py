@@ -9,8 +9,8 @@ import torch
 from nnode.data.sequence import Sequence
 from nnode.discover.compare import compare, heldout
 from nnode.discover.engine import row_of
-from nnode.discover.fit import evaluated, refine
-from nnode.discover.individual import individuals
+from nnode.discover.fit import Fit, evaluated, refine
+from nnode.discover.individual import Individuals, individuals, sharpened
 from nnode.discover.score import Screen, traces
 from nnode.discover.search import search, settled
 from nnode.discover.smooth import noise_variance, smooth, velocity
@@ -19,6 +19,7 @@ from nnode.discover.variables import curves, weighed
 from nnode.models import System
 from nnode.models.build import add_effects, build_model
 from nnode.models.effects import CATALOGUE
+from nnode.models.extend import extended
 from tests.discover.platoons import LENGTH, V0, delayed, platoons, relative_speed
 
 
@@ -159,24 +160,47 @@ def test_curves_find_the_variable_of_an_effect() -> None:
     assert best.gain.low > 0
 
 
-def test_drivers_who_differ_are_recognised() -> None:
-    rng = np.random.default_rng(5)
-    pace = rng.normal(0, 0.1, (40, 4))
+def paced(own: np.ndarray) -> list[Sequence]:
+    """Sequences whose drivers have the paces ``(S, 4)``."""
     made = []
-    for s in range(12):
-        own = pace[s]
-        made += [
-            Sequence(name=f"r/{s}", recording="r", time=one.time + 100 * s, x=one.x)
-            for one in platoons(lambda x, law, lead, own=own: law * (1 + own), number=1, seed=s)
-        ]
-    engine = TrafficEngine(made)
+    for s, pace in enumerate(own):
+        (one,) = platoons(lambda x, law, lead, pace=pace: law * (1 + pace), number=1, seed=s)
+        made.append(Sequence(name=f"r/{s}", recording="r", time=one.time + 100 * s, x=one.x))
+    return made
+
+
+def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, Individuals, float]:
+    """What is found of different drivers, and the p-value of that."""
+    engine = TrafficEngine(sequences)
     fit = settled(engine, model())
-    effect = CATALOGUE.effects["driver_heterogeneity"]
-    found = individuals(engine, fit, effect)  # type: ignore[arg-type]
+    found = individuals(engine, fit, CATALOGUE.effects["driver_heterogeneity"])  # type: ignore[arg-type]
     assert found is not None
+    (score,) = Screen(fit, engine.block).scores([], [found])
+    return engine, fit, found, score.p_value
+
+
+def test_drivers_who_differ_are_recognised() -> None:
+    pace = np.random.default_rng(5).normal(0, 0.1, (12, 4))
+    engine, fit, found, p_value = who_differs(paced(pace))
+    assert p_value < 0.01
     assert found.interval[0] > 0.04
-    numbers = np.array([found.people[f"r/{s}"][:4] for s in range(12)])
-    assert np.corrcoef(numbers.ravel(), pace[:12].ravel())[0, 1] > 0.8
+    linear = np.array([found.people[f"r/{s}"][:4] for s in range(12)])
+    assert np.corrcoef(linear.ravel(), pace.ravel())[0, 1] > 0.8
+    # around the motion that the numbers lead to, they come nearer to the truth
+    system, _ = extended(fit.system, found.effect(people=found.people))
+    near = sharpened(engine, system, found)
+    own = np.array([near.people[f"r/{s}"][:4] for s in range(12)])
+    away = pace - pace.mean()
+    errors = [np.abs(each - each.mean() - away).mean() for each in (own, linear)]
+    assert errors[0] < errors[1]
+
+
+@pytest.mark.parametrize("what", ["the hour", "the place in the platoon"])
+def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
+    rng = np.random.default_rng(6)
+    common = rng.normal(0, 0.1, (12, 1) if what == "the hour" else (1, 4))
+    *_, p_value = who_differs(paced(np.broadcast_to(common, (12, 4))))
+    assert p_value > 0.05
 
 
 # -- statistics ------------------------------------------------------------------------------
