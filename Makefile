@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := runs/demo
 
-.PHONY: setup demo test lint study clean
+.PHONY: setup demo test tutorials docs lint study clean
 
 setup: $(VENV)/.installed
 
@@ -30,6 +30,16 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+# Runs every block of code of the tutorials.
+tutorials: setup
+	$(BIN)/python -m pytest -m tutorial tests/docs
+
+# The documentation as a site that works offline: runs/site/index.html
+docs: setup
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "site: runs/site/index.html"
 
 lint: setup
 	$(BIN)/ruff check .

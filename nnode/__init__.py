@@ -8,13 +8,20 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from nnode.app.notebook import diagnose, fit
     from nnode.calibrate.checkpoint import load
 
-__all__ = ["__version__", "load"]
+__all__ = ["__version__", "diagnose", "fit", "load"]
+
+#: Where each name comes from: imported on first use, a short command should not wait for torch.
+_HOMES = {
+    "diagnose": "nnode.app.notebook",
+    "fit": "nnode.app.notebook",
+    "load": "nnode.calibrate.checkpoint",
+}
 
 
 def __getattr__(name: str) -> Any:
-    # imported on first use: a short command should not wait for torch
-    if name == "load":
-        return import_module("nnode.calibrate.checkpoint").load
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

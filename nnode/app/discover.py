@@ -129,7 +129,7 @@ def diagnose_table(
     Raises:
         NNodeError: see :func:`discover`.
     """
-    own = _model_options(model, leader)
+    own = model_options(model, leader)
     chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
     data = TableOptions(
         domain=domain, path=str(path), walls=None if walls is None else str(walls),
@@ -147,8 +147,12 @@ def diagnose_table(
     return plain_report(found.diagnosis)
 
 
-def _model_options(model: Mapping[str, Any], leader: str) -> dict[str, Any]:
-    """A model's options with the defaults of its schema."""
+def model_options(model: Mapping[str, Any], leader: str) -> dict[str, Any]:
+    """A model's options with the defaults of its schema.
+
+    Raises:
+        ConfigError: an unknown term or option.
+    """
     from nnode.config import SCHEMAS
 
     term = str(model.get("term", ""))

@@ -21,12 +21,17 @@ _chosen: set[str] = set()
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
-    """The composed configuration in plain types, with the groups it was composed from."""
+    """The composed configuration in plain types, with the groups it was composed from.
+
+    One that was made without Hydra names its groups itself.
+    """
     plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
     assert isinstance(plain, dict)
+    make_absolute(plain.get("data", {}))
+    if not HydraConfig.initialized():
+        return {str(k): v for k, v in plain.items() if k != "resume"}
     choices = HydraConfig.get().runtime.choices
     groups = {group: str(choices[group]) for group in GROUPS if group in choices}
-    make_absolute(plain.get("data", {}))
     return {**{str(k): v for k, v in plain.items() if k != "resume"}, "groups": groups}
 
 

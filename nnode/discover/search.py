@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 #: An effect must remove this share of the squared errors of positions that the model had before
 #: anything was added to it.
 FLOOR = 0.02
+#: A mean square error of positions, m², below which nothing is left to be explained: 1 mm.
+EXACT = 1e-6
 #: Effects whose trace explains this share of what the best one explains are calibrated too.
 RIVAL = 0.25
 #: At most so many effects are calibrated in a round.
@@ -214,6 +216,8 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     before = heldout(found.fit, engine.sequence)
     square = square_of(engine, found.fit.system)
     found.square = found.square or square
+    if square < EXACT:
+        return None
     candidates: list[Candidate] = []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)

@@ -68,7 +68,8 @@ class TorchdiffeqSolver:
             discrete scheme by O(dt)); ``discrete`` differentiates the scheme itself.
         dt: step, s; None takes the domain's default (0.002 s in traffic; at most 0.0625 s,
             dividing the sampling interval, in crowds).
-        rtol, atol: tolerances of adaptive methods.
+        rtol: relative tolerance of adaptive methods.
+        atol: absolute tolerance of adaptive methods, m and m/s.
 
     Raises:
         ConfigError: unknown method or gradient, two that exclude each other, or a step that

@@ -223,7 +223,7 @@ def test_effects_can_be_given_on_the_command_line() -> None:
 
 
 def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
-    full = app._model_options(model, "measured")
+    full = app.model_options(model, "measured")
     return app._job(full, data, {}, {}, DiscoverOptions(**options), Path("nowhere"))
 
 

@@ -1,0 +1,193 @@
+"""Calibrate and diagnose in a notebook: a table in, an object to look at out."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+
+from nnode.app.discover import diagnose_table, model_options
+from nnode.app.sweep import RESULT
+from nnode.app.train import train
+from nnode.calibrate.checkpoint import load
+from nnode.calibrate.optimizers import LbfgsOptions
+from nnode.calibrate.options import FusedOptions, TrainerOptions
+from nnode.data.options import TableOptions
+from nnode.errors import ConfigError
+from nnode.models import System
+from nnode.plots import force_figure
+
+if TYPE_CHECKING:
+    from nnode.discover.options import DiscoverOptions
+
+#: Models by the names that ``conf/model`` gives them.
+MODELS: dict[str, dict[str, Any]] = {
+    "lin": {"term": "lin"},
+    "log": {"term": "log"},
+    "n2": {"term": "network_speed", "hidden": 2},
+    "n4": {"term": "network_speed", "hidden": 4},
+    "n10": {"term": "network_speed", "hidden": 10},
+    "sf": {"term": "social_force"},
+    "nn": {"term": "network_force"},
+}
+
+Table = str | Path | pd.DataFrame
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated model.
+
+    Attributes:
+        model: a torch module, at its best epoch.
+        folder: holds checkpoints and TensorBoard curves as ``scripts/train.py`` writes them.
+        history: one row per evaluation: epoch, costs, parameters.
+        summary: what the script prints at its end.
+    """
+
+    model: System
+    folder: Path
+    history: pd.DataFrame
+    summary: dict[str, Any]
+
+    def plot(self) -> Figure:
+        """The calibrated speed curve, or the force between two people."""
+        return force_figure(self.model)
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """Value and unit of every physical parameter."""
+        rows = {name: (float(value), unit) for name, (value, unit) in self.model.physical().items()}
+        return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "unit"])
+
+
+def fit(
+    data: Table,
+    domain: str,
+    *,
+    model: str | Mapping[str, Any] = "lin",
+    walls: str | Path | None = None,
+    leader: str = "constant",
+    epochs: int = 100,
+    heldout: float = 0.2,
+    seed: int = 0,
+    folder: str | Path | None = None,
+) -> Calibration:
+    """Calibrate a model to a tidy table by L-BFGS on compiled kernels.
+
+    For other optimisers, solvers and options there is ``scripts/train.py``.
+
+    Args:
+        data: CSV or Parquet, or a data frame, with ``sequence, time, agent, x`` and, where they
+            exist, ``y`` and more, SI units; see ``docs/data.md``.
+        domain: ``traffic`` or ``crowd``.
+        model: a name as in ``conf/model``, or a model's options with its ``term``.
+        walls: CSV with x1, y1, x2, y2, m.
+        leader: of a traffic model: ``constant`` or ``measured``.
+        epochs: at most.
+        heldout: share of the sequences that the calibration does not see.
+        seed: of start weights and of the split.
+        folder: receives checkpoints and curves; by default a new temporary one.
+
+    Raises:
+        NNodeError: a table, a model or options that do not fit; the message says what to do.
+    """
+    place = Path(mkdtemp(prefix="nnode-fit-")) if folder is None else Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    options = TableOptions(
+        domain=domain,
+        path=str(_file(data, place)),
+        walls=None if walls is None else str(Path(walls).absolute()),
+    )
+    options.split.heldout = heldout
+    config = OmegaConf.create(
+        {
+            "model": model_options(named(model), leader),
+            "data": OmegaConf.structured(options),
+            "solver": OmegaConf.structured(FusedOptions()),
+            "optimizer": OmegaConf.structured(LbfgsOptions()),
+            "trainer": OmegaConf.structured(TrainerOptions(max_epochs=epochs, figure_every=0)),
+            "seed": seed,
+            "resume": None,
+            "groups": {
+                "model": str(named(model)["name"]),
+                "data": "table",
+                "solver": "fused",
+                "optimizer": "lbfgs",
+            },
+        }
+    )
+    with redirect_stdout(StringIO()) as printed:
+        train(config, place)
+    logging.getLogger(__name__).info("%s", printed.getvalue())
+    result = json.loads((place / RESULT).read_text())
+    return Calibration(
+        model=load(place / "checkpoints" / "best.pt"),
+        folder=place,
+        history=pd.DataFrame(result["history"]),
+        summary=result["summary"],
+    )
+
+
+def diagnose(
+    data: Table,
+    domain: str,
+    *,
+    model: str | Mapping[str, Any] = "lin",
+    walls: str | Path | None = None,
+    leader: str = "measured",
+    folder: str | Path | None = None,
+    seed: int = 0,
+    options: DiscoverOptions | None = None,
+) -> dict[str, Any]:
+    """What a model lacks on a tidy table: the content of ``report.json``.
+
+    Args: as of :func:`fit`; a folder receives the page, the extended model and its checkpoint.
+
+    Raises:
+        NNodeError: see :func:`fit`.
+    """
+    with TemporaryDirectory(prefix="nnode-") as scratch:
+        return diagnose_table(
+            _file(data, Path(scratch) if folder is None else Path(folder)),
+            domain,
+            model=named(model),
+            walls=walls,
+            leader=leader,
+            folder=folder,
+            seed=seed,
+            options=options,
+        )
+
+
+def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
+    """A model's options by its name.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    if not isinstance(model, str):
+        return {"name": model.get("term", ""), **model}
+    if model not in MODELS:
+        raise ConfigError(f"model={model} is unknown, expected one of {', '.join(MODELS)}")
+    return {"name": model, **MODELS[model]}
+
+
+def _file(data: Table, folder: Path) -> Path:
+    """A table as a file."""
+    if not isinstance(data, pd.DataFrame):
+        return Path(data).absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "table.parquet"
+    data.to_parquet(path, index=False)
+    return path.absolute()
