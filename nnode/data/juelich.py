@@ -58,9 +58,32 @@ def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
     Source: Forschungszentrum Jülich, DOI 10.34735/ped.2013.5 (bi_corr) and the HERMES runs.
     """
     path = Path(path)
+    table, rate = load_people(path, options)
+    return cut_people(path, table, rate, options)
+
+
+def cut_people(
+    path: Path,
+    table: pd.DataFrame,
+    rate: float,
+    options: JuelichOptions,
+    walls: np.ndarray | None = None,
+) -> list[Sequence]:
+    """Cut tracked people into consecutive sequences, see :func:`read_juelich`.
+
+    Args:
+        path: the file they come from; its stem names the recording.
+        table: rows id, frame (whole numbers), x, y (m).
+        rate: frames per second.
+        options: duration, walking axis, walls, view and velocities.
+        walls: ``(W, 4)`` m, in place of ``options.walls``.
+
+    Raises:
+        ConfigError: an option out of its range.
+        DataError: one person twice in a frame, or no sequence at all.
+    """
     axis = int(one_of("walking_axis", options.walking_axis, _AXES))
     view = _interval("view", options.view)
-    table, rate = _load(path, options)
     steps = positive("t_seq", options.t_seq) * rate
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
         nearest = max(round(steps), 1) / rate
@@ -68,9 +91,11 @@ def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
             f"data.t_seq={options.t_seq:g} s is {steps:g} frames at the {rate:g} frames/s of "
             f"{path.name}; expected a whole number, such as t_seq={nearest:g}"
         )
+    _check_once(path, table)
     frames, ids, x = _positions(table)
     v = _velocity(x, rate, options.velocity)
-    walls = _walls(path.stem, options.walls, axis, x, view)
+    if walls is None:
+        walls = _walls(path.stem, options.walls, axis, x, view)
     inside = np.isfinite(x[:, :, axis])
     if view is not None:
         with np.errstate(invalid="ignore"):
@@ -112,8 +137,13 @@ def _interval(option: str, value: list[float] | None) -> tuple[float, float] | N
     return numbers[0], numbers[1]
 
 
-def _load(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
-    """Rows id, frame, x, y (m) and the frame rate (1/s)."""
+def load_people(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
+    """Rows id, frame, x, y (m) of a text file, and its frame rate (1/s).
+
+    Raises:
+        ConfigError: a frame rate or unit that is unknown or contradicts the file.
+        DataError: no such file, or lines that are no trajectory (names the line).
+    """
     rate = options.frame_rate
     if rate is not None:
         positive("frame_rate", rate)
@@ -139,6 +169,10 @@ def _load(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
     table = trajectory.data[["id", "frame", "x", "y"]].reset_index(drop=True)
     if not np.isfinite(table[["x", "y"]].to_numpy()).all():
         _check_lines(path)
+    return table, float(trajectory.frame_rate)
+
+
+def _check_once(path: Path, table: pd.DataFrame) -> None:
     twice = table.duplicated(["id", "frame"])
     if twice.any():
         row = table[twice].iloc[0]
@@ -146,7 +180,6 @@ def _load(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
             f"{path}: person {row.id:g} stands twice in frame {row.frame:g} "
             f"({int(twice.sum())} such rows); expected one row per person and frame"
         )
-    return table, float(trajectory.frame_rate)
 
 
 def _pedpy() -> ModuleType:

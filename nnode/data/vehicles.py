@@ -7,7 +7,7 @@ in which the same vehicles are in view.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from nnode.data.columns import Table
-from nnode.data.options import VehicleTableOptions
+from nnode.data.options import LaneOptions, VehicleTableOptions
 from nnode.data.recordings import check_known, one_of, positive, table_path, wanted
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
@@ -27,6 +27,33 @@ SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 
 _REQUIRED = ("vehicle", "time", "x")
 _OPTIONAL = ("lane", "speed", "length", "kind")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicles:
+    """Rows of one recording, one per vehicle and time, in any order and in SI units.
+
+    Attributes:
+        path: the file they come from.
+        row: where the i-th row stands in the file, in words.
+        vehicle: identifiers, ``(rows,)`` text.
+        time: ``(rows,)`` s.
+        x: ``(rows,)`` m, growing as vehicles drive on.
+        lane: ``(rows,)`` names, or None where there is one lane.
+        speed: ``(rows,)`` m/s, at least 0, or None.
+        length: ``(rows,)`` m, NaN where unknown, or None.
+        kind: ``(rows,)`` class codes, or None.
+    """
+
+    path: Path
+    row: Callable[[int], str]
+    vehicle: np.ndarray
+    time: np.ndarray
+    x: np.ndarray
+    lane: np.ndarray | None = None
+    speed: np.ndarray | None = None
+    length: np.ndarray | None = None
+    kind: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -48,14 +75,35 @@ class _Stint:
         return self.first + len(self.x) - 1
 
 
-def vehicle_files(options: VehicleTableOptions) -> dict[str, Path]:
+def vehicle_files(options: LaneOptions) -> dict[str, Path]:
     """The table's path."""
     path = table_path(options, "path", options.path)
     return {path.stem: path}
 
 
 def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
-    """Read a table and cut it into sequences.
+    """Read a table and cut it into sequences, see :func:`cut_vehicles`.
+
+    Args:
+        path: CSV or Parquet.
+        options: columns, units, lanes, time grid and the way of cutting.
+
+    Raises:
+        ConfigError: an option out of its range, an unknown lane or recording.
+        DataError: columns or cells that are missing or hold no number (names the row), one
+            vehicle twice at one time, or no sequence at all.
+    """
+    path = Path(path)
+    if options.direction not in (1, -1):
+        raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
+    check_cutting(options)
+    return cut_vehicles(_rows(Table(path), options), options, path.stem)
+
+
+def cut_vehicles(
+    rows: Vehicles, options: LaneOptions, stem: str, lane_word: str = "lane"
+) -> list[Sequence]:
+    """Cut a recording into sequences.
 
     Without ``window`` a sequence is a maximal interval during which the same vehicles are in
     view. With it, time is cut into consecutive windows that share their boundary sample, and a
@@ -64,22 +112,20 @@ def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
     its leader.
 
     Args:
-        path: CSV or Parquet.
-        options: columns, units, lanes, time grid and the way of cutting.
+        rows: the recording.
+        options: lanes, time grid and the way of cutting, checked by :func:`check_cutting`.
+        stem: name of the recording, to which ``_`` and the lane are added.
+        lane_word: stands before the lane's name.
 
     Returns:
-        Sequences named ``recording/number``, recording being the file's name and the lane.
-        Vehicles are ordered by position, the leader last.
+        Sequences named ``recording/number``. Vehicles are ordered by position, the leader last.
 
     Raises:
-        ConfigError: an option out of its range, an unknown lane or recording.
-        DataError: columns or cells that are missing or hold no number (names the row), one
-            vehicle twice at one time, or no sequence at all.
+        ConfigError: an unknown lane or recording.
+        DataError: one vehicle twice at one time, or no sequence at all.
     """
-    path = Path(path)
-    _check(options)
-    lanes = _stints(Table(path), options)
-    recordings = {f"{path.stem}_lane{lane}" if lane else path.stem: lane for lane in lanes}
+    lanes = _stints(rows, options)
+    recordings = {f"{stem}_{lane_word}{lane}" if lane else stem: lane for lane in lanes}
     asked = wanted(options.recording)
     if asked is not None:
         check_known(asked, recordings)
@@ -92,8 +138,8 @@ def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
     if not found:
         vehicles = {stint.vehicle for stints in lanes.values() for stint in stints}
         raise DataError(
-            f"{path}: no sequence; at no time are {options.min_vehicles} vehicles in one lane "
-            f"for {options.min_samples} samples of {options.dt:g} s"
+            f"{rows.path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
+            f"lane for {options.min_samples} samples of {options.dt:g} s"
             + (f" throughout a window of {options.window:g} s" if options.window else "")
             + f" ({len(vehicles)} vehicles, {len(lanes)} lanes); lower data.min_vehicles, "
             "data.min_samples or data.window"
@@ -101,13 +147,16 @@ def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
     return found
 
 
-def _check(options: VehicleTableOptions) -> None:
+def check_cutting(options: LaneOptions) -> None:
+    """Refuse options of the cutting that are out of their range.
+
+    Raises:
+        ConfigError: names the option.
+    """
     positive("dt", options.dt)
     positive("max_hole", options.max_hole)
     if options.min_vehicles < 1 or options.min_samples < 1:
         raise ConfigError("data.min_vehicles and data.min_samples must be at least 1")
-    if options.direction not in (1, -1):
-        raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     if options.window is not None:
         samples = positive("window", options.window) / options.dt
         if abs(samples - round(samples)) > 1e-6:
@@ -130,15 +179,15 @@ def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndar
     return table.numbers(column) * scale
 
 
-def _lanes(options: VehicleTableOptions, table: Table, lane: np.ndarray | None) -> list[str]:
-    if lane is None:
+def _lanes(options: LaneOptions, rows: Vehicles) -> list[str]:
+    if rows.lane is None:
         if options.lane is not None:
             raise ConfigError(
-                f"data.lane={options.lane}, but {table.path} has no lane column; set "
+                f"data.lane={options.lane}, but {rows.path} has no lane column; set "
                 "data.columns.lane or data.lane=null"
             )
         return [""]
-    present = sorted(set(lane), key=lambda name: (len(name), name))
+    present = sorted(set(rows.lane), key=lambda name: (len(name), name))
     if options.lane is None:
         return present
     chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
@@ -146,31 +195,41 @@ def _lanes(options: VehicleTableOptions, table: Table, lane: np.ndarray | None) 
     for name in names:
         if name not in present:
             raise ConfigError(
-                f"data.lane={name}: {table.path} has the lanes {', '.join(present[:20])}"
+                f"data.lane={name}: {rows.path} has the lanes {', '.join(present[:20])}"
             )
     return names
 
 
-def _stints(table: Table, options: VehicleTableOptions) -> dict[str, list[_Stint]]:
-    """Every vehicle's stays by lane, on the reference time grid."""
+def _rows(table: Table, options: VehicleTableOptions) -> Vehicles:
+    """The table's columns, by what they mean."""
     names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     length_unit = options.length_unit or options.position_unit
-    vehicle = table.names(names["vehicle"])
-    time = _seconds(table, names["time"], options)
-    x = table.numbers(names["x"]) * metres * options.direction
-    lane = table.names(names["lane"]) if "lane" in names else None
-    lanes = _lanes(options, table, lane)
-    speed = length = kind = None
+    speed = length = None
     if "speed" in names:
         scale = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
         speed = np.abs(table.numbers(names["speed"])) * scale
     if "length" in names:
         scale = one_of("length_unit", length_unit, LENGTH_UNITS)
         length = table.numbers(names["length"], empty=True) * scale
-    if "kind" in names:
-        kind = table.names(names["kind"], empty=True)
+    return Vehicles(
+        path=table.path,
+        row=table.row,
+        vehicle=table.names(names["vehicle"]),
+        time=_seconds(table, names["time"], options),
+        x=table.numbers(names["x"]) * metres * options.direction,
+        lane=table.names(names["lane"]) if "lane" in names else None,
+        speed=speed,
+        length=length,
+        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
+    )
 
+
+def _stints(recording: Vehicles, options: LaneOptions) -> dict[str, list[_Stint]]:
+    """Every vehicle's stays by lane, on the reference time grid."""
+    lanes = _lanes(options, recording)
+    vehicle, time, x, lane = recording.vehicle, recording.time, recording.x, recording.lane
+    speed, length, kind = recording.speed, recording.length, recording.kind
     ids, code = np.unique(vehicle.astype(str), return_inverse=True)
     order = np.lexsort((time, code))
     step = np.diff(time[order])
@@ -179,8 +238,9 @@ def _stints(table: Table, options: VehicleTableOptions) -> dict[str, list[_Stint
     if twice.size:
         i, j = sorted(order[twice[0] : twice[0] + 2])
         raise DataError(
-            f"{table.path}, {table.row(j)}: vehicle {vehicle[j]} at time {time[j]:g} s stands "
-            f"there a second time (first in {table.row(i)}); expected one row per vehicle and time"
+            f"{recording.path}, {recording.row(j)}: vehicle {vehicle[j]} at time {time[j]:g} s "
+            f"stands there a second time (first in {recording.row(i)}); expected one row per "
+            "vehicle and time"
         )
     cut = ~same | (step > options.max_hole + 1e-9)
     if lane is not None:
@@ -213,7 +273,7 @@ def _stints(table: Table, options: VehicleTableOptions) -> dict[str, list[_Stint
 _Platoon = tuple[list[_Stint], int, int]
 
 
-def _cut(stints: list[_Stint], options: VehicleTableOptions) -> Iterator[_Platoon]:
+def _cut(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
     """Vehicles, first and last grid time of every sequence of one lane, in order of time."""
     if not stints:
         return
@@ -229,7 +289,7 @@ def _intervals(stints: list[_Stint]) -> Iterator[_Platoon]:
         yield [s for s in stints if s.first <= first and s.last >= after - 1], first, after - 1
 
 
-def _windows(stints: list[_Stint], options: VehicleTableOptions) -> Iterator[_Platoon]:
+def _windows(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
     assert options.window is not None
     steps = round(options.window / options.dt)
     end = max(s.last for s in stints)
