@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,7 +133,7 @@ def export(config: DictConfig, folder: Path) -> None:
             "notes": counterpart.notes,
             "no_counterpart": counterpart.missing,
         }
-        place = files[0] if len(files) == 1 else files[0].parent
+        place = files[0] if len(files) == 1 else os.path.commonpath(files)
         number = "" if len(files) == 1 else f" ({len(files)} files)"
         print(f"{target}: {place}{number}")
         for line in counterpart.notes:

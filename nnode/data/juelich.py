@@ -25,6 +25,9 @@ from nnode.errors import ConfigError, DataError
 #: Units of the coordinates, with their size in m.
 UNITS = {"cm": 0.01, "m": 1.0}
 
+#: A table of frames and people may hold so many cells, or so many times its rows.
+_FRAMES, _SPARSE = 10**8, 1000
+
 _AXES = {"x": 0, "y": 1}
 _NAME = re.compile(r"(.+)\.txt")
 
@@ -92,6 +95,7 @@ def cut_people(
             f"{path.name}; expected a whole number, such as t_seq={nearest:g}"
         )
     _check_once(path, table)
+    _check_dense(path, table)
     frames, ids, x = _positions(table)
     v = _velocity(x, rate, options.velocity)
     if walls is None:
@@ -179,6 +183,17 @@ def _check_once(path: Path, table: pd.DataFrame) -> None:
         raise DataError(
             f"{path}: person {row.id:g} stands twice in frame {row.frame:g} "
             f"({int(twice.sum())} such rows); expected one row per person and frame"
+        )
+
+
+def _check_dense(path: Path, table: pd.DataFrame) -> None:
+    """Refuse a stray frame number before a table of all frames is made for it."""
+    frame = table["frame"]
+    span = int(frame.max()) - int(frame.min()) + 1
+    if span * table["id"].nunique() > max(_FRAMES, _SPARSE * len(table)):
+        raise DataError(
+            f"{path}: {len(table)} rows stand in frames {frame.min()} to {frame.max()}; expected "
+            "consecutive frame numbers: look for one that is wrong, or cut the file"
         )
 
 

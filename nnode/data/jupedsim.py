@@ -29,6 +29,12 @@ MAGIC = b"SQLite format 3\x00"
 #: Keys of the files.
 PEOPLE, GEOMETRY = "trajectories", "geometry"
 
+#: Rows that are converted together.
+_AT_ONCE = 100_000
+
+#: Whole numbers below this are exact as floating-point numbers.
+_WHOLE = 2**53
+
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
@@ -181,24 +187,33 @@ def _rate(path: Path, base: sqlite3.Connection) -> float:
 
 def _people(path: Path, base: sqlite3.Connection) -> pd.DataFrame:
     rows = base.execute(f"SELECT {', '.join(_COLUMNS)} FROM trajectory_data ORDER BY id, frame")
-    content = rows.fetchall()
-    if not content:
+    parts = []
+    while part := rows.fetchmany(_AT_ONCE):
+        parts.append(_numbers(path, part))
+    if not parts:
         raise DataError(
             f"{path}: the table trajectory_data is empty; a simulation's trajectories are in its "
             "file only after the writer was closed"
         )
-    table = pd.DataFrame(content, columns=["id", "frame", "x", "y"], dtype=object)
-    values = table.apply(pd.to_numeric, errors="coerce").astype(float)
-    whole = values[["id", "frame"]]
-    bad = ~np.isfinite(values.to_numpy()).all(axis=1) | (whole % 1 != 0).to_numpy().any(axis=1)
-    if bad.any():
-        i = int(np.flatnonzero(bad)[0])
+    table = pd.DataFrame(np.concatenate(parts), columns=["id", "frame", "x", "y"])
+    return table.astype({"id": np.int64, "frame": np.int64})
+
+
+def _numbers(path: Path, rows: list[tuple[object, ...]]) -> np.ndarray:
+    """``(rows, 4)``; SQLite lets any cell hold anything."""
+    table = pd.DataFrame(rows, dtype=object).apply(pd.to_numeric, errors="coerce")
+    values = table.to_numpy(dtype=np.float64)
+    whole = values[:, :2]
+    good = np.isfinite(values).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        good &= ((whole % 1 == 0) & (np.abs(whole) < _WHOLE)).all(axis=1)
+    if not good.all():
+        i = int(np.flatnonzero(~good)[0])
         raise DataError(
-            f"{path}, table trajectory_data: a row holds (id, frame, pos_x, pos_y) = "
-            f"{tuple(content[i])}; expected whole numbers and then coordinates in m "
-            f"({int(bad.sum())} such rows)"
+            f"{path}, table trajectory_data: a row holds (id, frame, pos_x, pos_y) = {rows[i]}; "
+            "expected whole numbers and then coordinates in m"
         )
-    return values.astype({"id": np.int64, "frame": np.int64})
+    return values
 
 
 def _area(path: Path, base: sqlite3.Connection) -> str | None:

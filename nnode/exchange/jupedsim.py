@@ -64,10 +64,11 @@ def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
 def points_per_edge(r: float, B: float, spacing: float) -> float:
     """How much stronger a long row of points acts than the nearest point of an edge.
 
-    At distance r (m), where a person touches the wall: the mean over the row's places of
-    sum exp((r - d_p)/B), which is 2 r exp(r/B) K_1(r/B) / spacing with the Bessel function K_1.
+    At distance r (m), where a person touches the wall, only the pushes' parts along the normal
+    add up: the mean over the row's places of sum exp((r - d_p)/B) r/d_p, which is
+    2 r exp(r/B) K_0(r/B) / spacing with the Bessel function K_0.
     """
-    return float(2 * r * kve(1, r / B) / spacing)
+    return float(2 * r * kve(0, r / B) / spacing)
 
 
 def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
@@ -86,7 +87,7 @@ def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
     found = Counterpart()
     walls = force.walls and scenes.points > 0
     mass = force.mass * scenes.people
-    strength = float(force.A)
+    strength, k, kappa = (float(value.detach()) for value in (force.A, force.k, force.kappa))
     obstacle = 0.0
     if walls:
         share = scenes.people / scenes.points
@@ -119,7 +120,7 @@ def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
     found.text = json.dumps(
         {
             "program": "JuPedSim >= 1.4, SocialForceModel",
-            "model": {"body_force": float(force.k), "friction": float(force.kappa)},
+            "model": {"body_force": k, "friction": kappa},
             "agent": {
                 "mass": mass,
                 "desired_speed": scenes.speed,

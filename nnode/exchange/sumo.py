@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from xml.etree import ElementTree
 
 import numpy as np
+from torch.nn import Module
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
@@ -40,7 +41,7 @@ def equilibrium_gap(law: Linear | Logarithmic, speed: float, time_gap: float = 0
     Args:
         time_gap: h of the effect of this name, s.
     """
-    v0, standstill = float(law.v0), float(law.L) + time_gap * speed
+    v0, standstill = float(law.v0.detach()), float(law.L.detach()) + time_gap * speed
     if isinstance(law, Logarithmic):
         return standstill * math.exp(speed / v0)
     return standstill / (1 - speed / v0) if speed < v0 else math.inf
@@ -66,7 +67,7 @@ def sumo_type(system: System, name: str, speed: float, length: float | None) -> 
         )
     found = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}
-    L, v0 = float(law.L), float(law.v0)
+    L, v0 = float(law.L.detach()), float(law.v0.detach())
     own = min(DEFAULT_LENGTH if length is None else length, L)
     values = {
         "id": name,
@@ -83,7 +84,7 @@ def sumo_type(system: System, name: str, speed: float, length: float | None) -> 
     limits = [v0] if isinstance(law, Linear) else []
     counted = set()
     if "free_flow_speed" in effects:
-        limits.append(float(effects["free_flow_speed"].v_max))  # type: ignore[arg-type]
+        limits.append(_value(effects["free_flow_speed"], "v_max"))
         counted.add("free_flow_speed")
     if limits:
         values["maxSpeed"] = _digits(min(limits))
@@ -94,7 +95,7 @@ def sumo_type(system: System, name: str, speed: float, length: float | None) -> 
         )
     time_gap = 0.0
     if "time_gap" in effects:
-        time_gap = float(effects["time_gap"].h)  # type: ignore[arg-type]
+        time_gap = _value(effects["time_gap"], "h")
         counted.add("time_gap")
     gap = equilibrium_gap(law, speed, time_gap)
     if speed > 0 and L < gap < math.inf:
@@ -109,7 +110,7 @@ def sumo_type(system: System, name: str, speed: float, length: float | None) -> 
             f"tau: the law has no gap at the data's median speed of {speed:.4g} m/s; SUMO's stays"
         )
     if "reaction_delay" in effects:
-        delay = float(effects["reaction_delay"].T)  # type: ignore[arg-type]
+        delay = _value(effects["reaction_delay"], "T")
         values["actionStepLength"] = _digits(delay)
         found.notes.append(
             "actionStepLength: the reaction delay; SUMO's drivers decide at such intervals, which "
@@ -123,6 +124,10 @@ def sumo_type(system: System, name: str, speed: float, length: float | None) -> 
     found.missing += effects_without(system, 1, counted)
     found.text = _document(values, found)
     return found
+
+
+def _value(effect: Module, parameter: str) -> float:
+    return float(getattr(effect, parameter).detach())
 
 
 def _digits(value: float) -> str:

@@ -27,7 +27,8 @@ def simulated(
 ) -> Iterator[Sequence]:
     """The sequences as a model moves the agents from their first measured state.
 
-    Velocities are the model's own in second-order models, else None.
+    Velocities are the model's own in second-order models, else None. Where people walk to is
+    what the simulation was told, also where that was their last measured position.
 
     Args:
         size: so many are simulated at once.
@@ -38,7 +39,7 @@ def simulated(
         v = None if path.v is None else path.v.double().cpu().numpy()
         for b, s in enumerate(group):
             part = (slice(s.n_samples), b, slice(s.n_agents))
-            yield replace(s, x=x[part], v=None if v is None else v[part])
+            yield replace(_directed(s), x=x[part], v=None if v is None else v[part])
 
 
 def write_pedpy(folder: Path, sequences: Iterable[Sequence]) -> list[Path]:
@@ -65,8 +66,13 @@ def write_parquet(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
     """
     with replacing(path) as temporary, open_writer(temporary, dims) as writer:
         for s in sequences:
-            writer.write_table(to_table(s))
+            writer.write_table(to_table(_directed(s)))
     return path
+
+
+def _directed(s: Sequence) -> Sequence:
+    """The sequence with destinations spelled out; a table's column is filled or absent."""
+    return s if s.destination is not None else replace(s, destination=s.x[-1])
 
 
 def _groups(sequences: Iterable[Sequence], size: int) -> Iterator[list[Sequence]]:
