@@ -101,7 +101,7 @@ def export(config: DictConfig, folder: Path) -> None:
     checkpoint = load_checkpoint(checkpoint_of(config.run))
     config = merge_saved(config, checkpoint.config, ("data", "solver"))
     model = checkpoint.build()
-    targets = _targets(config.to, model)
+    targets = targets_of(config.to, model)
     if config.trajectories not in SOURCES:
         raise ConfigError(
             f"trajectories={config.trajectories} is unknown, expected {', '.join(SOURCES)}"
@@ -145,8 +145,12 @@ def export(config: DictConfig, folder: Path) -> None:
     print(f"account: {folder / 'export.json'}")
 
 
-def _targets(asked: Any, model: System) -> list[str]:
-    """What is to be written, in the order of :data:`TARGETS`."""
+def targets_of(asked: Any, model: System) -> list[str]:
+    """What is to be written, in the order of :data:`TARGETS`.
+
+    Raises:
+        ConfigError: nothing, or a target that there is not.
+    """
     if asked == "auto":
         fit = {"parquet", "csv"}
         if model.find(SocialForce) is not None:

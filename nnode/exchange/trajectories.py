@@ -53,7 +53,13 @@ def write_pedpy(folder: Path, sequences: Iterable[Sequence]) -> list[Path]:
     Raises:
         DataError: a sequence of traffic, which has no second coordinate, or of one sample.
     """
-    return [_pedpy_file(folder / f"{_file_name(s.name)}.txt", s) for s in sequences]
+    files: dict[str, Path] = {}
+    for s in sequences:
+        name = _file_name(s.name)
+        while name in files:  # names may differ in signs that no file name has
+            name += "_"
+        files[name] = _pedpy_file(folder / f"{name}.txt", s)
+    return list(files.values())
 
 
 def write_parquet(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:

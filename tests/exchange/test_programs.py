@@ -187,7 +187,6 @@ def test_a_wall_pushes_alike_who_touches_it(jupedsim: ModuleType) -> None:
     s = Sequence(name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x]), walls=walls)
     content = json.loads(jupedsim_parameters(model, scenes_of([s], 0.02)).text)
     theirs, ours = accelerations(jupedsim, content, x, v), forces(model, x, v, walls)
-    # JuPedSim's push has the whole length along the normal; that of points besides is oblique
     assert theirs[0, 0] == pytest.approx(ours[0, 0], abs=1e-6)
     assert theirs[0, 1] == pytest.approx(ours[0, 1], rel=0.01)
 

@@ -61,6 +61,11 @@ def test_names_that_are_no_numbers_are_counted(tmp_path: Path, agents: tuple[str
         assert f"# {i} is {name.replace('/', ' ')}\n" in path.read_text()
 
 
+def test_no_file_is_written_twice(tmp_path: Path) -> None:
+    paths = write_pedpy(tmp_path, [walk(name="run/2"), walk(name="run_2"), walk(name="run:2")])
+    assert [p.name for p in paths] == ["run_2.txt", "run_2_.txt", "run_2__.txt"]
+
+
 def test_text_needs_two_coordinates(tmp_path: Path) -> None:
     lane = Sequence(name="a/0", recording="a", time=np.arange(3.0), x=np.zeros((3, 2, 1)))
     with pytest.raises(DataError, match=r"a/0.*two coordinates.*leave pedpy out"):
