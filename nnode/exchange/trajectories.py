@@ -102,7 +102,7 @@ def _pedpy_file(path: Path, s: Sequence) -> Path:
             f"sequence {s.name}: PedPy's text needs two coordinates and two samples, found "
             f"{s.x.shape[2]} and {s.n_samples}; leave pedpy out of to="
         )
-    own = [int(name) for name in s.agents if name.isascii() and name.isdigit()]
+    own = [int(name) for name in s.agents if name.isascii() and name.isdigit() and len(name) < 10]
     numbered = len(own) == s.n_agents and len(set(own)) == len(own)
     ids = own if numbered else list(range(1, s.n_agents + 1))
     first = round(float(s.time[0]) / s.dt)

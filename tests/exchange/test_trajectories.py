@@ -49,7 +49,9 @@ def test_text_is_read_as_it_was(tmp_path: Path, n: int, k: int, rate: float, sta
     np.testing.assert_allclose(back.time, s.time, rtol=1e-9)
 
 
-@pytest.mark.parametrize("agents", [(), ("ann", "x/cm", "framerate 7"), ("1", "01", "2")])
+@pytest.mark.parametrize(
+    "agents", [(), ("1", "2", "9" * 40), ("ann", "x/cm", "framerate 7"), ("1", "01", "2")]
+)
 def test_names_that_are_no_numbers_are_counted(tmp_path: Path, agents: tuple[str, ...]) -> None:
     s = walk(agents=agents)
     (path,) = write_pedpy(tmp_path, [s])
