@@ -12,9 +12,9 @@ import numpy as np
 
 from nnode.data.columns import Table
 from nnode.data.options import HighDOptions
+from nnode.data.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.recordings import table_path
 from nnode.data.sequence import Sequence
-from nnode.data.vehicles import Vehicles, check_cutting, cut_vehicles
 from nnode.errors import ConfigError, DataError
 
 #: How the names of a recording's three tables end.

@@ -17,9 +17,9 @@ from xml.parsers import expat
 import numpy as np
 
 from nnode.data.options import SumoOptions
+from nnode.data.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.recordings import table_path
 from nnode.data.sequence import Sequence
-from nnode.data.vehicles import Vehicles, check_cutting, cut_vehicles
 from nnode.errors import ConfigError, DataError
 
 #: Lanes within a junction have names that begin with this sign.
