@@ -27,9 +27,12 @@ from nnode.calibrate.options import (
 )
 from nnode.data.options import (
     EsimasOptions,
+    HighDOptions,
     JuelichOptions,
+    SumoOptions,
     TableOptions,
     VehicleTableOptions,
+    WalkwayOptions,
 )
 from nnode.discover.options import DiscoverOptions
 from nnode.models.options import (
@@ -70,6 +73,19 @@ class EvaluateConfig:
     solver: Any = MISSING
     device: Device = Device.auto
     part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
+
+
+@dataclass
+class ExportConfig:
+    """``scripts/export.py``: a run's results in the formats of other programs."""
+
+    run: str = MISSING  # folder of a training or a diagnosis
+    to: Any = "auto"  # jupedsim | sumo | pedpy | parquet | csv, or a list; auto: all that fit
+    trajectories: str = "both"  # measured | simulated | both
+    part: str = "all"  # heldout | train | unseen | all | auto
+    data: Any = MISSING
+    solver: Any = MISSING
+    device: Device = Device.auto
 
 
 @dataclass
@@ -148,6 +164,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
     (None, "evaluate_schema"): EvaluateConfig,
+    (None, "export_schema"): ExportConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "benchmark_schema"): BenchmarkConfig,
     (None, "study_schema"): StudyConfig,
@@ -162,6 +179,9 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("data", "vehicles_schema"): VehicleTableOptions,
     ("data", "juelich_schema"): JuelichOptions,
     ("data", "table_schema"): TableOptions,
+    ("data", "walkway_schema"): WalkwayOptions,
+    ("data", "sumo_schema"): SumoOptions,
+    ("data", "highd_schema"): HighDOptions,
     ("solver", "torchdiffeq_schema"): TorchdiffeqOptions,
     ("solver", "fused_schema"): FusedOptions,
     ("optimizer", "adadelta_schema"): AdadeltaOptions,

@@ -37,7 +37,7 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
 
 def make_absolute(data: dict[str, Any]) -> None:
     """Let a data set's files be found again from any working directory."""
-    for key in ("path", "source", "prepared", "walls"):
+    for key in ("path", "source", "prepared", "walls", "geometry"):
         place = data.get(key)
         if isinstance(place, str) and Path(place).exists():
             data[key] = str(Path(place).absolute())

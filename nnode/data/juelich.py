@@ -25,6 +25,9 @@ from nnode.errors import ConfigError, DataError
 #: Units of the coordinates, with their size in m.
 UNITS = {"cm": 0.01, "m": 1.0}
 
+#: A table of frames and people may hold so many cells, or so many times its rows.
+_FRAMES, _SPARSE = 10**8, 1000
+
 _AXES = {"x": 0, "y": 1}
 _NAME = re.compile(r"(.+)\.txt")
 
@@ -58,9 +61,32 @@ def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
     Source: Forschungszentrum Jülich, DOI 10.34735/ped.2013.5 (bi_corr) and the HERMES runs.
     """
     path = Path(path)
+    table, rate = load_people(path, options)
+    return cut_people(path, table, rate, options)
+
+
+def cut_people(
+    path: Path,
+    table: pd.DataFrame,
+    rate: float,
+    options: JuelichOptions,
+    walls: np.ndarray | None = None,
+) -> list[Sequence]:
+    """Cut tracked people into consecutive sequences, see :func:`read_juelich`.
+
+    Args:
+        path: the file they come from; its stem names the recording.
+        table: rows id, frame (whole numbers), x, y (m).
+        rate: frames per second.
+        options: duration, walking axis, walls, view and velocities.
+        walls: ``(W, 4)`` m, in place of ``options.walls``.
+
+    Raises:
+        ConfigError: an option out of its range.
+        DataError: one person twice in a frame, or no sequence at all.
+    """
     axis = int(one_of("walking_axis", options.walking_axis, _AXES))
     view = _interval("view", options.view)
-    table, rate = _load(path, options)
     steps = positive("t_seq", options.t_seq) * rate
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
         nearest = max(round(steps), 1) / rate
@@ -68,9 +94,12 @@ def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
             f"data.t_seq={options.t_seq:g} s is {steps:g} frames at the {rate:g} frames/s of "
             f"{path.name}; expected a whole number, such as t_seq={nearest:g}"
         )
+    _check_once(path, table)
+    _check_dense(path, table)
     frames, ids, x = _positions(table)
     v = _velocity(x, rate, options.velocity)
-    walls = _walls(path.stem, options.walls, axis, x, view)
+    if walls is None:
+        walls = _walls(path.stem, options.walls, axis, x, view)
     inside = np.isfinite(x[:, :, axis])
     if view is not None:
         with np.errstate(invalid="ignore"):
@@ -112,8 +141,13 @@ def _interval(option: str, value: list[float] | None) -> tuple[float, float] | N
     return numbers[0], numbers[1]
 
 
-def _load(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
-    """Rows id, frame, x, y (m) and the frame rate (1/s)."""
+def load_people(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
+    """Rows id, frame, x, y (m) of a text file, and its frame rate (1/s).
+
+    Raises:
+        ConfigError: a frame rate or unit that is unknown or contradicts the file.
+        DataError: no such file, or lines that are no trajectory (names the line).
+    """
     rate = options.frame_rate
     if rate is not None:
         positive("frame_rate", rate)
@@ -139,6 +173,10 @@ def _load(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
     table = trajectory.data[["id", "frame", "x", "y"]].reset_index(drop=True)
     if not np.isfinite(table[["x", "y"]].to_numpy()).all():
         _check_lines(path)
+    return table, float(trajectory.frame_rate)
+
+
+def _check_once(path: Path, table: pd.DataFrame) -> None:
     twice = table.duplicated(["id", "frame"])
     if twice.any():
         row = table[twice].iloc[0]
@@ -146,7 +184,17 @@ def _load(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
             f"{path}: person {row.id:g} stands twice in frame {row.frame:g} "
             f"({int(twice.sum())} such rows); expected one row per person and frame"
         )
-    return table, float(trajectory.frame_rate)
+
+
+def _check_dense(path: Path, table: pd.DataFrame) -> None:
+    """Refuse a stray frame number before a table of all frames is made for it."""
+    frame = table["frame"]
+    span = int(frame.max()) - int(frame.min()) + 1
+    if span * table["id"].nunique() > max(_FRAMES, _SPARSE * len(table)):
+        raise DataError(
+            f"{path}: {len(table)} rows stand in frames {frame.min()} to {frame.max()}; expected "
+            "consecutive frame numbers: look for one that is wrong, or cut the file"
+        )
 
 
 def _pedpy() -> ModuleType:

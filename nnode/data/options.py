@@ -81,7 +81,22 @@ class EsimasOptions(DataOptions):
 
 
 @dataclass
-class VehicleTableOptions(DataOptions):
+class LaneOptions(DataOptions):
+    """How vehicles' rows become platoons, whatever file they come from."""
+
+    domain: str = "traffic"
+    path: str = MISSING  # the file; relative to data.source where that is given
+    kinds: Any = field(default_factory=dict)  # {class code: name}; codes may be numbers
+    lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
+    dt: float = 0.2  # reference time grid, s
+    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
+    min_vehicles: int = 3
+    min_samples: int = 3
+    window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+
+
+@dataclass
+class VehicleTableOptions(LaneOptions):
     """A table with one row per vehicle and time (CSV or Parquet).
 
     ``columns`` names the table's columns by what they mean: ``vehicle``, ``time``, ``x``, and
@@ -90,22 +105,27 @@ class VehicleTableOptions(DataOptions):
     """
 
     name: str = "vehicles"
-    domain: str = "traffic"
-    path: str = MISSING  # the table; relative to data.source where that is given
     columns: dict[str, str | None] = field(default_factory=dict)
     position_unit: str = "m"  # m | ft | cm | km
     length_unit: str | None = None  # null: the unit of the positions
     speed_unit: str = "m/s"  # m/s | km/h | ft/s | mph
     time_unit: str = "s"  # s | ms | frame
     frame_rate: float | None = None  # 1/s, with time_unit=frame
-    kinds: Any = field(default_factory=dict)  # {class code: name}; codes may be numbers
-    lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
     direction: int = 1  # -1 where positions fall as vehicles drive on
-    dt: float = 0.2  # reference time grid, s
-    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
-    min_vehicles: int = 3
-    min_samples: int = 3
-    window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+
+
+@dataclass
+class SumoOptions(LaneOptions):
+    """SUMO's floating car data (fcd-output, XML, also gzipped)."""
+
+    name: str = "sumo"
+
+
+@dataclass
+class HighDOptions(LaneOptions):
+    """highD's tracks, with the tables ``tracksMeta`` and ``recordingMeta`` beside them."""
+
+    name: str = "highd"
 
 
 @dataclass
@@ -122,6 +142,15 @@ class JuelichOptions(DataOptions):
     view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
     velocity: Velocity = Velocity.forward
     min_agents: int = 1
+
+
+@dataclass
+class WalkwayOptions(JuelichOptions):
+    """One file of walking people: PedPy's text, or JuPedSim's SQLite database."""
+
+    name: str = "pedpy"
+    path: str = MISSING  # the file; relative to data.source where that is given
+    geometry: str | None = None  # text file with the walkable area as WKT, m
 
 
 @dataclass

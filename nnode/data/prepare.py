@@ -19,18 +19,24 @@ from omegaconf.errors import MissingMandatoryValue
 from nnode import __version__
 from nnode.data.download import sha256
 from nnode.data.esimas import esimas_files, read_esimas
+from nnode.data.highd import highd_files, read_highd
 from nnode.data.juelich import juelich_files, read_juelich
+from nnode.data.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
 from nnode.data.options import (
     DataOptions,
     EsimasOptions,
+    HighDOptions,
     JuelichOptions,
+    SumoOptions,
     TableOptions,
     VehicleTableOptions,
+    WalkwayOptions,
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent
 from nnode.data.quality import Fault, find_faults
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.store import Store, write_store
+from nnode.data.sumo import read_sumo, sumo_files
 from nnode.data.table import TABLE, WALLS, read_table, table_files
 from nnode.data.vehicles import read_vehicles, vehicle_files
 from nnode.errors import ConfigError, DataError
@@ -74,6 +80,12 @@ FORMATS: dict[type[DataOptions], Format] = {
     TableOptions: Format(
         table_files, lambda files, options: read_table(files[TABLE], options, files.get(WALLS))
     ),
+    WalkwayOptions: Format(
+        walkway_files,
+        lambda files, options: read_walkway(files[PEOPLE], options, files.get(GEOMETRY)),
+    ),
+    SumoOptions: Format(sumo_files, _each(read_sumo)),
+    HighDOptions: Format(highd_files, read_highd),
 }
 
 
@@ -185,7 +197,7 @@ def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
 def _preparation(options: dict[str, Any]) -> dict[str, Any]:
     """The options that decide what is prepared; of a table's path only the name."""
     chosen = {key: value for key, value in options.items() if key not in NOT_PREPARATION}
-    for key in ("path", "walls"):
+    for key in ("path", "walls", "geometry"):
         if isinstance(chosen.get(key), str):
             chosen[key] = Path(chosen[key]).name
     return chosen

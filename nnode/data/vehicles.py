@@ -1,24 +1,17 @@
-"""Reader of vehicle tables: one row per vehicle and time, as video recordings give them.
-
-The way of the data follows Section 4.2 of the calibration paper: every lane by itself, the
-lateral coordinate dropped, positions interpolated to a reference time grid, and sequences cut
-in which the same vehicles are in view.
-"""
+"""Reader of vehicle tables: one row per vehicle and time, as video recordings give them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from nnode.data.columns import Table
-from nnode.data.options import VehicleTableOptions
-from nnode.data.recordings import check_known, one_of, positive, table_path, wanted
+from nnode.data.options import LaneOptions, VehicleTableOptions
+from nnode.data.platoons import Vehicles, check_cutting, cut_vehicles
+from nnode.data.recordings import one_of, positive, table_path
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError, DataError
+from nnode.errors import ConfigError
 
 #: Metres per unit of length.
 LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
@@ -29,47 +22,18 @@ _REQUIRED = ("vehicle", "time", "x")
 _OPTIONAL = ("lane", "speed", "length", "kind")
 
 
-@dataclass(frozen=True)
-class _Stint:
-    """A vehicle's uninterrupted stay in one lane, on the reference time grid.
-
-    Sample k of ``x`` (m) and ``speed`` (m/s) belongs to the grid's time ``first + k``.
-    """
-
-    vehicle: str
-    first: int
-    x: np.ndarray
-    speed: np.ndarray | None
-    length: float
-    kind: str | None
-
-    @property
-    def last(self) -> int:
-        return self.first + len(self.x) - 1
-
-
-def vehicle_files(options: VehicleTableOptions) -> dict[str, Path]:
+def vehicle_files(options: LaneOptions) -> dict[str, Path]:
     """The table's path."""
     path = table_path(options, "path", options.path)
     return {path.stem: path}
 
 
 def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
-    """Read a table and cut it into sequences.
-
-    Without ``window`` a sequence is a maximal interval during which the same vehicles are in
-    view. With it, time is cut into consecutive windows that share their boundary sample, and a
-    sequence is a platoon of vehicles in view throughout; where a vehicle is in view for part of
-    the window, the platoon is cut at its place, so that nobody follows a vehicle that is not
-    its leader.
+    """Read a table and cut it into sequences, see :func:`nnode.data.platoons.cut_vehicles`.
 
     Args:
         path: CSV or Parquet.
         options: columns, units, lanes, time grid and the way of cutting.
-
-    Returns:
-        Sequences named ``recording/number``, recording being the file's name and the lane.
-        Vehicles are ordered by position, the leader last.
 
     Raises:
         ConfigError: an option out of its range, an unknown lane or recording.
@@ -77,49 +41,10 @@ def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
             vehicle twice at one time, or no sequence at all.
     """
     path = Path(path)
-    _check(options)
-    lanes = _stints(Table(path), options)
-    recordings = {f"{path.stem}_lane{lane}" if lane else path.stem: lane for lane in lanes}
-    asked = wanted(options.recording)
-    if asked is not None:
-        check_known(asked, recordings)
-        recordings = {name: recordings[name] for name in asked}
-    found = [
-        _sequence(f"{name}/{number:03d}", name, platoon, first, last, options.dt)
-        for name, lane in recordings.items()
-        for number, (platoon, first, last) in enumerate(_cut(lanes[lane], options))
-    ]
-    if not found:
-        vehicles = {stint.vehicle for stints in lanes.values() for stint in stints}
-        raise DataError(
-            f"{path}: no sequence; at no time are {options.min_vehicles} vehicles in one lane "
-            f"for {options.min_samples} samples of {options.dt:g} s"
-            + (f" throughout a window of {options.window:g} s" if options.window else "")
-            + f" ({len(vehicles)} vehicles, {len(lanes)} lanes); lower data.min_vehicles, "
-            "data.min_samples or data.window"
-        )
-    return found
-
-
-def _check(options: VehicleTableOptions) -> None:
-    positive("dt", options.dt)
-    positive("max_hole", options.max_hole)
-    if options.min_vehicles < 1 or options.min_samples < 1:
-        raise ConfigError("data.min_vehicles and data.min_samples must be at least 1")
     if options.direction not in (1, -1):
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
-    if options.window is not None:
-        samples = positive("window", options.window) / options.dt
-        if abs(samples - round(samples)) > 1e-6:
-            raise ConfigError(
-                f"data.window={options.window:g} s is no whole number of steps of "
-                f"data.dt={options.dt:g} s"
-            )
-        if round(samples) + 1 < options.min_samples:
-            raise ConfigError(
-                f"data.window={options.window:g} s has {round(samples) + 1} samples, fewer than "
-                f"data.min_samples={options.min_samples}"
-            )
+    check_cutting(options)
+    return cut_vehicles(_rows(Table(path), options), options, path.stem)
 
 
 def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
@@ -130,146 +55,26 @@ def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndar
     return table.numbers(column) * scale
 
 
-def _lanes(options: VehicleTableOptions, table: Table, lane: np.ndarray | None) -> list[str]:
-    if lane is None:
-        if options.lane is not None:
-            raise ConfigError(
-                f"data.lane={options.lane}, but {table.path} has no lane column; set "
-                "data.columns.lane or data.lane=null"
-            )
-        return [""]
-    present = sorted(set(lane), key=lambda name: (len(name), name))
-    if options.lane is None:
-        return present
-    chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
-    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
-    for name in names:
-        if name not in present:
-            raise ConfigError(
-                f"data.lane={name}: {table.path} has the lanes {', '.join(present[:20])}"
-            )
-    return names
-
-
-def _stints(table: Table, options: VehicleTableOptions) -> dict[str, list[_Stint]]:
-    """Every vehicle's stays by lane, on the reference time grid."""
+def _rows(table: Table, options: VehicleTableOptions) -> Vehicles:
+    """The table's columns, by what they mean."""
     names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     length_unit = options.length_unit or options.position_unit
-    vehicle = table.names(names["vehicle"])
-    time = _seconds(table, names["time"], options)
-    x = table.numbers(names["x"]) * metres * options.direction
-    lane = table.names(names["lane"]) if "lane" in names else None
-    lanes = _lanes(options, table, lane)
-    speed = length = kind = None
+    speed = length = None
     if "speed" in names:
         scale = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
         speed = np.abs(table.numbers(names["speed"])) * scale
     if "length" in names:
         scale = one_of("length_unit", length_unit, LENGTH_UNITS)
         length = table.numbers(names["length"], empty=True) * scale
-    if "kind" in names:
-        kind = table.names(names["kind"], empty=True)
-
-    ids, code = np.unique(vehicle.astype(str), return_inverse=True)
-    order = np.lexsort((time, code))
-    step = np.diff(time[order])
-    same = np.diff(code[order]) == 0
-    twice = np.flatnonzero(same & (step <= 0))
-    if twice.size:
-        i, j = sorted(order[twice[0] : twice[0] + 2])
-        raise DataError(
-            f"{table.path}, {table.row(j)}: vehicle {vehicle[j]} at time {time[j]:g} s stands "
-            f"there a second time (first in {table.row(i)}); expected one row per vehicle and time"
-        )
-    cut = ~same | (step > options.max_hole + 1e-9)
-    if lane is not None:
-        cut |= lane[order][1:] != lane[order][:-1]
-    names_of_kinds = {str(code): str(name) for code, name in dict(options.kinds).items()}
-    found: dict[str, list[_Stint]] = {name: [] for name in lanes}
-    for rows in np.split(order, np.flatnonzero(cut) + 1):
-        place = "" if lane is None else lane[rows[0]]
-        if place not in found:
-            continue
-        first = int(np.ceil(time[rows[0]] / options.dt - 1e-6))
-        last = int(np.floor(time[rows[-1]] / options.dt + 1e-6))
-        if last < first:
-            continue
-        grid = np.arange(first, last + 1) * options.dt
-        code_of_kind = "" if kind is None else kind[rows[0]]
-        found[place].append(
-            _Stint(
-                vehicle=str(ids[code[rows[0]]]),
-                first=first,
-                x=np.interp(grid, time[rows], x[rows]),
-                speed=None if speed is None else np.interp(grid, time[rows], speed[rows]),
-                length=np.nan if length is None else float(length[rows[0]]),
-                kind=None if kind is None else names_of_kinds.get(code_of_kind, code_of_kind),
-            )
-        )
-    return found
-
-
-_Platoon = tuple[list[_Stint], int, int]
-
-
-def _cut(stints: list[_Stint], options: VehicleTableOptions) -> Iterator[_Platoon]:
-    """Vehicles, first and last grid time of every sequence of one lane, in order of time."""
-    if not stints:
-        return
-    pieces = _intervals(stints) if options.window is None else _windows(stints, options)
-    for platoon, first, last in pieces:
-        if len(platoon) >= options.min_vehicles and last - first + 1 >= options.min_samples:
-            yield sorted(platoon, key=lambda s: s.x[first - s.first]), first, last
-
-
-def _intervals(stints: list[_Stint]) -> Iterator[_Platoon]:
-    changes = sorted({s.first for s in stints} | {s.last + 1 for s in stints})
-    for first, after in pairwise(changes):
-        yield [s for s in stints if s.first <= first and s.last >= after - 1], first, after - 1
-
-
-def _windows(stints: list[_Stint], options: VehicleTableOptions) -> Iterator[_Platoon]:
-    assert options.window is not None
-    steps = round(options.window / options.dt)
-    end = max(s.last for s in stints)
-    for first in range(min(s.first for s in stints), end - steps + 1, steps):
-        last = first + steps
-        seen = [s for s in stints if s.first <= last and s.last >= first]
-        whole = [s for s in seen if s.first <= first and s.last >= last]
-        if not whole:
-            continue
-        whole.sort(key=lambda s: s.x[first - s.first])
-        x = np.stack([s.x[first - s.first : last - s.first + 1] for s in whole], axis=1)
-        broken: set[int] = set()
-        for s in seen:
-            if s.first > first or s.last < last:
-                a, b = max(first, s.first), min(last, s.last)
-                own = s.x[a - s.first : b - s.first + 1]
-                behind = (x[a - first : b - first + 1] < own[:, None]).sum(axis=1)
-                broken.update(int(n) for n in behind)
-        borders = sorted({0, len(whole)} | broken)
-        for low, high in pairwise(borders):
-            yield whole[low:high], first, last
-
-
-def _sequence(
-    name: str, recording: str, platoon: list[_Stint], first: int, last: int, dt: float
-) -> Sequence:
-    def cut(values: list[np.ndarray]) -> np.ndarray:
-        parts = zip(platoon, values, strict=True)
-        return np.stack([v[first - s.first : last - s.first + 1] for s, v in parts], axis=1)
-
-    speeds = [s.speed for s in platoon if s.speed is not None]
-    kinds = tuple(s.kind for s in platoon if s.kind is not None)
-    length = np.array([s.length for s in platoon])
-    return Sequence(
-        name=name,
-        recording=recording,
-        time=np.arange(first, last + 1) * dt,
-        x=cut([s.x for s in platoon])[:, :, None],
-        v=cut(speeds)[:, :, None] if speeds else None,
-        agents=tuple(s.vehicle for s in platoon),
-        length=None if np.isnan(length).all() else length,
-        kind=kinds or None,
+    return Vehicles(
+        path=table.path,
+        row=table.row,
+        vehicle=table.names(names["vehicle"]),
+        time=_seconds(table, names["time"], options),
+        x=table.numbers(names["x"]) * metres * options.direction,
+        lane=table.names(names["lane"]) if "lane" in names else None,
+        speed=speed,
+        length=length,
+        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
     )

@@ -62,6 +62,10 @@ def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) 
         ["model=lin,log,n2", "seed=1,2,3"],
         ["model=sf", "data=hermes", "optimizer=adam", "optimizer.lr=0.1", "seed=range(3)"],
         ["data=vehicles", "data.path='a, b.csv'", "data.columns={vehicle: id, x: pos}"],
+        ["data=sumo", "data.path=fcd.xml.gz", "data.lane=e_0", "data.kinds={car: car}"],
+        ["data=highd", "data.path=01_tracks.csv", "data.window=null"],
+        ["model=sf", "data=jupedsim", "data.path=a.sqlite", "data.view=[1,9]"],
+        ["model=sf", "data=pedpy", "data.path=a.txt", "data.geometry=a.wkt"],
         ["experiment=paper_traffic", "solver.dt=null"],
         ["solver=fused", "solver.cutoff=2.5"],
         ["solver=fused", "solver.cutoff=null", "solver.cutoff_error=1e-6"],
@@ -71,7 +75,7 @@ def test_right_options_pass(overrides: list[str]) -> None:
     check_overrides(overrides, CONF, "train")
 
 
-@pytest.mark.parametrize("name", ["train", "prepare_data", "evaluate", "plot_forces"])
+@pytest.mark.parametrize("name", ["train", "prepare_data", "evaluate", "plot_forces", "export"])
 def test_every_group_of_every_script_composes(name: str) -> None:
     for group in ("model", "data", "optimizer", "solver", "experiment"):
         for file in sorted((CONF / group).glob("*.yaml")):

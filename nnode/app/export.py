@@ -1,0 +1,234 @@
+"""A run's results in the formats of other programs: ``scripts/export.py``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.app.evaluate import choose
+from nnode.app.saved import merge_saved, saved_groups
+from nnode.app.train import build_solver, set_threads, straight_loader, stream
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.distributed import World
+from nnode.calibrate.evaluate import Simulate, evaluate
+from nnode.calibrate.options import Device, SolverOptions
+from nnode.data.dataset import SequenceDataset
+from nnode.data.options import DataOptions
+from nnode.data.prepare import open_data
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError
+from nnode.exchange.counterpart import Counterpart
+from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
+from nnode.exchange.sumo import sumo_type, traffic_of
+from nnode.exchange.tables import write_csv, write_results
+from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy
+from nnode.files import write_json, write_text
+from nnode.models import Linear, Logarithmic, SocialForce, System
+
+#: What can be written, in the order in which it is.
+TARGETS = ("jupedsim", "sumo", "pedpy", "parquet", "csv")
+
+#: Which trajectories ``trajectories=`` asks for.
+SOURCES = {
+    "measured": ("measured",),
+    "simulated": ("simulated",),
+    "both": ("measured", "simulated"),
+}
+
+#: Where a training or a diagnosis leaves its calibrated model.
+BEST = Path("checkpoints") / "best.pt"
+
+
+def checkpoint_of(run: str) -> Path:
+    """The checkpoint of a run's folder; a path to a checkpoint is taken as it stands."""
+    place = Path(run).expanduser()
+    return place if place.suffix == ".pt" else place / BEST
+
+
+def groups_of_run(overrides: list[str]) -> list[str]:
+    """Overrides that choose the run's own data and solver where the user chooses none."""
+    told = []
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key == "run" and value not in ("", "null"):
+            first = value.strip("[]").split(",")[0].strip().strip("'\"")
+            override = f"checkpoint={checkpoint_of(first)}"
+        told.append(override)
+    return saved_groups(told, "checkpoint", ("data", "solver"))
+
+
+@dataclass
+class _Export:
+    """What all writers look at."""
+
+    folder: Path
+    checkpoint: Checkpoint
+    model: System
+    simulate: Simulate
+    sequences: SequenceDataset
+    device: torch.device
+    sources: tuple[str, ...]
+    batch_size: int
+
+    @property
+    def dtype(self) -> torch.dtype:
+        found: torch.dtype = getattr(torch, self.checkpoint.config["trainer"]["dtype"])
+        return found
+
+    def trajectories(self, source: str) -> Iterator[Sequence]:
+        measured = (self.sequences[i] for i in range(len(self.sequences)))
+        if source == "measured":
+            return measured
+        size = self.batch_size or len(self.sequences)
+        return simulated(self.simulate, measured, size=size, dtype=self.dtype, device=self.device)
+
+
+def export(config: DictConfig, folder: Path) -> None:
+    """Write what is asked for, say where it is and what had no counterpart.
+
+    Raises:
+        NNodeError: no such run or data, an unknown target, or one that the model does not have.
+    """
+    checkpoint = load_checkpoint(checkpoint_of(config.run))
+    config = merge_saved(config, checkpoint.config, ("data", "solver"))
+    model = checkpoint.build()
+    targets = targets_of(config.to, model)
+    if config.trajectories not in SOURCES:
+        raise ConfigError(
+            f"trajectories={config.trajectories} is unknown, expected {', '.join(SOURCES)}"
+        )
+    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
+    set_threads(checkpoint.config["trainer"]["threads"], data.domain)
+    store = open_data(data, folder / "data")
+    part, indices, _ = choose(store, checkpoint, config.part)
+    device = World().use(Device(config.device), "device")
+    model, solver = model.to(device), build_solver(solver_options, device)
+    model.scene(next(stream(straight_loader(store, indices[:1], 1))))  # of the data's domain
+    job = _Export(
+        folder=folder,
+        checkpoint=checkpoint,
+        model=model,
+        simulate=lambda batch: solver(model, batch),
+        sequences=SequenceDataset(store, indices),
+        device=device,
+        sources=SOURCES[config.trajectories],
+        batch_size=data.loader.batch_size,
+    )
+    print(f"{data.name}, {part}: {len(indices)} sequences, model {_label(checkpoint)}")
+    told: dict[str, Any] = {}
+    for target in targets:
+        files, counterpart = WRITERS[target](job)
+        told[target] = {
+            "files": [str(path.relative_to(folder)) for path in files],
+            "notes": counterpart.notes,
+            "no_counterpart": counterpart.missing,
+        }
+        place = files[0] if len(files) == 1 else os.path.commonpath(files)
+        number = "" if len(files) == 1 else f" ({len(files)} files)"
+        print(f"{target}: {place}{number}")
+        for line in counterpart.notes:
+            print(f"  {line}")
+        for line in counterpart.missing:
+            print(f"  no counterpart: {line}")
+    account = {"run": str(config.run), "part": part, "sequences": len(indices), "written": told}
+    write_json(folder / "export.json", account)
+    print(f"account: {folder / 'export.json'}")
+
+
+def targets_of(asked: Any, model: System) -> list[str]:
+    """What is to be written, in the order of :data:`TARGETS`.
+
+    Raises:
+        ConfigError: nothing, or a target that there is not.
+    """
+    if asked == "auto":
+        fit = {"parquet", "csv"}
+        if model.find(SocialForce) is not None:
+            fit.add("jupedsim")
+        if model.find(Linear) is not None or model.find(Logarithmic) is not None:
+            fit.add("sumo")
+        if model.domain == "crowd":
+            fit.add("pedpy")
+        return [name for name in TARGETS if name in fit]
+    names = [asked] if isinstance(asked, str) else list(asked or [])
+    for name in names:
+        if name not in TARGETS:
+            raise ConfigError(f"to={name} is unknown, expected auto or any of {', '.join(TARGETS)}")
+    if not names:
+        raise ConfigError(f"to=[]: expected auto or any of {', '.join(TARGETS)}")
+    return [name for name in TARGETS if name in names]
+
+
+def _label(checkpoint: Checkpoint) -> str:
+    return str(checkpoint.config["model"]["name"])
+
+
+_Written = tuple[list[Path], Counterpart]
+
+
+def _jupedsim(job: _Export) -> _Written:
+    scenes = scenes_of(job.trajectories("measured"), job.model.wall_spacing)
+    found = jupedsim_parameters(job.model, scenes)
+    return [write_text(job.folder / "jupedsim.json", found.text + "\n")], found
+
+
+def _sumo(job: _Export) -> _Written:
+    speed, length = traffic_of(job.trajectories("measured"))
+    found = sumo_type(job.model, _label(job.checkpoint), speed, length)
+    return [write_text(job.folder / "vtype.add.xml", found.text)], found
+
+
+def _pedpy(job: _Export) -> _Written:
+    files: list[Path] = []
+    for source in job.sources:
+        files += write_pedpy(job.folder / "pedpy" / source, job.trajectories(source))
+    return files, Counterpart()
+
+
+def _parquet(job: _Export) -> _Written:
+    found = Counterpart()
+    files = [
+        write_parquet(job.folder / f"{source}.parquet", job.trajectories(source), job.model.dim)
+        for source in job.sources
+    ]
+    walls = _walls(job.trajectories("measured"))
+    if len(walls) == 1 and walls[0] is not None:
+        table = pd.DataFrame(walls[0], columns=["x1", "y1", "x2", "y2"])
+        files.append(write_csv(job.folder / "walls.csv", table))
+    elif len(walls) > 1:
+        found.missing.append(f"walls: the sequences have {len(walls)} sets, a table has one")
+    return files, found
+
+
+def _walls(sequences: Iterable[Sequence]) -> list[np.ndarray | None]:
+    """Distinct sets of walls, None for none."""
+    known = {None if s.walls is None else s.walls.tobytes(): s.walls for s in sequences}
+    return list(known.values())
+
+
+def _csv(job: _Export) -> _Written:
+    convention = Convention(job.checkpoint.config["trainer"]["cost"])
+    loader = straight_loader(job.sequences.store, list(job.sequences.indices), job.batch_size)
+    metrics = evaluate(job.simulate, stream(loader, job.dtype, job.device), convention)
+    unit = "m² s" if convention is Convention.integral else "m²"
+    folder = job.folder / "csv"
+    return write_results(folder, job.checkpoint, job.model, metrics, unit), Counterpart()
+
+
+WRITERS = {
+    "jupedsim": _jupedsim,
+    "sumo": _sumo,
+    "pedpy": _pedpy,
+    "parquet": _parquet,
+    "csv": _csv,
+}

@@ -1,0 +1,268 @@
+"""From vehicles' rows to platoons: lane by lane, on one time grid, with the same vehicles in view.
+
+The way of the data follows Section 4.2 of the calibration paper: every lane by itself, the
+lateral coordinate dropped, positions interpolated to a reference time grid, and sequences cut
+in which the same vehicles are in view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from nnode.data.options import LaneOptions
+from nnode.data.recordings import check_known, positive, wanted
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicles:
+    """Rows of one recording, one per vehicle and time, in any order and in SI units.
+
+    Attributes:
+        path: the file they come from.
+        row: where the i-th row stands in the file, in words.
+        vehicle: identifiers, ``(rows,)`` text.
+        time: ``(rows,)`` s.
+        x: ``(rows,)`` m, growing as vehicles drive on.
+        lane: ``(rows,)`` names, or None where there is one lane.
+        speed: ``(rows,)`` m/s, at least 0, or None.
+        length: ``(rows,)`` m, NaN where unknown, or None.
+        kind: ``(rows,)`` class codes, or None.
+    """
+
+    path: Path
+    row: Callable[[int], str]
+    vehicle: np.ndarray
+    time: np.ndarray
+    x: np.ndarray
+    lane: np.ndarray | None = None
+    speed: np.ndarray | None = None
+    length: np.ndarray | None = None
+    kind: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class _Stint:
+    """A vehicle's uninterrupted stay in one lane, on the reference time grid.
+
+    Sample k of ``x`` (m) and ``speed`` (m/s) belongs to the grid's time ``first + k``.
+    """
+
+    vehicle: str
+    first: int
+    x: np.ndarray
+    speed: np.ndarray | None
+    length: float
+    kind: str | None
+
+    @property
+    def last(self) -> int:
+        return self.first + len(self.x) - 1
+
+
+def cut_vehicles(
+    rows: Vehicles, options: LaneOptions, stem: str, lane_word: str = "lane"
+) -> list[Sequence]:
+    """Cut a recording into sequences.
+
+    Without ``window`` a sequence is a maximal interval during which the same vehicles are in
+    view. With it, time is cut into consecutive windows that share their boundary sample, and a
+    sequence is a platoon of vehicles in view throughout; where a vehicle is in view for part of
+    the window, the platoon is cut at its place, so that nobody follows a vehicle that is not
+    its leader.
+
+    Args:
+        rows: the recording.
+        options: lanes, time grid and the way of cutting, checked by :func:`check_cutting`.
+        stem: name of the recording, to which ``_`` and the lane are added.
+        lane_word: stands before the lane's name.
+
+    Returns:
+        Sequences named ``recording/number``. Vehicles are ordered by position, the leader last.
+
+    Raises:
+        ConfigError: an unknown lane or recording.
+        DataError: one vehicle twice at one time, or no sequence at all.
+    """
+    lanes = _stints(rows, options)
+    recordings = {f"{stem}_{lane_word}{lane}" if lane else stem: lane for lane in lanes}
+    asked = wanted(options.recording)
+    if asked is not None:
+        check_known(asked, recordings)
+        recordings = {name: recordings[name] for name in asked}
+    found = [
+        _sequence(f"{name}/{number:03d}", name, platoon, first, last, options.dt)
+        for name, lane in recordings.items()
+        for number, (platoon, first, last) in enumerate(_cut(lanes[lane], options))
+    ]
+    if not found:
+        vehicles = {stint.vehicle for stints in lanes.values() for stint in stints}
+        raise DataError(
+            f"{rows.path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
+            f"lane for {options.min_samples} samples of {options.dt:g} s"
+            + (f" throughout a window of {options.window:g} s" if options.window else "")
+            + f" ({len(vehicles)} vehicles, {len(lanes)} lanes); lower data.min_vehicles, "
+            "data.min_samples or data.window"
+        )
+    return found
+
+
+def check_cutting(options: LaneOptions) -> None:
+    """Refuse options of the cutting that are out of their range.
+
+    Raises:
+        ConfigError: names the option.
+    """
+    positive("dt", options.dt)
+    positive("max_hole", options.max_hole)
+    if options.min_vehicles < 1 or options.min_samples < 1:
+        raise ConfigError("data.min_vehicles and data.min_samples must be at least 1")
+    if options.window is not None:
+        samples = positive("window", options.window) / options.dt
+        if abs(samples - round(samples)) > 1e-6:
+            raise ConfigError(
+                f"data.window={options.window:g} s is no whole number of steps of "
+                f"data.dt={options.dt:g} s"
+            )
+        if round(samples) + 1 < options.min_samples:
+            raise ConfigError(
+                f"data.window={options.window:g} s has {round(samples) + 1} samples, fewer than "
+                f"data.min_samples={options.min_samples}"
+            )
+
+
+def _lanes(options: LaneOptions, rows: Vehicles) -> list[str]:
+    if rows.lane is None:
+        if options.lane is not None:
+            raise ConfigError(
+                f"data.lane={options.lane}, but {rows.path} has no lane column; set "
+                "data.columns.lane or data.lane=null"
+            )
+        return [""]
+    present = sorted(set(rows.lane), key=lambda name: (len(name), name))
+    if options.lane is None:
+        return present
+    chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
+    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
+    for name in names:
+        if name not in present:
+            raise ConfigError(
+                f"data.lane={name}: {rows.path} has the lanes {', '.join(present[:20])}"
+            )
+    return names
+
+
+def _stints(recording: Vehicles, options: LaneOptions) -> dict[str, list[_Stint]]:
+    """Every vehicle's stays by lane, on the reference time grid."""
+    lanes = _lanes(options, recording)
+    vehicle, time, x, lane = recording.vehicle, recording.time, recording.x, recording.lane
+    speed, length, kind = recording.speed, recording.length, recording.kind
+    ids, code = np.unique(vehicle.astype(str), return_inverse=True)
+    order = np.lexsort((time, code))
+    step = np.diff(time[order])
+    same = np.diff(code[order]) == 0
+    twice = np.flatnonzero(same & (step <= 0))
+    if twice.size:
+        i, j = sorted(order[twice[0] : twice[0] + 2])
+        raise DataError(
+            f"{recording.path}, {recording.row(j)}: vehicle {vehicle[j]} at time {time[j]:g} s "
+            f"stands there a second time (first in {recording.row(i)}); expected one row per "
+            "vehicle and time"
+        )
+    cut = ~same | (step > options.max_hole + 1e-9)
+    if lane is not None:
+        cut |= lane[order][1:] != lane[order][:-1]
+    names_of_kinds = {str(code): str(name) for code, name in dict(options.kinds).items()}
+    found: dict[str, list[_Stint]] = {name: [] for name in lanes}
+    for rows in np.split(order, np.flatnonzero(cut) + 1):
+        place = "" if lane is None else lane[rows[0]]
+        if place not in found:
+            continue
+        first = int(np.ceil(time[rows[0]] / options.dt - 1e-6))
+        last = int(np.floor(time[rows[-1]] / options.dt + 1e-6))
+        if last < first:
+            continue
+        grid = np.arange(first, last + 1) * options.dt
+        code_of_kind = "" if kind is None else kind[rows[0]]
+        found[place].append(
+            _Stint(
+                vehicle=str(ids[code[rows[0]]]),
+                first=first,
+                x=np.interp(grid, time[rows], x[rows]),
+                speed=None if speed is None else np.interp(grid, time[rows], speed[rows]),
+                length=np.nan if length is None else float(length[rows[0]]),
+                kind=None if kind is None else names_of_kinds.get(code_of_kind, code_of_kind),
+            )
+        )
+    return found
+
+
+_Platoon = tuple[list[_Stint], int, int]
+
+
+def _cut(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
+    """Vehicles, first and last grid time of every sequence of one lane, in order of time."""
+    if not stints:
+        return
+    pieces = _intervals(stints) if options.window is None else _windows(stints, options)
+    for platoon, first, last in pieces:
+        if len(platoon) >= options.min_vehicles and last - first + 1 >= options.min_samples:
+            yield sorted(platoon, key=lambda s: s.x[first - s.first]), first, last
+
+
+def _intervals(stints: list[_Stint]) -> Iterator[_Platoon]:
+    changes = sorted({s.first for s in stints} | {s.last + 1 for s in stints})
+    for first, after in pairwise(changes):
+        yield [s for s in stints if s.first <= first and s.last >= after - 1], first, after - 1
+
+
+def _windows(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
+    assert options.window is not None
+    steps = round(options.window / options.dt)
+    end = max(s.last for s in stints)
+    for first in range(min(s.first for s in stints), end - steps + 1, steps):
+        last = first + steps
+        seen = [s for s in stints if s.first <= last and s.last >= first]
+        whole = [s for s in seen if s.first <= first and s.last >= last]
+        if not whole:
+            continue
+        whole.sort(key=lambda s: s.x[first - s.first])
+        x = np.stack([s.x[first - s.first : last - s.first + 1] for s in whole], axis=1)
+        broken: set[int] = set()
+        for s in seen:
+            if s.first > first or s.last < last:
+                a, b = max(first, s.first), min(last, s.last)
+                own = s.x[a - s.first : b - s.first + 1]
+                behind = (x[a - first : b - first + 1] < own[:, None]).sum(axis=1)
+                broken.update(int(n) for n in behind)
+        borders = sorted({0, len(whole)} | broken)
+        for low, high in pairwise(borders):
+            yield whole[low:high], first, last
+
+
+def _sequence(
+    name: str, recording: str, platoon: list[_Stint], first: int, last: int, dt: float
+) -> Sequence:
+    def cut(values: list[np.ndarray]) -> np.ndarray:
+        parts = zip(platoon, values, strict=True)
+        return np.stack([v[first - s.first : last - s.first + 1] for s, v in parts], axis=1)
+
+    speeds = [s.speed for s in platoon if s.speed is not None]
+    kinds = tuple(s.kind for s in platoon if s.kind is not None)
+    length = np.array([s.length for s in platoon])
+    return Sequence(
+        name=name,
+        recording=recording,
+        time=np.arange(first, last + 1) * dt,
+        x=cut([s.x for s in platoon])[:, :, None],
+        v=cut(speeds)[:, :, None] if speeds else None,
+        agents=tuple(s.vehicle for s in platoon),
+        length=None if np.isnan(length).all() else length,
+        kind=kinds or None,
+    )

@@ -1,0 +1,149 @@
+"""Exporting a run: every target from end to end, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import nnode
+from nnode.app.export import TARGETS, checkpoint_of, groups_of_run, targets_of
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.data.juelich import read_juelich
+from nnode.data.options import JuelichOptions, TableOptions
+from nnode.data.table import read_table
+from nnode.errors import CheckpointError, ConfigError
+from nnode.models import Linear, Relaxation, SocialForce, Traffic
+from nnode.models.crowd import NetworkForce
+from nnode.models.system import Crowd
+from tests.app.conftest import Script
+
+
+def trained(script: Script, raw: Path, folder: Path, domain: str, model: str) -> Path:
+    """The folder of a short training."""
+    done = script(
+        "train",
+        f"experiment=demo_{domain}",
+        f"model={model}",
+        "trainer.max_epochs=2",
+        f"data.source={raw}",
+        f"hydra.run.dir={folder}",
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def traffic(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(script, raw, tmp_path_factory.mktemp("runs") / "traffic", "traffic", "lin")
+
+
+@pytest.fixture(scope="module")
+def crowd(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(script, raw, tmp_path_factory.mktemp("runs") / "crowd", "crowd", "sf")
+
+
+def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Path) -> None:
+    done = script("export", f"run={traffic}", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    account = json.loads((tmp_path / "export.json").read_text())
+    assert list(account["written"]) == ["sumo", "parquet", "csv"]
+    for entry in account["written"].values():
+        for name in entry["files"]:
+            assert (tmp_path / name).is_file()
+    assert "no counterpart: " in done.stdout
+
+    model = nnode.load(checkpoint_of(str(traffic)))
+    known = {name: float(value) for name, (value, _) in model.physical().items()}
+    table = pd.read_csv(tmp_path / "csv" / "parameters.csv").set_index("parameter")
+    assert table["value"].to_dict() == pytest.approx(known, rel=1e-15)
+    assert table["unit"].to_dict() == {"v0": "m/s", "L": "m"}
+    (kind,) = ElementTree.parse(tmp_path / "vtype.add.xml").iter("vType")
+    room = float(kind.attrib["length"]) + float(kind.attrib["minGap"])
+    assert room == pytest.approx(known["L"], rel=1e-5)
+
+    measured, simulated = (
+        read_table(path, TableOptions(domain="traffic", path=str(path)))
+        for path in (tmp_path / "measured.parquet", tmp_path / "simulated.parquet")
+    )
+    assert len(measured) == account["sequences"]
+    errors: dict[int, list[float]] = {}
+    for a, b in zip(measured, simulated, strict=True):
+        assert (a.name, a.agents) == (b.name, b.agents)
+        np.testing.assert_array_equal(a.x[0], b.x[0])
+        for k in range(1, a.n_samples):
+            errors.setdefault(k, []).extend(((a.x[k] - b.x[k]) ** 2).ravel())
+    horizons = pd.read_csv(tmp_path / "csv" / "horizons.csv")
+    expected = [np.sqrt(np.mean(errors[k])) for k in sorted(errors)]
+    np.testing.assert_allclose(horizons["rmse_m"], expected, rtol=1e-9)
+    history = pd.read_csv(tmp_path / "csv" / "history.csv")
+    assert {"cost/train", "cost/heldout", "parameters/v0"} <= set(history["quantity"])
+
+
+@pytest.mark.slow
+def test_crowd_held_out_and_simulated(script: Script, crowd: Path, tmp_path: Path) -> None:
+    done = script(
+        "export",
+        f"run={crowd}",
+        "to=[pedpy,jupedsim,csv]",
+        "part=heldout",
+        "trajectories=simulated",
+        f"hydra.run.dir={tmp_path}",
+    )
+    assert done.returncode == 0, done.stderr
+    heldout = load_checkpoint(checkpoint_of(str(crowd))).split["heldout"]
+    files = sorted((tmp_path / "pedpy" / "simulated").iterdir())
+    assert len(files) == len(heldout) > 0
+    assert not (tmp_path / "pedpy" / "measured").exists()
+    assert read_juelich(files[0], JuelichOptions(t_seq=0.04))[0].dt == pytest.approx(0.04)
+    table = pd.read_csv(tmp_path / "csv" / "sequences.csv")
+    assert sorted(table["sequence"]) == sorted(heldout)
+    assert set(table["part"]) == {"heldout"}
+
+    content = json.loads((tmp_path / "jupedsim.json").read_text())
+    model = nnode.load(checkpoint_of(str(crowd)))
+    known = {name: float(value) for name, (value, _) in model.physical().items()}
+    assert content["agent"]["agent_scale"] == pytest.approx(known["A"])
+    assert content["model"] == pytest.approx({"body_force": known["k"], "friction": known["kappa"]})
+    assert content["agent"]["obstacle_scale"] > 0
+
+
+def test_one_clear_error(script: Script, traffic: Path, tmp_path: Path) -> None:
+    done = script("export", f"run={traffic}", "to=[csv,jupedsim]", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    assert "to=jupedsim" in errors[0]
+    assert "no social force" in errors[0]
+    assert not (tmp_path / "export.json").exists()
+
+
+def test_which_targets_fit() -> None:
+    force = SocialForce(1.0, 1.0, 1.0)
+    assert targets_of("auto", Traffic([Linear()])) == ["sumo", "parquet", "csv"]
+    assert targets_of("auto", Crowd([force])) == ["jupedsim", "pedpy", "parquet", "csv"]
+    assert targets_of("auto", Crowd([Relaxation(), NetworkForce()])) == ["pedpy", "parquet", "csv"]
+    assert targets_of(["csv", "pedpy"], Crowd([force])) == ["pedpy", "csv"]
+    assert targets_of("sumo", Crowd([force])) == ["sumo"]  # refused later, with the reason
+    for asked in ("vadere", ["csv", "vadere"], [], None):
+        with pytest.raises(ConfigError, match=", ".join(TARGETS)):
+            targets_of(asked, Crowd([force]))
+
+
+def test_a_run_is_named_by_folder_or_checkpoint(tmp_path: Path) -> None:
+    assert checkpoint_of(str(tmp_path)) == tmp_path / "checkpoints" / "best.pt"
+    assert checkpoint_of(str(tmp_path / "last.pt")) == tmp_path / "last.pt"
+    with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
+        groups_of_run([f"run={tmp_path}"])
+    assert groups_of_run(["to=csv"]) == []
+
+
+def test_the_run_s_own_data_and_solver_are_chosen(traffic: Path) -> None:
+    run = f"run={traffic}"
+    assert groups_of_run([run]) == ["data=demo_traffic", "solver=torchdiffeq"]
+    assert groups_of_run([run, "solver=fused"]) == ["data=demo_traffic"]

@@ -1,0 +1,212 @@
+"""Calibrated parameters as those of JuPedSim and SUMO, and what has no counterpart."""
+
+from __future__ import annotations
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nnode.data.sequence import Sequence, collate
+from nnode.errors import ConfigError
+from nnode.exchange.jupedsim import Scenes, jupedsim_parameters, points_per_edge, scenes_of
+from nnode.exchange.sumo import equilibrium_gap, sumo_type, traffic_of
+from nnode.models import (
+    Crowd,
+    Linear,
+    Logarithmic,
+    NetworkForce,
+    NetworkSpeed,
+    Relaxation,
+    SocialForce,
+    System,
+    Traffic,
+)
+from nnode.models.build import add_effects
+from nnode.models.term import State
+
+SCENES = Scenes(people=12.0, points=50.0, spacing=0.25, speed=1.3)
+
+
+def crowd(**options: object) -> Crowd:
+    force = SocialForce(30.0, 10.0, 5.0, **options)  # type: ignore[arg-type]
+    return Crowd([Relaxation(0.7), force])
+
+
+def test_social_force_by_jupedsim_s_names() -> None:
+    found = jupedsim_parameters(crowd(r=0.2, B=0.1, mass=2.0), SCENES)
+    content = json.loads(found.text)
+    assert content["model"] == {"body_force": 10.0, "friction": 5.0}
+    agent = content["agent"]
+    obstacle = agent.pop("obstacle_scale")
+    assert obstacle == pytest.approx(30 * 12 / 50 * points_per_edge(0.2, 0.1, 0.25))
+    assert agent == {
+        "mass": 24.0,
+        "desired_speed": 1.3,
+        "reaction_time": 0.7,
+        "agent_scale": 30.0,
+        "force_distance": 0.1,
+        "radius": 0.2,
+    }
+    assert content["no_counterpart"] == found.missing
+
+
+def test_what_jupedsim_cannot_say() -> None:
+    plain = jupedsim_parameters(crowd(), SCENES).missing
+    assert not any("opposing" in line or "effect" in line for line in plain)
+    model = crowd(opposing_wall_friction=True)
+    add_effects(model, [{"name": "side_preference"}])
+    missing = jupedsim_parameters(model, SCENES).missing
+    assert len(missing) == len(plain) + 2
+    assert any("opposing_wall_friction" in line for line in missing)
+    assert any("side_preference" in line for line in missing)
+
+
+def test_without_walls_nobody_is_pushed_by_them() -> None:
+    for model, points in ((crowd(walls=False), 50.0), (crowd(), 0.0)):
+        found = jupedsim_parameters(model, Scenes(12.0, points, 0.25, 1.3))
+        assert json.loads(found.text)["agent"]["obstacle_scale"] == 0
+        assert not any("walls" in line for line in found.missing)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [Crowd([Relaxation(), NetworkForce()]), Traffic([Linear()])],
+)
+def test_jupedsim_knows_no_other_model(model: System) -> None:
+    with pytest.raises(ConfigError, match=r"to=jupedsim: .* no social force"):
+        jupedsim_parameters(model, SCENES)
+
+
+@given(r=st.floats(0.1, 0.5), B=st.floats(0.05, 1.0))
+@settings(max_examples=30, deadline=None)
+def test_points_per_edge_is_the_sum_over_a_row(r: float, B: float) -> None:
+    spacing = 0.02  # so fine that the sum does not depend on where the row begins
+    y = spacing * np.arange(-4000, 4001)
+    d = np.hypot(r, y)
+    row = (np.exp((r - d) / B) * r / d).sum()
+    assert points_per_edge(r, B, spacing) == pytest.approx(row, rel=1e-3)
+
+
+def test_scenes_are_means_over_sequences() -> None:
+    time = 0.1 * np.arange(3)
+    walls = np.array([[0.0, 0, 4, 0], [4, 2, 0, 2]])
+
+    def people(n: int, speed: float, walls: np.ndarray | None) -> Sequence:
+        x = np.zeros((3, n, 2))
+        x[:, :, 0] = speed * time[:, None]
+        return Sequence(name=str(n), recording="a", time=time, x=x, walls=walls)
+
+    scenes = scenes_of([people(2, 1.0, walls), people(6, 1.5, None)], 0.25)
+    assert (scenes.people, scenes.points) == (4.0, 17.0)
+    assert scenes.spacing == pytest.approx(0.25)
+    assert scenes.speed == pytest.approx(1.5)
+
+
+def values(model: System, speed: float = 15.0, length: float | None = 4.2) -> dict[str, str]:
+    (kind,) = ElementTree.fromstring(sumo_type(model, "lin", speed, length).text).iter("vType")
+    return dict(kind.attrib)
+
+
+def test_a_linear_law_as_a_vehicle_type() -> None:
+    found = values(Traffic([Linear(30.0, 7.0)]))
+    assert found["id"] == "lin"
+    assert (float(found["length"]), float(found["minGap"])) == (4.2, pytest.approx(2.8))
+    assert float(found["maxSpeed"]) == 30
+    # at 15 m/s the law asks for twice the gap at rest
+    assert float(found["tau"]) == pytest.approx(7 / 15, rel=1e-5)
+    assert "actionStepLength" not in found
+
+
+def test_a_law_shorter_than_a_car() -> None:
+    found = values(Traffic([Linear(30.0, 3.5)]), length=None)
+    assert (float(found["length"]), float(found["minGap"])) == (3.5, 0)
+
+
+def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
+    model = Traffic([Logarithmic(10.0, 6.0)])
+    assert "maxSpeed" not in values(model)
+    assert any("v0 = 10" in line for line in sumo_type(model, "log", 15.0, None).missing)
+    assert float(values(model)["tau"]) == pytest.approx(6 * (np.exp(1.5) - 1) / 15, rel=1e-5)
+
+
+def test_effects_with_a_counterpart() -> None:
+    model = Traffic([Linear(30.0, 7.0)])
+    chosen = [
+        {"name": "reaction_delay", "T": 0.8},
+        {"name": "free_flow_speed", "v_max": 25.0},
+        {"name": "time_gap", "h": 0.2},
+        {"name": "relative_speed", "kappa": 0.3},
+    ]
+    add_effects(model, chosen)
+    found = values(model)
+    assert float(found["actionStepLength"]) == pytest.approx(0.8)
+    assert float(found["maxSpeed"]) == 25
+    assert float(found["tau"]) == pytest.approx((2 * (7 + 0.2 * 15) - 7) / 15, rel=1e-5)
+    told = [t for t in sumo_type(model, "lin", 15.0, None).missing if t.startswith("effect")]
+    assert len(told) == 1
+    assert "relative_speed" in told[0]
+
+
+@pytest.mark.parametrize("speed", [0.0, 30.0, 35.0])
+def test_no_gap_at_the_recorded_speed(speed: float) -> None:
+    model = Traffic([Linear(30.0, 7.0)])
+    assert "tau" not in values(model, speed)
+    assert any(t.startswith("tau") for t in sumo_type(model, "lin", speed, None).missing)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [crowd(), Traffic([NetworkSpeed(4)])],
+)
+def test_sumo_knows_no_other_model(model: System) -> None:
+    with pytest.raises(ConfigError, match=r"to=sumo: .* no law with a gap at rest"):
+        sumo_type(model, "x", 15.0, None)
+
+
+@given(v0=st.floats(5, 50), L=st.floats(2, 15), share=st.floats(0.01, 0.95), log=st.booleans())
+@settings(max_examples=50, deadline=None)
+def test_at_its_equilibrium_gap_a_law_drives_at_that_speed(
+    v0: float, L: float, share: float, log: bool
+) -> None:
+    law = Logarithmic(v0, L) if log else Linear(v0, L)
+    speed = share * v0
+    gap = torch.tensor(equilibrium_gap(law, speed), dtype=torch.float64)
+    assert float(law.speed(gap).detach()) == pytest.approx(speed, rel=1e-9)
+
+
+@pytest.mark.parametrize("h", [-0.1, 0.3])
+def test_the_time_gap_s_equilibrium_is_the_model_s(h: float) -> None:
+    model = Traffic([Linear(30.0, 7.0)])
+    add_effects(model, [{"name": "time_gap", "h": h}])
+    law = model.find(Linear)
+    assert law is not None
+    gap = equilibrium_gap(law, 12.0, h)
+    lead = equilibrium_gap(law, 12.0, h)
+    # the leader's constant speed is that of the equilibrium
+    with torch.no_grad():
+        law.v0.fill_(30.0)
+    x = np.array([0.0, gap, gap + lead])[None, :, None] + 12 * 0.1 * np.arange(3)[:, None, None]
+    batch = collate([Sequence(name="a", recording="a", time=0.1 * np.arange(3), x=x)])
+    model.leader = "measured"
+    scene = model.scene(batch)
+    state = State(torch.tensor(0.0), batch.x[0], None, scene)
+    rate = model.acceleration(state).detach()[0, :, 0]
+    np.testing.assert_allclose(rate[:2], 12.0)
+
+
+def test_traffic_is_the_median_over_all_sequences() -> None:
+    time = 0.2 * np.arange(4)
+
+    def cars(speed: float, length: np.ndarray | None) -> Sequence:
+        x = np.array([0.0, 30.0])[None, :, None] + speed * time[:, None, None]
+        return Sequence(name=f"{speed}", recording="a", time=time, x=x, length=length)
+
+    speed, length = traffic_of([cars(10, np.array([4.0, np.nan])), cars(20, np.array([6.0, 9.0]))])
+    assert speed == pytest.approx(15.0)
+    assert length == 6.0
+    assert traffic_of([cars(10, None)])[1] is None

@@ -1,0 +1,291 @@
+"""The neighbouring programs themselves: they write what is read here, and read what is written."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import warnings
+from pathlib import Path
+from types import ModuleType
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.data.jupedsim import read_walkway, walls_of
+from nnode.data.options import Faults, SumoOptions, WalkwayOptions
+from nnode.data.prepare import prepare
+from nnode.data.sequence import Sequence, collate
+from nnode.data.store import Store
+from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
+from nnode.exchange.sumo import equilibrium_gap, sumo_type
+from nnode.exchange.trajectories import write_pedpy
+from nnode.models import Crowd, Linear, Relaxation, SocialForce, Traffic
+from nnode.models.term import State
+from tests.app.conftest import Script, script  # noqa: F401
+
+ROOM = [(0, 0), (12, 0), (12, 4), (0, 4)]
+PILLAR = [(5.5, 1.8), (6.5, 1.8), (6.5, 2.2), (5.5, 2.2)]
+
+
+@pytest.fixture(scope="module")
+def jupedsim() -> ModuleType:
+    found: ModuleType = pytest.importorskip("jupedsim", minversion="1.4")
+    return found
+
+
+@pytest.fixture(scope="module")
+def walked(jupedsim: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four people who walk past a pillar for 5 s, simulated by JuPedSim."""
+    import shapely
+
+    path = tmp_path_factory.mktemp("jupedsim") / "walk.sqlite"
+    writer = jupedsim.SqliteTrajectoryWriter(output_file=path, every_nth_frame=4)
+    room = shapely.Polygon(ROOM, holes=[PILLAR])
+    simulation = jupedsim.Simulation(
+        model=jupedsim.SocialForceModel(), geometry=room, dt=0.01, trajectory_writer=writer
+    )
+    target = simulation.add_exit_stage([(11.5, 0.2), (11.9, 0.2), (11.9, 3.8), (11.5, 3.8)])
+    journey = simulation.add_journey(jupedsim.JourneyDescription([target]))
+    for i in range(4):
+        simulation.add_agent(
+            jupedsim.SocialForceModelAgentParameters(
+                position=(1, 0.6 + 0.9 * i), journey_id=journey, stage_id=target, radius=0.2
+            )
+        )
+    for _ in range(500):
+        simulation.iterate()
+    writer.close()
+    return path
+
+
+def test_a_simulation_by_jupedsim_is_read(walked: Path, tmp_path: Path) -> None:
+    options = WalkwayOptions(path=str(walked), faults=Faults.error)
+    store = prepare(options, tmp_path / "out")
+    assert (len(store), store.manifest["dt"], store[0].n_agents) == (5, 0.04, 4)
+    start = store[0].x[0]
+    np.testing.assert_allclose(
+        start[np.argsort(start[:, 1])], [[1, 0.6 + 0.9 * i] for i in range(4)]
+    )
+    walls = store[0].walls
+    assert walls is not None
+    assert {tuple(w[:2]) for w in walls} == {(float(x), float(y)) for x, y in ROOM + PILLAR}
+    centre = np.array([6.0, 1.0])  # beside the pillar: on the left of its nearest edges
+    for x1, y1, x2, y2 in walls:
+        if y1 == y2 and y1 in (0, 1.8):
+            assert (x2 - x1) * (centre[1] - y1) > 0
+
+
+@pytest.mark.slow
+def test_a_simulation_by_jupedsim_calibrates(
+    walked: Path,
+    tmp_path: Path,
+    script: Script,  # noqa: F811
+) -> None:
+    done = script(
+        "train",
+        "model=sf",
+        "data=jupedsim",
+        f"data.path={walked}",
+        "data.split.heldout=0",
+        "trainer.max_epochs=3",
+        f"hydra.run.dir={tmp_path}",
+    )
+    assert done.returncode == 0, done.stderr
+    history = load_checkpoint(tmp_path / "checkpoints" / "best.pt").history
+    assert history[-1]["cost/train"] < history[0]["cost/train"]
+
+
+def test_pedpy_reads_the_same_database(walked: Path) -> None:
+    pedpy = pytest.importorskip("pedpy")
+    area = pedpy.load_walkable_area_from_jupedsim_sqlite(trajectory_file=walked)
+    theirs = pedpy.load_trajectory_from_jupedsim_sqlite(trajectory_file=walked)
+    ours = read_walkway(walked, WalkwayOptions(path=str(walked), t_seq=5.0))[0]
+    np.testing.assert_array_equal(walls_of(area.polygon.wkt, "").shape, ours.walls.shape)
+    assert theirs.frame_rate == pytest.approx(1 / ours.dt)
+    for n, agent in enumerate(ours.agents):
+        rows = theirs.data[theirs.data["id"] == int(agent)].sort_values("frame")
+        np.testing.assert_allclose(ours.x[:, n], rows[["x", "y"]].to_numpy()[: ours.n_samples])
+
+
+def test_pedpy_reads_the_text(tmp_path: Path) -> None:
+    pedpy = pytest.importorskip("pedpy")
+    time = 0.04 * np.arange(10, 36)
+    x = np.stack([np.stack([1.3 * time, 0 * time + n], -1) for n in range(3)], 1)
+    s = Sequence(name="a/000", recording="a", time=time, x=x, agents=("4", "9", "11"))
+    (path,) = write_pedpy(tmp_path, [s])
+    trajectory = pedpy.load_trajectory(trajectory_file=path)
+    assert trajectory.frame_rate == 25
+    assert sorted(set(trajectory.data["id"])) == [4, 9, 11]
+    assert trajectory.data["frame"].min() == 10
+    speed = pedpy.compute_individual_speed(traj_data=trajectory, frame_step=1)
+    np.testing.assert_allclose(speed["speed"], 1.3, atol=1e-4)
+
+
+def accelerations(jupedsim: ModuleType, content: dict, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """What JuPedSim's people feel who want to go nowhere: their change of velocity by time."""
+    import shapely
+
+    dt = 1e-4
+    simulation = jupedsim.Simulation(
+        model=jupedsim.SocialForceModel(**content["model"]),
+        geometry=shapely.Polygon(ROOM),
+        dt=dt,
+    )
+    target = simulation.add_waypoint_stage((11, 3.5), 0.1)
+    journey = simulation.add_journey(jupedsim.JourneyDescription([target]))
+    agent = {**content["agent"], "desired_speed": 1e-12}
+    ids = [
+        simulation.add_agent(
+            jupedsim.SocialForceModelAgentParameters(
+                position=tuple(place),
+                velocity=tuple(speed),
+                journey_id=journey,
+                stage_id=target,
+                **agent,
+            )
+        )
+        for place, speed in zip(x, v, strict=True)
+    ]
+    simulation.iterate()
+    found = np.array([simulation.agent(i).model.velocity for i in ids])
+    return (found - v) / dt + v / agent["reaction_time"]
+
+
+def forces(model: Crowd, x: np.ndarray, v: np.ndarray, walls: np.ndarray | None) -> np.ndarray:
+    """What the model's own interaction gives."""
+    s = Sequence(
+        name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), walls=walls,
+        v=np.stack([v, v]),
+    )  # fmt: skip
+    batch = collate([s])
+    state = State(torch.tensor(0.0), batch.x[0], batch.v[0], model.scene(batch))
+    force = model.find(SocialForce)
+    assert force is not None
+    return force(state)[0].detach().numpy()
+
+
+def test_people_push_each_other_alike_in_jupedsim(jupedsim: ModuleType) -> None:
+    model = Crowd([Relaxation(0.5), SocialForce(20.0, 30.0, 40.0, B=0.3, mass=1.5)])
+    # the middle pair touches, all are near each other and far from walls
+    x = np.array([[5.0, 2.0], [5.4, 2.1], [5.5, 1.4], [4.6, 2.5]])
+    v = np.array([[1.0, 0.2], [-0.8, 0.1], [0.3, 0.9], [0.0, -1.0]])
+    s = Sequence(name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]))
+    content = json.loads(jupedsim_parameters(model, scenes_of([s], 0.25)).text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # the names are those of today
+        theirs = accelerations(jupedsim, content, x, v)
+    np.testing.assert_allclose(theirs, forces(model, x, v, None), rtol=1e-3, atol=1e-3)
+
+
+def test_a_wall_pushes_alike_who_touches_it(jupedsim: ModuleType) -> None:
+    model = Crowd([Relaxation(0.5), SocialForce(20.0, 0.0, 0.0, B=0.2)], wall_spacing=0.02)
+    walls = np.hstack([ROOM, np.roll(ROOM, -1, axis=0)]).astype(float)
+    x, v = np.array([[6.0, 0.25]]), np.zeros((1, 2))
+    s = Sequence(name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x]), walls=walls)
+    content = json.loads(jupedsim_parameters(model, scenes_of([s], 0.02)).text)
+    theirs, ours = accelerations(jupedsim, content, x, v), forces(model, x, v, walls)
+    assert theirs[0, 0] == pytest.approx(ours[0, 0], abs=1e-6)
+    assert theirs[0, 1] == pytest.approx(ours[0, 1], rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def sumo() -> Path:
+    """The folder of SUMO's programs."""
+    return Path(pytest.importorskip("sumo").SUMO_HOME) / "bin"
+
+
+@pytest.fixture(scope="module")
+def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A straight road of 3 km, as a network for SUMO."""
+    folder = tmp_path_factory.mktemp("sumo")
+    (folder / "a.nod.xml").write_text(
+        '<nodes><node id="a" x="0" y="0"/><node id="b" x="3000" y="0"/></nodes>'
+    )
+    (folder / "a.edg.xml").write_text(
+        '<edges><edge id="e" from="a" to="b" numLanes="1" speed="50"/></edges>'
+    )
+    call(sumo / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
+         "-o", folder / "a.net.xml")  # fmt: skip
+    return folder / "a.net.xml"
+
+
+def call(*arguments: object) -> None:
+    done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> Path:
+    """Four vehicles of type ``own`` behind one of type ``lead``; returns SUMO's data of them."""
+    cars = "".join(
+        f'<vehicle id="c{i}" type="{"own" if i else "lead"}" route="r" depart="0" '
+        f'departPos="{300 - 40 * i}" departSpeed="10"/>'
+        for i in range(5)
+    )
+    (folder / "a.rou.xml").write_text(f'<routes><route id="r" edges="e"/>{cars}</routes>')
+    call(sumo / "sumo", "-n", road, "-a", types, "-r", folder / "a.rou.xml", "--step-length", 0.2,
+         "--end", seconds, "--fcd-output", folder / "fcd.xml.gz", "--fcd-output.attributes",
+         "id,type,speed,pos,lane")  # fmt: skip
+    return folder / "fcd.xml.gz"
+
+
+@pytest.fixture
+def types(tmp_path: Path) -> Path:
+    (tmp_path / "types.add.xml").write_text(
+        '<additional><vType id="lead" maxSpeed="12" speedDev="0" sigma="0"/>'
+        '<vType id="own" length="4.5" speedDev="0"/></additional>'
+    )
+    return tmp_path / "types.add.xml"
+
+
+def test_a_platoon_by_sumo_is_read(sumo: Path, road: Path, types: Path, tmp_path: Path) -> None:
+    path = platoon(sumo, road, tmp_path, types, 31)
+    store = prepare(SumoOptions(path=str(path), window=10.0, faults=Faults.error), tmp_path / "out")
+    assert len(store) == 3
+    assert store[0].agents == ("c4", "c3", "c2", "c1", "c0")
+    assert store[0].kind == ("own",) * 4 + ("lead",)
+    assert store[2].v is not None
+    np.testing.assert_allclose(store[2].v[-1], 12.0, atol=1.0)
+    np.testing.assert_allclose(np.diff(store[2].x[:, -1, 0]), 2.4, atol=0.011)
+
+
+@pytest.mark.slow
+def test_a_platoon_by_sumo_calibrates(
+    sumo: Path,
+    road: Path,
+    types: Path,
+    tmp_path: Path,
+    script: Script,  # noqa: F811
+) -> None:
+    path = platoon(sumo, road, tmp_path, types, 31)
+    run = tmp_path / "run"
+    done = script(
+        "train",
+        "model=lin",
+        "data=sumo",
+        f"data.path={path}",
+        "data.split.heldout=0",
+        "solver=fused",
+        "trainer.max_epochs=5",
+        f"hydra.run.dir={run}",
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(Store(run / "data")) == 3
+    history = load_checkpoint(run / "checkpoints" / "best.pt").history
+    assert history[-1]["cost/train"] < history[0]["cost/train"]
+
+
+def test_sumo_s_drivers_keep_the_law_s_gap(sumo: Path, road: Path, tmp_path: Path) -> None:
+    model, speed = Traffic([Linear(25.0, 6.5)]), 12.0
+    law = model.find(Linear)
+    assert law is not None
+    root = ElementTree.fromstring(sumo_type(model, "own", speed, 4.0).text)
+    ElementTree.SubElement(root, "vType", id="lead", length="4", maxSpeed="12", speedDev="0")
+    types = tmp_path / "types.add.xml"
+    ElementTree.ElementTree(root).write(types)
+    path = platoon(sumo, road, tmp_path, types, 121)
+    (s,) = prepare(SumoOptions(path=str(path), window=120.0), tmp_path / "out")
+    gap = np.diff(s.x[-1, :, 0])
+    np.testing.assert_allclose(gap, equilibrium_gap(law, speed), atol=0.1)
