@@ -36,3 +36,11 @@ class CheckpointError(NNodeError):
 
 class StudyError(NNodeError):
     """Tasks of a study failed, or its worker processes cannot run; what is done is kept."""
+
+
+class WriteError(NNodeError):
+    """Nothing can be written, as where a disk is full; what was written before is kept."""
+
+
+class FolderInUseError(NNodeError):
+    """Another run works in the folder."""

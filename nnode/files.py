@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from nnode.errors import WriteError
+
+#: Ends the names of files that are being written; ``.NAME.PROCESS`` stands before it.
+PARTIAL = ".partial"
+
+#: What the system answers where there is no room, or where nothing may be written.
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
 
 @contextmanager
@@ -20,13 +29,34 @@ def replacing(path: Path) -> Iterator[Path]:
         OSError: the folder cannot be made or written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
     try:
         yield temporary
         os.replace(temporary, path)
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+@contextmanager
+def disk_words(folder: Path) -> Iterator[None]:
+    """Say in words that a disk is full, or that nothing may be written.
+
+    Args:
+        folder: where the work inside writes.
+
+    Raises:
+        WriteError: for the system's errors of that kind; all others pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        raise WriteError(
+            f"{error.filename or folder} cannot be written: {error.strerror}. What was written "
+            "before is kept; make room, or choose another folder with hydra.run.dir="
+        ) from error
 
 
 def write_text(path: Path, text: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ from nnode.calibrate.distributed import World, join
 from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
+from nnode.files import disk_words
 
 Job = Callable[[DictConfig, Path], None]
 
@@ -61,6 +63,8 @@ def run(
     if has_no_part(parallel):
         return
     register()
+    # on a full disk the log cannot be written either, which shall not bury the run's own words
+    logging.raiseExceptions = False
     folder = Path(sys.argv[0]).resolve().parent.parent / "conf"
     try:
         if parallel:
@@ -74,7 +78,7 @@ def run(
             failed = failures()
     except NNodeError as error:
         _end(error)
-    except _Escape as escape:
+    except Escape as escape:
         _end(escape.error)
     World().part()
     if failed:
@@ -121,7 +125,7 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-class _Escape(BaseException):
+class Escape(BaseException):
     """Carries the package's errors through Hydra, which would print its own words for them."""
 
     def __init__(self, error: NNodeError) -> None:
@@ -136,7 +140,8 @@ def _guarded(job: Job) -> Callable[[DictConfig], None]:
         folder = Path(settings.runtime.output_dir)
         try:
             try:
-                job(config, folder)
+                with disk_words(folder):
+                    job(config, folder)
             except OmegaConfBaseException as error:
                 raise ConfigError(_missing(error)) from None
         except NNodeError as error:
@@ -147,7 +152,7 @@ def _guarded(job: Job) -> Callable[[DictConfig], None]:
                 if isinstance(error, Interrupted) and settings.mode == RunMode.MULTIRUN:
                     text = f"{error}\nthe sweep ends here: its later runs were not started"
                     error = Interrupted(text, error.signal)
-                raise _Escape(error) from None
+                raise Escape(error) from None
             # the other jobs of a sweep go on
             if World().first:
                 _say(f"error in {folder}: {error}")
