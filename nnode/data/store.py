@@ -24,6 +24,8 @@ from nnode.data.sequence import Sequence
 from nnode.errors import DataError
 
 TABLE = "sequences.parquet"
+#: A store that replaces another one has the name that the other has not.
+_TABLES = (TABLE, "sequences-2.parquet")
 MANIFEST = "manifest.json"
 FORMAT = "nnode sequences"
 VERSION = 1
@@ -55,13 +57,14 @@ class Store:
             self.index: list[dict[str, Any]] = content["sequences"]
             self.dims = int(content["dims"])
             self._bytes = int(content["table"]["bytes"])
+            self._path = self.folder / _TABLES[_TABLES.index(content["table"]["file"])]
             self._walls = [np.asarray(w, float).reshape(-1, 4) for w in content["walls"]]
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"{self.folder / MANIFEST} is damaged ({type(error).__name__}: {error}); "
                 "prepare the data again"
             ) from error
-        path = self.folder / TABLE
+        path = self._path
         size = path.stat().st_size if path.is_file() else None
         if size != self._bytes:
             found = "no such file" if size is None else f"{size} bytes"
@@ -95,7 +98,7 @@ class Store:
     def _open(self) -> pq.ParquetFile:
         # An open file must not cross a fork: parent and child would share its position.
         if self._file is None or self._pid != os.getpid():
-            file = pq.ParquetFile(self.folder / TABLE, page_checksum_verification=True)
+            file = pq.ParquetFile(self._path, page_checksum_verification=True)
             if file.num_row_groups != len(self):
                 raise ValueError(f"{file.num_row_groups} row groups for {len(self)} sequences")
             self._file, self._pid = file, os.getpid()
@@ -107,7 +110,7 @@ class Store:
             yield
         except (pa.ArrowException, OSError, KeyError, ValueError) as error:
             raise DataError(
-                f"{self.folder / TABLE}: sequence {i} ({self.index[i].get('name')}) cannot be "
+                f"{self._path}: sequence {i} ({self.index[i].get('name')}) cannot be "
                 f"read: {error}; the store is damaged: prepare the data again"
             ) from error
 
@@ -117,8 +120,8 @@ def write_store(
 ) -> Store:
     """Write a data set, one sequence at a time, replacing the one in ``folder``.
 
-    Nothing in ``folder`` changes before all sequences are written; an interruption while the
-    finished files are moved into place leaves a folder that :class:`Store` refuses.
+    At every moment the folder holds the whole store of before or the whole new one: the table
+    takes the name that the manifest of before does not speak of, and the manifest follows it.
 
     Args:
         folder: created where it is missing.
@@ -138,11 +141,12 @@ def write_store(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         content = _write_table(partial[TABLE], sequences)
+        name, before = _free_name(folder)
+        content["table"]["file"] = name
         _write_json(partial[MANIFEST], {**content, "manifest": dict(manifest)})
-        # A manifest must never describe another table than the one that stands beside it.
-        (folder / MANIFEST).unlink(missing_ok=True)
-        os.replace(partial[TABLE], folder / TABLE)
+        os.replace(partial[TABLE], folder / name)
         os.replace(partial[MANIFEST], folder / MANIFEST)
+        (folder / before).unlink(missing_ok=True)
     except OSError as error:
         raise DataError(f"the store {folder} cannot be written: {error}") from error
     finally:
@@ -150,6 +154,15 @@ def write_store(
             if path.exists():
                 path.unlink()
     return Store(folder)
+
+
+def _free_name(folder: Path) -> tuple[str, str]:
+    """The table's name that the present manifest does not speak of, and the other one."""
+    try:
+        used = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["table"]["file"]
+    except (OSError, ValueError, KeyError, TypeError):
+        used = _TABLES[1]
+    return _TABLES if used != TABLE else (_TABLES[1], _TABLES[0])
 
 
 def _write_table(path: Path, sequences: Iterable[Sequence]) -> dict[str, Any]:
@@ -246,7 +259,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 def _read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.is_file():
-        if (folder / TABLE).exists() or any(folder.glob(".*.partial")):
+        if any((folder / name).exists() for name in _TABLES) or any(folder.glob(".*.partial")):
             raise DataError(
                 f"{folder} holds a half-written store ({MANIFEST} is missing): its preparation "
                 "was interrupted; prepare the data again"

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
+import os
 import pickle
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -164,7 +166,38 @@ def test_rewriting_replaces_the_store(folder: Path) -> None:
     write_store(folder, [bare("tunnel/1")], {"name": "other"})
     store = Store(folder)
     assert (len(store), store.dims, store.manifest) == (1, 1, {"name": "other"})
+    assert len(store[0].time)
+    assert sorted(p.name for p in folder.iterdir()) == [MANIFEST, "sequences-2.parquet"]
+    write_store(folder, [bare("tunnel/2")], {})
     assert sorted(p.name for p in folder.iterdir()) == [MANIFEST, TABLE]
+
+
+@pytest.mark.parametrize("broken", [0, 1, 2])
+def test_a_replacement_broken_off_at_any_move_leaves_a_whole_store(
+    folder: Path, broken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moves: list[object] = []
+    move = os.replace
+
+    def stop(source: Path, target: Path) -> None:
+        moves.append(target)
+        if len(moves) > broken:
+            raise KeyboardInterrupt
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", stop)
+    with suppress(KeyboardInterrupt):
+        write_store(folder, [bare("tunnel/1")], {"name": "other"})
+    assert len(list(Store(folder))) == (1 if broken == 2 else 2)
+
+
+@pytest.mark.parametrize("name", ["../elsewhere.parquet", "/etc/passwd", "manifest.json", 3])
+def test_a_manifest_names_no_file_but_its_table(folder: Path, name: object) -> None:
+    content = json.loads((folder / MANIFEST).read_text())
+    content["table"]["file"] = name
+    (folder / MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(DataError, match="is damaged"):
+        Store(folder)
 
 
 @pytest.mark.parametrize(
