@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.errors import ConfigError
+from nnode.errors import CheckpointError, ConfigError
 
 GROUPS = ("model", "data", "optimizer", "solver")
 
@@ -57,7 +57,7 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
     path = _checkpoint_of(overrides, option)
     if path is None:
         return []
-    saved = load_checkpoint(path).config["groups"]
+    saved = load_checkpoint(path).config.get("groups", {})
     given = {override.partition("=")[0] for override in overrides}
     chosen = [g for g in groups if g in saved and g not in given]
     _chosen.update(chosen)
@@ -71,10 +71,16 @@ def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, 
 
     Raises:
         ConfigError: checkpoints of different groups in one sweep.
+        CheckpointError: the checkpoint's configuration lacks a section.
     """
     merged = config.copy()
     choices = HydraConfig.get().runtime.choices
     for name in sections:
+        if name not in saved or "groups" not in saved:
+            raise CheckpointError(
+                f"the checkpoint's configuration has no {name if 'groups' in saved else 'groups'}; "
+                "it is damaged: take another checkpoint"
+            )
         if name in saved["groups"] and choices[name] != saved["groups"][name]:
             if name in _chosen:
                 raise ConfigError(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
-import pickle
+import warnings
+import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,8 @@ import torch
 from torch import Tensor
 
 import nnode
-from nnode.errors import CheckpointError
+from nnode.errors import CheckpointError, NNodeError
+from nnode.files import disk_words, replacing
 from nnode.models import System, build_model
 
 #: Raised when the layout of a checkpoint changes.
@@ -49,11 +52,19 @@ class Checkpoint:
 
     def build(self) -> System:
         """The model, with the parameters of this checkpoint."""
-        dtype = getattr(torch, self.config["trainer"]["dtype"])
-        system = build_model(self.config["model"], self.config["seed"], dtype)
+        try:
+            dtype = getattr(torch, self.config["trainer"]["dtype"])
+            system = build_model(self.config["model"], self.config["seed"], dtype)
+        except NNodeError:
+            raise
+        except Exception as error:  # whatever options that nobody checked lead to
+            raise CheckpointError(
+                "the checkpoint's configuration describes no model "
+                f"({type(error).__name__}: {error}); it is damaged: take another checkpoint"
+            ) from error
         try:
             system.load_state_dict(self.model)
-        except RuntimeError as error:
+        except (RuntimeError, TypeError, AttributeError) as error:
             raise CheckpointError(
                 f"the checkpoint's parameters do not fit its own model.term="
                 f"{self.config['model'].get('term')}: {error}"
@@ -62,17 +73,19 @@ class Checkpoint:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
-    """Write ``path`` so that at every moment it is either the old file or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(temporary, "wb") as file:
-            torch.save({f.name: getattr(checkpoint, f.name) for f in fields(checkpoint)}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write ``path`` so that at every moment it is either the old file or the new one.
+
+    Raises:
+        WriteError: no room, or not allowed; the old file is kept.
+    """
+    content = {f.name: getattr(checkpoint, f.name) for f in fields(checkpoint)}
+    with disk_words(path.parent), replacing(path) as temporary, open(temporary, "wb") as file:
+        # through memory: writing to a full disk, torch's own words would hide the reason
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        file.write(buffer.getbuffer())
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
@@ -86,17 +99,11 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         near = sorted(file.parent.glob("*.pt")) if file.parent.is_dir() else []
         hint = f"; that folder holds {', '.join(p.name for p in near)}" if near else ""
         raise CheckpointError(f"no checkpoint {file}{hint}")
-    try:
-        content = torch.load(file, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError) as error:
-        raise CheckpointError(
-            f"{file} cannot be opened as a checkpoint: it is damaged or of another kind "
-            f"({type(error).__name__})"
-        ) from error
+    content = _content(file)
     names = {f.name for f in fields(Checkpoint)}
     if not isinstance(content, dict) or not {"format", "model", "config"} <= set(content):
         raise CheckpointError(f"{file} is no checkpoint of this package")
-    if content["format"] != FORMAT:
+    if not isinstance(content["format"], int) or content["format"] != FORMAT:
         raise CheckpointError(
             f"{file} has checkpoint format {content['format']}, this version reads {FORMAT}; "
             f"it was written by version {content.get('version', 'unknown')}"
@@ -105,7 +112,72 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         raise CheckpointError(
             f"{file} is incomplete: {', '.join(sorted(names ^ set(content)))} missing or unknown"
         )
+    wrong = [name for name, kind in _KINDS.items() if not isinstance(content[name], kind)]
+    wrong += [] if wrong else _wrong_inside(content)
+    if wrong:
+        raise CheckpointError(
+            f"{file} is damaged: {', '.join(wrong)} hold(s) what no checkpoint has there; take "
+            "another checkpoint"
+        )
     return Checkpoint(**content)
+
+
+#: What the fields are.
+_KINDS: dict[str, Any] = {
+    "config": dict,
+    "manifest": dict,
+    "model": dict,
+    "optimizer": dict,
+    "progress": dict,
+    "history": list,
+    "split": dict,
+    "free_speed": float | int | None,
+    "version": str,
+}
+
+
+def _wrong_inside(content: dict[str, Any]) -> list[str]:
+    """Fields whose entries are of another kind than a checkpoint's."""
+
+    def texts(value: Any) -> bool:
+        return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+    def numbers(value: Any) -> bool:
+        return isinstance(value, dict) and all(isinstance(v, int | float) for v in value.values())
+
+    config = content["config"]
+    sound = {
+        "config": all(isinstance(key, str) for key in config)
+        and all(isinstance(config.get(key, {}), dict) for key in _SECTIONS),
+        "model": all(isinstance(v, Tensor) for v in content["model"].values()),
+        "progress": numbers(content["progress"]),
+        "history": all(numbers(row) for row in content["history"]),
+        "split": all(isinstance(k, str) and texts(v) for k, v in content["split"].items()),
+    }
+    return [name for name, good in sound.items() if not good]
+
+
+#: Parts of the configuration that are mappings.
+_SECTIONS = ("model", "data", "solver", "optimizer", "trainer", "groups")
+
+
+def _content(file: Path) -> Any:
+    """What the file holds, read without executing anything and in memory of the file's size."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            records = archive.infolist()
+        # torch stores without packing; a small file that unpacks to a large one is none of ours
+        packed = any(record.compress_type != zipfile.ZIP_STORED for record in records)
+        if packed or sum(record.file_size for record in records) > file.stat().st_size:
+            raise ValueError("its records are packed")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what a damaged file makes torch say
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file leads to almost any error
+        raise CheckpointError(
+            f"{file} cannot be opened as a checkpoint: it is damaged or of another kind "
+            f"({type(error).__name__})"
+        ) from error
 
 
 def load(path: str | os.PathLike[str]) -> System:

@@ -30,7 +30,8 @@ from nnode.calibrate.options import Monitor, TrainerOptions
 from nnode.calibrate.progress import Reporter
 from nnode.data.dataset import EpochSampler
 from nnode.data.sequence import Batch
-from nnode.errors import SimulationError
+from nnode.errors import CheckpointError, SimulationError
+from nnode.files import replacing
 from nnode.models import System
 from nnode.solvers.base import Solver
 
@@ -138,18 +139,28 @@ class Trainer:
         )
 
     def restore(self, path: Path) -> None:
-        """Go on from the checkpoint at ``path``, of this run or of another folder's."""
+        """Go on from the checkpoint at ``path``, of this run or of another folder's.
+
+        Raises:
+            CheckpointError: see :func:`load_checkpoint`; or it is of another model or optimiser.
+        """
         checkpoint = load_checkpoint(path)
-        self.model.load_state_dict(checkpoint.model)
-        self.optimizer.load_state_dict(checkpoint.optimizer)
-        for name in self._COUNTERS:
-            setattr(self, name, checkpoint.progress[name])
+        try:
+            self.model.load_state_dict(checkpoint.model)
+            self.optimizer.load_state_dict(checkpoint.optimizer)
+            for name in self._COUNTERS:
+                setattr(self, name, checkpoint.progress[name])
+        except Exception as error:  # each optimiser has its own words for a state of another kind
+            raise CheckpointError(
+                f"{path} does not fit the model and the optimiser of this run "
+                f"({type(error).__name__}: {error}); take another checkpoint, or start a new run"
+            ) from error
         self.history = list(checkpoint.history)
         best = path.parent / self.best_path.name
         foreign = best.is_file() and best.resolve() != self.best_path.resolve()
         if foreign and self.world.first:
-            self.best_path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(best, self.best_path)
+            with replacing(self.best_path) as temporary:
+                shutil.copyfile(best, temporary)
 
     def save(self) -> None:
         """Write the best checkpoint, if there is a new one, then the last."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 import nnode
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.trainer import Trainer
-from nnode.errors import CheckpointError
+from nnode.errors import CheckpointError, WriteError
 
 Make = Callable[..., Trainer]
 
@@ -46,7 +47,7 @@ def test_a_failed_write_leaves_the_old_file(saved: Path, monkeypatch: pytest.Mon
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(WriteError, match=r"cannot be written: No space left on device\. What was"):
         save_checkpoint(checkpoint, saved)
     assert saved.read_bytes() == before
     assert sorted(p.name for p in saved.parent.iterdir()) == ["best.pt", "last.pt"]
@@ -96,4 +97,53 @@ def test_another_format_names_both(saved: Path) -> None:
     content.pop("optimizer")
     torch.save(content, saved)
     with pytest.raises(CheckpointError, match="optimizer missing"):
+        load_checkpoint(saved)
+
+
+def changed(saved: Path, **values: object) -> Path:
+    content = torch.load(saved, weights_only=True)
+    torch.save({**content, **values}, saved)
+    return saved
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"config": 3}, "config hold"),
+        ({"config": {"model": 3}}, "config hold"),
+        ({"model": {"terms.0.v0": 30.0}}, "model hold"),
+        ({"progress": {"epoch": "one"}}, "progress hold"),
+        ({"history": [3]}, "history hold"),
+        ({"split": {"train": "demo/000"}}, "split hold"),
+        ({"format": torch.zeros(2, 2)}, "checkpoint format"),
+    ],
+)
+def test_values_of_another_kind_are_refused(
+    saved: Path, values: dict[str, object], words: str
+) -> None:
+    with pytest.raises(CheckpointError, match=words):
+        load_checkpoint(changed(saved, **values))
+
+
+def test_a_configuration_of_no_model_is_refused(saved: Path) -> None:
+    config = load_checkpoint(saved).config
+    with pytest.raises(CheckpointError, match=r"describes no model \(KeyError"):
+        nnode.load(changed(saved, config={**config, "trainer": {}}))
+
+
+def test_a_checkpoint_of_another_optimiser_is_refused(
+    saved: Path, make_trainer: Make, tmp_path: Path
+) -> None:
+    trainer = make_trainer(tmp_path / "other", max_epochs=2)
+    with pytest.raises(CheckpointError, match="does not fit the model and the optimiser"):
+        trainer.restore(changed(saved, optimizer={"strange": 1}))
+
+
+def test_packed_records_are_refused_before_they_swell(saved: Path) -> None:
+    with zipfile.ZipFile(saved) as archive:
+        records = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in records.items():
+            archive.writestr(name, data + bytes(1 << 20))
+    with pytest.raises(CheckpointError, match="cannot be opened as a checkpoint"):
         load_checkpoint(saved)
