@@ -11,6 +11,9 @@ import pandas as pd
 
 from nnode.errors import ConfigError, DataError
 
+#: Whole numbers below this are exact as floating-point numbers.
+_EXACT = 2.0**53
+
 
 class Table:
     """A CSV or Parquet table whose cells are asked for by meaning.
@@ -35,9 +38,14 @@ class Table:
                 frame = pd.read_csv(path, low_memory=False, skip_blank_lines=False)
         except pd.errors.EmptyDataError as error:
             raise DataError(f"{path} is empty; expected a line of column names and rows") from error
-        except (pd.errors.ParserError, UnicodeDecodeError, ValueError, OSError) as error:
+        except Exception as error:  # a damaged file leads to almost any error
             kind = "Parquet" if self.parquet else "comma-separated"
             raise DataError(f"{path} cannot be read as a {kind} table: {error}") from error
+        if not isinstance(frame.index, pd.RangeIndex):
+            raise DataError(
+                f"{path}: there are more cells in its rows than names in its first line; give "
+                "every column a name"
+            )
         frame.columns = [str(name).strip() for name in frame.columns]
         self.frame = frame.dropna(how="all")
         if self.frame.empty:
@@ -128,7 +136,8 @@ class Table:
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} is empty; expected a name or number"
             )
-        if pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all():
+        whole = pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all()
+        if whole and (cells.dropna().abs() < _EXACT).all():
             cells = cells.astype("Int64")
         text = cells.astype("string").fillna("").str.strip()
         return np.asarray(text, dtype=object)

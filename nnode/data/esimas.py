@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 
+from nnode.data.matlab import read_matlab
 from nnode.data.options import EsimasOptions
 from nnode.data.recordings import raw_files
 from nnode.data.sequence import Sequence
@@ -72,8 +72,8 @@ def read_esimas(path: Path, options: EsimasOptions | None = None) -> list[Sequen
     if match is None:
         raise DataError(f"{path}: expected a file name like sequence_data1-1_1.mat")
     recording = match.group(1)
-    cells = np.ravel(_load(path))
-    if cells.size == 0:
+    cells = _load(path)
+    if not cells:
         raise DataError(f"{path}: 'sequences' is empty; expected at least one sequence")
     found = []
     for number, cell in enumerate(cells):
@@ -95,36 +95,33 @@ def read_esimas(path: Path, options: EsimasOptions | None = None) -> list[Sequen
     return found
 
 
-def _load(path: Path) -> Any:
+def _load(path: Path) -> list[Any]:
     if not path.is_file():
         raise DataError(f"there is no file {path}")
     try:
-        content = loadmat(path)
-    except Exception as error:  # scipy raises almost anything on a damaged file
+        content = read_matlab(path)
+    except (ValueError, OSError) as error:
         raise DataError(
-            f"{path} cannot be read as a MATLAB file ({type(error).__name__}: {error}); it is "
-            "truncated or of another format: fetch it again"
+            f"{path} cannot be read as a MATLAB file ({error}); it is truncated or of another "
+            "format: fetch it again"
         ) from error
     if "sequences" not in content:
-        names = [name for name in content if not name.startswith("__")]
         raise DataError(
-            f"{path}: expected a cell array 'sequences', found {', '.join(names) or 'nothing'}"
+            f"{path}: expected a cell array 'sequences', found {', '.join(content) or 'nothing'}"
         )
-    return content["sequences"]
+    found = content["sequences"]
+    if isinstance(found, np.ndarray):
+        return list(found.ravel())
+    return found if isinstance(found, list) else [found]
 
 
 def _field(cell: Any, name: str, where: str) -> np.ndarray:
     """A struct's field as numbers."""
-    struct = cell
-    while isinstance(struct, np.ndarray) and struct.size == 1:
-        struct = struct.item() if struct.dtype == object else struct.flat[0]
-    fields = getattr(getattr(struct, "dtype", None), "names", None) or ()
-    if name not in fields:
-        raise DataError(
-            f"{where}: expected a struct with the fields Xarr and Tarr, found "
-            f"{', '.join(fields) or type(struct).__name__}"
-        )
-    try:
-        return np.asarray(struct[name], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{where}: {name} holds no plain numbers ({error})") from error
+    while isinstance(cell, list) and len(cell) == 1:
+        cell = cell[0]
+    if not isinstance(cell, dict) or name not in cell:
+        held = ", ".join(cell) if isinstance(cell, dict) else type(cell).__name__
+        raise DataError(f"{where}: expected a struct with the fields Xarr and Tarr, found {held}")
+    if not isinstance(cell[name], np.ndarray):
+        raise DataError(f"{where}: {name} holds no plain numbers ({type(cell[name]).__name__})")
+    return cell[name].astype(np.float64)

@@ -28,6 +28,9 @@ UNITS = {"cm": 0.01, "m": 1.0}
 #: A table of frames and people may hold so many cells, or so many times its rows.
 _FRAMES, _SPARSE = 10**8, 1000
 
+#: Frames per second beyond which a file is in error.
+FASTEST = 1e6
+
 _AXES = {"x": 0, "y": 1}
 _NAME = re.compile(r"(.+)\.txt")
 
@@ -87,6 +90,11 @@ def cut_people(
     """
     axis = int(one_of("walking_axis", options.walking_axis, _AXES))
     view = _interval("view", options.view)
+    if not 0 < rate <= FASTEST:
+        raise DataError(
+            f"{path}: a frame rate of {rate:g} frames/s; expected a positive number of at most "
+            f"{FASTEST:g}: correct it in the file"
+        )
     steps = positive("t_seq", options.t_seq) * rate
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
         nearest = max(round(steps), 1) / rate

@@ -225,8 +225,14 @@ def _intervals(stints: list[_Stint]) -> Iterator[_Platoon]:
 def _windows(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
     assert options.window is not None
     steps = round(options.window / options.dt)
-    end = max(s.last for s in stints)
-    for first in range(min(s.first for s in stints), end - steps + 1, steps):
+    start, end = min(s.first for s in stints), max(s.last for s in stints)
+    # only windows in which somebody is in view: two stays may lie years apart
+    busy = {
+        k
+        for s in stints
+        for k in range((s.first - start) // steps - 1, (s.last - start) // steps + 1)
+    }
+    for first in sorted(start + k * steps for k in busy if 0 <= k <= (end - start) // steps - 1):
         last = first + steps
         seen = [s for s in stints if s.first <= last and s.last >= first]
         whole = [s for s in seen if s.first <= first and s.last >= last]

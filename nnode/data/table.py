@@ -15,6 +15,9 @@ from nnode.errors import ConfigError, DataError
 #: Share of the sampling interval by which sampling times may deviate from equal spacing.
 UNEVEN = 0.01
 
+#: A sequence's times times its agents, present or not.
+MOST_CELLS = 10**8
+
 _REQUIRED = ("sequence", "time", "agent", "x")
 _OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
 _WALL = ("x1", "y1", "x2", "y2")
@@ -88,6 +91,12 @@ def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> 
         index = np.array(rows)
         grid, k = _grid(table, name, time, index)
         people, n = _people(agent[index])
+        if len(grid) * len(people) > MOST_CELLS:
+            raise DataError(
+                f"{path}: sequence {name} has {len(grid)} times and {len(people)} agents in "
+                f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
+                "shorter sequences"
+            )
         at = np.full((len(grid), len(people)), -1)
         for row, i, j in zip(index, k, n, strict=True):
             if at[i, j] >= 0:

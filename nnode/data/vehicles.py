@@ -11,12 +11,15 @@ from nnode.data.options import LaneOptions, VehicleTableOptions
 from nnode.data.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.recordings import one_of, positive, table_path
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, DataError
 
 #: Metres per unit of length.
 LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
 #: Metres per second per unit of speed.
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
+
+#: Times are counted in steps up to this number: it is exact, and adding to it as well.
+_LATEST = 2.0**52
 
 _REQUIRED = ("vehicle", "time", "x")
 _OPTIONAL = ("lane", "speed", "length", "kind")
@@ -52,7 +55,15 @@ def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndar
     scale = one_of("time_unit", options.time_unit, units)
     if options.time_unit == "frame":
         scale = 1.0 / positive("frame_rate", options.frame_rate)
-    return table.numbers(column) * scale
+    time = table.numbers(column) * scale
+    far = np.flatnonzero(~(np.abs(time) < _LATEST * options.dt))
+    if far.size:
+        raise DataError(
+            f"{table.path}, {table.row(int(far[0]))}: column {column!r} is the time "
+            f"{time[far[0]]:g} s, which steps of {options.dt:g} s cannot count; "
+            "correct it, or data.time_unit"
+        )
+    return time
 
 
 def _rows(table: Table, options: VehicleTableOptions) -> Vehicles:
