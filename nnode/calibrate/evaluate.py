@@ -11,8 +11,12 @@ from torch import Tensor
 
 from nnode.calibrate.cost import Convention, sequence_costs, squared_error
 from nnode.data.sequence import Batch
+from nnode.errors import SimulationError
 from nnode.models import FollowTheLeader, Relaxation, System, Traffic
 from nnode.solvers.base import Solver, Trajectory
+
+#: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
+MOST = 1e24
 
 Simulate = Callable[[Batch], Trajectory]
 
@@ -60,7 +64,11 @@ class Metrics:
 def evaluate(
     simulate: Simulate, batches: Iterable[Batch], convention: Convention = Convention.integral
 ) -> Metrics:
-    """Errors of ``simulate`` over all sequences of ``batches``."""
+    """Errors of ``simulate`` over all sequences of ``batches``.
+
+    Raises:
+        SimulationError: an error is no finite number; with sequence, agent and time.
+    """
     costs: dict[str, float] = {}
     total: dict[int, float] = {}
     number: dict[int, int] = {}
@@ -72,6 +80,7 @@ def evaluate(
         names = zip(batch.names, sequence_costs(trajectory, batch, convention), strict=True)
         costs.update({name: float(cost) for name, cost in names})
         error = squared_error(trajectory, batch)
+        _check_finite(error, batch)
         for k in range(1, batch.n_samples):
             total[k] = total.get(k, 0.0) + float(error[k].sum())
             number[k] = number.get(k, 0) + int(batch.valid[k].sum())
@@ -99,6 +108,18 @@ def evaluate(
         sequences=len(costs),
         costs=costs,
     )
+
+
+def _check_finite(error: Tensor, batch: Batch) -> None:
+    """Refuse squared errors (K, B, N) that would make the table's numbers infinite or NaN."""
+    bad = ~error.isfinite() | (error > MOST)
+    if bool(bad.any()):
+        k, b, n = (int(i) for i in bad.nonzero()[0])
+        raise SimulationError(
+            f"the simulation of sequence {batch.names[b]} left the data: agent {n} is "
+            f"{float(error[k, b, n].sqrt()):.3g} m away at {k * batch.dt:g} s after the start; "
+            "check the sequence, start from other parameters, or take a smaller solver.dt"
+        )
 
 
 def _times(batch: Batch) -> Tensor:

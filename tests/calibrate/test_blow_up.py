@@ -1,0 +1,84 @@
+"""Numbers that blow up are told with sequence, agent and time, and are never a silent NaN."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.calibrate.evaluate import evaluate
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import SimulationError
+from nnode.models import build_model
+from nnode.solvers import Solver, TorchdiffeqSolver
+from nnode.solvers.base import Trajectory
+from nnode.solvers.fused.engine import FusedSolver
+
+SOLVERS = [
+    pytest.param(lambda dt: TorchdiffeqSolver(gradient="discrete", dt=dt), id="torchdiffeq"),
+    pytest.param(lambda dt: FusedSolver(dt), id="fused"),
+]
+
+
+def platoon(*starts: float) -> Batch:
+    x = np.array(starts)[None, :, None] + 10.0 * 0.2 * np.arange(6)[:, None, None]
+    return collate([Sequence(name="tunnel/7", recording="tunnel", time=0.2 * np.arange(6), x=x)])
+
+
+def law(term: str, **options: Any) -> Any:
+    return build_model(
+        {"term": term, "name": term, "leader": "constant", "v0": 20.0, "L": 5.0, "L_min": 2.0}
+        | options
+    )
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_gap_of_zero_is_told(solver: Any) -> None:
+    words = r"sequence tunnel/7 blew up: agent 1 at 0.2 s after the start"
+    with pytest.raises(SimulationError, match=words):
+        solver(0.1)(law("lin"), platoon(0.0, 30.0, 30.0))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_the_logarithm_of_a_negative_gap_is_a_number(solver: Any) -> None:
+    model, solve = law("log"), solver(0.1)
+    found = evaluate(lambda batch: solve(model, batch), [platoon(0.0, 30.0, 29.0)])
+    assert math.isfinite(found.J)
+    assert found.rmse > 5  # the one who stands before its leader is thrown back
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_people_who_stand_in_one_place_give_numbers(solver: Any) -> None:
+    time = 0.1 * np.arange(5)
+    x = np.zeros((5, 3, 2))
+    x[:, 2, 0] = 1.0 + time
+    batch = collate([Sequence(name="hall/1", recording="hall", time=time, x=x)])
+    model = build_model(
+        {"term": "social_force", "name": "sf", "A": 5.0, "k": 5.0, "kappa": 5.0, "B": 0.3,
+         "r": 0.25, "tau": 0.5, "mass": 1.0, "walls": False, "opposing_wall_friction": False,
+         "wall_spacing": 0.5}
+    )  # fmt: skip
+    solve: Solver = solver(0.05)
+    found = evaluate(lambda b: solve(model, b), [batch])
+    assert math.isfinite(found.J)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_diverging_step_is_told(solver: Any) -> None:
+    model = law("lin", v0=1e300)
+    solve = solver(0.2)
+    with pytest.raises(SimulationError, match=r"sequence tunnel/7 .* agent \d"):
+        evaluate(lambda batch: solve(model, batch), [platoon(0.0, 30.0, 60.0)])
+
+
+@pytest.mark.parametrize("away", [1e13, 1e200, math.inf, math.nan])
+def test_an_error_without_bounds_is_told_with_its_place(away: float) -> None:
+    batch = platoon(0.0, 30.0)
+    x = batch.x.clone()
+    x[3, 0, 1] += away
+    with pytest.raises(SimulationError, match=r"tunnel/7 left the data: agent 1 .* at 0.6 s"):
+        evaluate(lambda b: Trajectory(x, None), [batch])
+    assert torch.isfinite(batch.x).all()
