@@ -160,6 +160,19 @@ class DiscoverConfig:
     discover: DiscoverOptions = field(default_factory=DiscoverOptions)
 
 
+@dataclass
+class TortureConfig:
+    """``scripts/torture.py``: misuse on purpose."""
+
+    campaigns: list[str] = field(default_factory=lambda: ["kills", "disk", "folder", "fuzz"])
+    kills: int = 200  # over all jobs
+    jobs: list[str] | None = None  # scripts that are tortured; null: all that keep results
+    repeats: int = 4  # second runs in a folder, per job
+    inputs: int = 104000  # malformed files over all targets
+    targets: list[str] | None = None  # what is given them; null: every reader and loader
+    seed: int = 0
+
+
 SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
@@ -170,6 +183,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "study_schema"): StudyConfig,
     (None, "benchmark_discovery_schema"): DiscoveryBenchmarkConfig,
     (None, "discover_schema"): DiscoverConfig,
+    (None, "torture_schema"): TortureConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),

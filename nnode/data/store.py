@@ -108,9 +108,9 @@ class Store:
     def _damage(self, i: int) -> Iterator[None]:
         try:
             yield
-        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+        except (pa.ArrowException, OSError, LookupError, ValueError, TypeError) as error:
             raise DataError(
-                f"{self._path}: sequence {i} ({self.index[i].get('name')}) cannot be "
+                f"{self._path}: sequence {i} ({self.index[i]!s:.80}) cannot be "
                 f"read: {error}; the store is damaged: prepare the data again"
             ) from error
 

@@ -323,3 +323,12 @@ def test_a_store_may_cross_into_another_process(folder: Path, method: str) -> No
     process.join()
     assert process.exitcode == 0
     assert_same(store[1], pickle.loads(pickle.dumps(store))[1])
+
+
+@pytest.mark.parametrize("walls", [0.5, 9, "0", [0]])
+def test_an_index_of_another_kind_is_damage(folder: Path, walls: object) -> None:
+    content = json.loads((folder / MANIFEST).read_text())
+    content["sequences"][0]["walls"] = walls
+    (folder / MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(DataError, match="the store is damaged"):
+        Store(folder)[0]
