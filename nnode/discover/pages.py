@@ -168,16 +168,16 @@ def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
 def _rest(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
     blocks: list[Block] = [Heading("What is left")]
     if d.unknown is None:
-        blocks.append(Text("No structure that a flexible fit would find on held-out sequences."))
+        blocks.append(Text("No structure that a flexible fit would find."))
     else:
         hint = f" A form that comes near, as a hint only: `{d.unknown.hint}`."
         blocks += [
             Text(
                 "Something that is not in the catalogue. It depends on "
                 f"{', '.join(d.unknown.variables) or 'no variable that was looked at'}; a "
-                f"flexible fit of these removes {100 * d.unknown.gain:.0f} % of the held-out "
-                f"error that is left.{hint if d.unknown.hint else ''} Next: look at where it "
-                "acts, think of a cause, and write it as an effect of your own "
+                f"flexible fit of the first removes {100 * d.unknown.gain:.0f} % of the squared "
+                f"errors of positions that are left.{hint if d.unknown.hint else ''} "
+                "Next: look at where it acts, think of a cause, and write it as an effect of your own "
                 "(docs/discovery.md)."
             ),
             *drawn.unknown,

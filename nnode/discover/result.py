@@ -139,7 +139,7 @@ class Structure:
 
     Attributes:
         variables: on which it depends, the strongest first.
-        gain: held-out share of the whitened cost that a flexible fit removes.
+        gain: share of the squared errors of positions that are left that a flexible fit removes.
         hint: a symbolic form, as a hint only.
         curve: the flexible fit in the first variable: ``at``, ``deviation``.
     """

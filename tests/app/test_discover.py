@@ -198,7 +198,7 @@ def test_a_signal_leaves_no_half_report(run: Path, tmp_path: Path) -> None:
     assert "stopped by SIGTERM: the diagnosis was not finished and nothing of it" in errors
     assert "Traceback" not in errors
     left = {p.name for p in (tmp_path / "run").iterdir()}
-    assert left <= {"data", ".hydra", "discover.log"}
+    assert left <= {"data", ".hydra", ".lock", "discover.log"}
 
 
 @pytest.mark.parametrize(
