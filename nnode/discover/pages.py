@@ -177,8 +177,8 @@ def _rest(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
                 f"{', '.join(d.unknown.variables) or 'no variable that was looked at'}; a "
                 f"flexible fit of the first removes {100 * d.unknown.gain:.0f} % of the squared "
                 f"errors of positions that are left.{hint if d.unknown.hint else ''} "
-                "Next: look at where it acts, think of a cause, and write it as an effect of your own "
-                "(docs/discovery.md)."
+                "Next: look at where it acts, think of a cause, and write it as an effect of "
+                "your own (docs/discovery.md)."
             ),
             *drawn.unknown,
         ]
