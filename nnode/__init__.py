@@ -8,20 +8,22 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from nnode.app.notebook import diagnose, fit
+    from nnode.app.discover import diagnose_table as diagnose
+    from nnode.app.notebook import fit
     from nnode.calibrate.checkpoint import load
 
 __all__ = ["__version__", "diagnose", "fit", "load"]
 
 #: Where each name comes from: imported on first use, a short command should not wait for torch.
 _HOMES = {
-    "diagnose": "nnode.app.notebook",
-    "fit": "nnode.app.notebook",
-    "load": "nnode.calibrate.checkpoint",
+    "diagnose": ("nnode.app.discover", "diagnose_table"),
+    "fit": ("nnode.app.notebook", "fit"),
+    "load": ("nnode.calibrate.checkpoint", "load"),
 }
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        module, attribute = _HOMES[name]
+        return getattr(import_module(module), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

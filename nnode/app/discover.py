@@ -14,7 +14,8 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.saved import make_absolute, plain_config, shell_override
+from nnode.app.given import Table, model_options, table_file
+from nnode.app.saved import plain_config, shell_override
 from nnode.app.train import brief, set_threads
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
@@ -101,10 +102,10 @@ def discover(config: DictConfig, folder: Path) -> None:
 
 
 def diagnose_table(
-    path: str | Path,
+    data: Table,
     domain: str,
     *,
-    model: Mapping[str, Any],
+    model: str | Mapping[str, Any] = "lin",
     walls: str | Path | None = None,
     leader: str = "measured",
     folder: str | Path | None = None,
@@ -114,9 +115,10 @@ def diagnose_table(
     """Diagnose a model on a tidy table.
 
     Args:
-        path: CSV or Parquet, see ``docs/data.md``.
+        data: CSV or Parquet, or a data frame; see ``docs/data.md``.
         domain: ``traffic`` or ``crowd``.
-        model: options of the model; ``term`` says which, what is left out has its default.
+        model: a name as in ``conf/model``, or options of the model; ``term`` says which, what is
+            left out has its default.
         walls: CSV with x1, y1, x2, y2, m.
         leader: of a traffic model.
         folder: receives what the script writes; None writes and draws nothing.
@@ -131,45 +133,18 @@ def diagnose_table(
     """
     own = model_options(model, leader)
     chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
-    data = TableOptions(
-        domain=domain, path=str(path), walls=None if walls is None else str(walls),
-        name="table", faults=Faults.drop,
-    )  # fmt: skip
-    plain = _plain(data)
-    make_absolute(plain)
     groups = {"model": str(own["name"]), "data": "table"}
     with TemporaryDirectory(prefix="nnode-") as scratch:
         place = Path(scratch) if folder is None else Path(folder)
-        job = _job(own, data, plain, groups, chosen, place)
+        table = TableOptions(
+            domain=domain, path=str(table_file(data, place)), name="table", faults=Faults.drop,
+            walls=None if walls is None else str(Path(walls).absolute()),
+        )  # fmt: skip
+        job = _job(own, table, _plain(table), groups, chosen, place)
         found = _diagnose(job)
         if folder is not None:
             _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
     return plain_report(found.diagnosis)
-
-
-def model_options(model: Mapping[str, Any], leader: str) -> dict[str, Any]:
-    """A model's options with the defaults of its schema.
-
-    Raises:
-        ConfigError: an unknown term or option.
-    """
-    from nnode.config import SCHEMAS
-
-    term = str(model.get("term", ""))
-    schema = SCHEMAS.get(("model", f"{term}_schema"))
-    if schema is None:
-        known = [name.removesuffix("_schema") for group, name in SCHEMAS if group == "model"]
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(known)}")
-    given = {"name": term, **model}
-    if hasattr(schema, "leader"):
-        given.setdefault("leader", leader)
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(schema), given)
-    except Exception as error:  # omegaconf's own errors share no narrower class
-        raise ConfigError(f"model: {str(error).splitlines()[0]}") from error
-    found = OmegaConf.to_container(merged, enum_to_str=True)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
 
 
 def _plain(options: Any) -> dict[str, Any]:

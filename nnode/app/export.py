@@ -14,7 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.evaluate import choose
-from nnode.app.saved import merge_saved, saved_groups
+from nnode.app.saved import merge_saved, path_given, saved_groups
 from nnode.app.train import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
@@ -56,14 +56,9 @@ def checkpoint_of(run: str) -> Path:
 
 def groups_of_run(overrides: list[str]) -> list[str]:
     """Overrides that choose the run's own data and solver where the user chooses none."""
-    told = []
-    for override in overrides:
-        key, _, value = override.partition("=")
-        if key == "run" and value not in ("", "null"):
-            first = value.strip("[]").split(",")[0].strip().strip("'\"")
-            override = f"checkpoint={checkpoint_of(first)}"
-        told.append(override)
-    return saved_groups(told, "checkpoint", ("data", "solver"))
+    run = path_given(overrides, "run")
+    told = [] if run is None else [f"checkpoint={checkpoint_of(run)}"]
+    return saved_groups([*overrides, *told], "checkpoint", ("data", "solver"))
 
 
 @dataclass

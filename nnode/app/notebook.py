@@ -1,4 +1,4 @@
-"""Calibrate and diagnose in a notebook: a table in, an object to look at out."""
+"""Calibrate in a notebook: a table in, an object to look at out."""
 
 from __future__ import annotations
 
@@ -9,39 +9,22 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkdtemp
-from typing import TYPE_CHECKING, Any
+from tempfile import mkdtemp
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from nnode.app.discover import diagnose_table, model_options
+from nnode.app.given import Table, model_options, named, table_file
 from nnode.app.sweep import RESULT
 from nnode.app.train import train
 from nnode.calibrate.checkpoint import load
 from nnode.calibrate.optimizers import LbfgsOptions
 from nnode.calibrate.options import FusedOptions, TrainerOptions
 from nnode.data.options import TableOptions
-from nnode.errors import ConfigError
 from nnode.models import System
 from nnode.plots import force_figure
-
-if TYPE_CHECKING:
-    from nnode.discover.options import DiscoverOptions
-
-#: Models by the names that ``conf/model`` gives them.
-MODELS: dict[str, dict[str, Any]] = {
-    "lin": {"term": "lin"},
-    "log": {"term": "log"},
-    "n2": {"term": "network_speed", "hidden": 2},
-    "n4": {"term": "network_speed", "hidden": 4},
-    "n10": {"term": "network_speed", "hidden": 10},
-    "sf": {"term": "social_force"},
-    "nn": {"term": "network_force"},
-}
-
-Table = str | Path | pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -106,7 +89,7 @@ def fit(
     place.mkdir(parents=True, exist_ok=True)
     options = TableOptions(
         domain=domain,
-        path=str(_file(data, place)),
+        path=str(table_file(data, place)),
         walls=None if walls is None else str(Path(walls).absolute()),
     )
     options.split.heldout = heldout
@@ -137,57 +120,3 @@ def fit(
         history=pd.DataFrame(result["history"]),
         summary=result["summary"],
     )
-
-
-def diagnose(
-    data: Table,
-    domain: str,
-    *,
-    model: str | Mapping[str, Any] = "lin",
-    walls: str | Path | None = None,
-    leader: str = "measured",
-    folder: str | Path | None = None,
-    seed: int = 0,
-    options: DiscoverOptions | None = None,
-) -> dict[str, Any]:
-    """What a model lacks on a tidy table: the content of ``report.json``.
-
-    Args: as of :func:`fit`; a folder receives the page, the extended model and its checkpoint.
-
-    Raises:
-        NNodeError: see :func:`fit`.
-    """
-    with TemporaryDirectory(prefix="nnode-") as scratch:
-        return diagnose_table(
-            _file(data, Path(scratch) if folder is None else Path(folder)),
-            domain,
-            model=named(model),
-            walls=walls,
-            leader=leader,
-            folder=folder,
-            seed=seed,
-            options=options,
-        )
-
-
-def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
-    """A model's options by its name.
-
-    Raises:
-        ConfigError: an unknown name.
-    """
-    if not isinstance(model, str):
-        return {"name": model.get("term", ""), **model}
-    if model not in MODELS:
-        raise ConfigError(f"model={model} is unknown, expected one of {', '.join(MODELS)}")
-    return {"name": model, **MODELS[model]}
-
-
-def _file(data: Table, folder: Path) -> Path:
-    """A table as a file."""
-    if not isinstance(data, pd.DataFrame):
-        return Path(data).absolute()
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "table.parquet"
-    data.to_parquet(path, index=False)
-    return path.absolute()

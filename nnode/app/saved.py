@@ -43,7 +43,7 @@ def make_absolute(data: dict[str, Any]) -> None:
             data[key] = str(Path(place).absolute())
 
 
-def _checkpoint_of(overrides: list[str], option: str) -> str | None:
+def path_given(overrides: list[str], option: str) -> str | None:
     """The first path that ``option=PATH`` or ``option=[PATH, ...]`` names."""
     for override in reversed(overrides):
         key, _, value = override.partition("=")
@@ -54,7 +54,7 @@ def _checkpoint_of(overrides: list[str], option: str) -> str | None:
 
 def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GROUPS) -> list[str]:
     """Overrides that choose a checkpoint's groups where the user chooses none."""
-    path = _checkpoint_of(overrides, option)
+    path = path_given(overrides, option)
     if path is None:
         return []
     saved = load_checkpoint(path).config.get("groups", {})

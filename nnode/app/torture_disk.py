@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from nnode.app.torture_child import Child, script
-from nnode.app.torture_jobs import Job, jobs, load_libraries
+from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_kills import read_whole
 from nnode.app.torture_report import Row
 from nnode.files import PARTIAL
@@ -45,10 +45,7 @@ def disk(
         names: of the jobs; None takes all but the benchmark, which writes as the study does.
         mount: whether a disk in memory is tried as well.
     """
-    load_libraries()
-    scratch = folder / "disk"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    scratch = fresh(folder, "disk")
     rows = []
     for job in jobs(scratch / "raw"):
         if job.name in names if names is not None else job.name != "benchmark_discovery":

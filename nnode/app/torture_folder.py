@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from nnode.app.torture_child import Child, script
-from nnode.app.torture_jobs import Job, jobs, load_libraries
+from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_report import Row
 from nnode.lock import LOCK
 
@@ -23,10 +23,7 @@ def folder(root: Path, place: Path, names: list[str] | None = None, repeats: int
         names: of the jobs; None takes all.
         repeats: so many second runs, and as many after a kill, per job.
     """
-    load_libraries()
-    scratch = place / "folder"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    scratch = fresh(place, "folder")
     rows = []
     for job in jobs(scratch / "raw"):
         if names is None or job.name in names:

@@ -22,7 +22,7 @@ import pandas as pd
 import yaml
 
 from nnode.app.torture_child import Child, script
-from nnode.app.torture_jobs import Job, jobs, load_libraries
+from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_report import Row
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.store import MANIFEST, Store
@@ -47,10 +47,7 @@ def kills(
         seed: of the moments.
         names: of the jobs; None takes all.
     """
-    load_libraries()
-    scratch = folder / "kills"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    scratch = fresh(folder, "kills")
     known = jobs(scratch / "raw")
     strange = set(names or ()) - {job.name for job in known}
     if strange:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nnode.discover.variables import Variable, knots_of, lengths_of
+from nnode.discover.variables import Variable, knots_of, waves_of
 from nnode.models.crowd import dot
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
@@ -157,15 +157,5 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
         knots = knots_of(seen, most)
         for level, direction in directions.items():
             found.append(Variable(name, unit, value, knots, direction, level))
-    for name, unit, value, shortest, longest in (
-        ("position x", "m", _position(0), *WAY),
-        ("clock time", "s", _clock, *CLOCK),
-    ):
-        where = value(state)[agent]
-        low, high = float(where.min()), float(where.max())
-        lengths = lengths_of(shortest, longest, high - low)
-        for level, direction in axes.items() if lengths else ():
-            found.append(
-                Variable(f"waves of {name}", unit, value, (low, high), direction, level, lengths)
-            )
-    return found
+    found += waves_of("position x", "m", _position(0), state.x[..., 0][agent], WAY, axes)
+    return found + waves_of("clock time", "s", _clock, _clock(state)[agent], CLOCK, axes)

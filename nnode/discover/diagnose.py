@@ -18,14 +18,14 @@ from nnode.discover.engine import Engine, row_of, square_of
 from nnode.discover.fit import Fit, evaluated
 from nnode.discover.found import Found
 from nnode.discover.individual import individuals, sharpened
-from nnode.discover.judge import STANDS_OUT, absences, named, places, structure
+from nnode.discover.judge import absences, named, places, structure
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.result import Diagnosis, Gap, Verdict
 from nnode.discover.search import Search, search, settled
 from nnode.discover.traffic import TrafficEngine
-from nnode.discover.variables import Curves, Variable, curves, weighed
+from nnode.discover.variables import Curves, curves, weighed
 from nnode.errors import DataError
-from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
+from nnode.models.effects import CATALOGUE, IndividualEffect
 from nnode.models.extend import effects_of
 from nnode.models.system import System
 
@@ -86,11 +86,18 @@ def diagnose(
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     variables = engine.variables()
-    first = weighed(engine, base, curves(engine, base, variables), STANDS_OUT)
+    first = weighed(engine, base, curves(engine, base, variables), SURE)
     located = places(first, _excess(engine, base))
     clock.lap("locate")
     effects = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
-    found, left = _searched(engine, base, effects, variables, options)
+    found = search(
+        engine, base, effects, alpha=options.alpha, most=options.max_effects, seed=options.seed,
+        variables=variables,
+    )  # fmt: skip
+    last = first
+    if found.fit is not base:
+        last = weighed(engine, found.fit, curves(engine, found.fit, variables), SURE)
+    left = [one for one in last if one.removed > LEFT]
     clock.lap("name")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
     verdict = _verdict(found, left, removed, bool(faults))
@@ -124,27 +131,6 @@ def diagnose(
         open=opened,
         sealed=sealed,
     )
-
-
-def _searched(
-    engine: Engine,
-    base: Fit,
-    effects: list[type[Effect]],
-    variables: list[Variable],
-    options: DiscoverOptions,
-) -> tuple[Search, list[Curves]]:
-    """What is named, and the curves of what is left."""
-    found = search(
-        engine, base, effects, alpha=options.alpha, most=options.max_effects, seed=options.seed,
-        variables=variables,
-    )  # fmt: skip
-    return found, _left(engine, found.fit, variables)
-
-
-def _left(engine: Engine, fit: Fit, variables: list[Variable]) -> list[Curves]:
-    """The curves of what a model leaves, as far as they count."""
-    found = weighed(engine, fit, curves(engine, fit, variables), SURE)
-    return [one for one in found if one.removed > LEFT]
 
 
 def _excess(engine: Engine, fit: Fit) -> float:

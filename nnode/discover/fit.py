@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 #: Dampings that are tried side by side, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
 
+#: Tolerance of calibrations whose result is compared, not kept.
+ROUGH = 1e-3
+
 
 @dataclass
 class Fit:

@@ -58,7 +58,7 @@ class Individuals:
     losses: np.ndarray
     people: dict[str, list[float]]
     halves: tuple[dict[str, list[float]], dict[str, list[float]]]
-    amounts: tuple[np.ndarray, np.ndarray, np.ndarray]
+    amounts: list[np.ndarray]
     spread: float
     settings: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -129,13 +129,15 @@ def _at(
 ) -> Individuals:
     row = torch.from_numpy(fit.row)
     z = engine.individual(fit.system, row, effect, options).numpy().T
-    gram, score = _halves(z, fit.residual, engine)
+    known = _evidence(z, fit.residual, engine)
+    _, (early_gram, early_score), (late_gram, late_score) = known
     sequence_of = np.array([people[0][0] for people in engine.people])
-    each = np.einsum("um,um->u", score[0], score[1])
-    scale = np.einsum("umn,unm->u", gram[0], gram[1])
-    products = _products(engine, *_halves(_contrasts(z, engine), fit.residual, engine))
+    each = np.einsum("um,um->u", early_score, late_score)
+    scale = np.einsum("umn,unm->u", early_gram, late_gram)
+    _, early, late = _evidence(_contrasts(z, engine), fit.residual, engine)
+    products = _products(engine, early, late)
     count = int(engine.sequence.max()) + 1
-    weight = _weights(each, scale, gram[0].shape[1])
+    weight = _weights(each, scale, z.shape[1])
     each = np.bincount(sequence_of, weight * each, count)
     scale = np.bincount(sequence_of, weight * scale, count)
     variance = each.sum() / max(scale.sum(), 1e-300)
@@ -144,12 +146,8 @@ def _at(
     error = float(np.sqrt((count - 1) / count * ((others - others.mean()) ** 2).sum()))
     sigma = float(np.sqrt(max(variance, 0.0)))
     low, high = (float(np.sqrt(max(variance + s * 2.1 * error, 0.0))) for s in (-1, 1))
-    losses, best = _crossed(z, fit.residual, engine, max(sigma, 1e-6))
-    amounts = (
-        _amounts(gram[0] + gram[1], score[0] + score[1], best),
-        _amounts(gram[0], score[0], best),
-        _amounts(gram[1], score[1], best),
-    )
+    losses, best = _crossed(z, fit.residual, known, engine, max(sigma, 1e-6))
+    amounts = [_amounts(gram, score, best) for gram, score in known]
     full, *halves = (_people(engine, effect, options, each) for each in amounts)
     return Individuals(
         effect=effect,
@@ -180,7 +178,7 @@ def sharpened(engine: Engine, system: System, one: Individuals) -> Individuals:
     system = copy.deepcopy(system)
     own = next(t for t in system.terms if isinstance(t, one.effect))
     found = []
-    for part, amounts in zip((None, 0, 1), one.amounts, strict=True):
+    for part, amounts in enumerate(one.amounts):
         for _ in range(SHARPER):
             own.people = _people(engine, one.effect, one.options, amounts)
             fit = evaluated(engine, system)
@@ -189,11 +187,10 @@ def sharpened(engine: Engine, system: System, one: Individuals) -> Individuals:
             z = engine.individual(
                 fit.system, torch.from_numpy(fit.row), one.effect, one.options
             ).numpy().T  # fmt: skip
-            gram, score = _halves(z, fit.residual, engine)
-            g, v = (gram[0] + gram[1], score[0] + score[1]) if part is None else (
-                gram[part], score[part])  # fmt: skip
+            gram, score = _evidence(z, fit.residual, engine)[part]
             ridge = np.eye(z.shape[1]) / one.spread**2
-            change = np.linalg.solve(g + ridge, (v - amounts / one.spread**2)[..., None])[..., 0]
+            change = np.linalg.solve(gram + ridge, (score - amounts / one.spread**2)[..., None])
+            change = change[..., 0]
             # a change acts on the pace that is there already
             amounts = amounts + np.clip((1 + amounts) * change, -LEAP, LEAP)
         found.append(amounts)
@@ -204,7 +201,7 @@ def sharpened(engine: Engine, system: System, one: Individuals) -> Individuals:
         one,
         people=full,
         halves=(halves[0], halves[1]),
-        amounts=(found[0], found[1], found[2]),
+        amounts=found,
         sigma=factor * one.sigma,
         interval=(factor * one.interval[0], factor * one.interval[1]),
     )
@@ -223,11 +220,13 @@ def _weights(each: np.ndarray, scale: np.ndarray, number: int) -> np.ndarray:
     return weight
 
 
-def _halves(
-    z: np.ndarray, residual: np.ndarray, engine: Engine
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Gram matrices ``(U, M, M)`` and scores ``(U, M)`` of both halves."""
-    gram, score = [], []
+#: Gram matrices ``(U, M, M)`` and scores ``(U, M)``.
+_Evidence = tuple[np.ndarray, np.ndarray]
+
+
+def _evidence(z: np.ndarray, residual: np.ndarray, engine: Engine) -> list[_Evidence]:
+    """Of both halves together, of the early and of the late one."""
+    halves = []
     units = int(engine.unit.max()) + 1
     for half in (0, 1):
         own = engine.half == half
@@ -236,9 +235,9 @@ def _halves(
         np.add.at(matrix, label, part[:, :, None] * part[:, None, :])
         vector = np.zeros((units, z.shape[1]))
         np.add.at(vector, label, -part * residual[own][:, None])
-        gram.append(matrix)
-        score.append(vector)
-    return gram, score
+        halves.append((matrix, vector))
+    (early_gram, early_score), (late_gram, late_score) = halves
+    return [(early_gram + late_gram, early_score + late_score), *halves]
 
 
 def _contrasts(z: np.ndarray, engine: Engine) -> np.ndarray:
@@ -253,12 +252,13 @@ def _contrasts(z: np.ndarray, engine: Engine) -> np.ndarray:
     return found
 
 
-def _products(engine: Engine, gram: list[np.ndarray], score: list[np.ndarray]) -> np.ndarray:
+def _products(engine: Engine, early: _Evidence, late: _Evidence) -> np.ndarray:
     """Per agent the product of the two halves' scores, each in units of its standard error.
 
     What those at one place of their units have in common is no difference between people.
     """
-    size = [np.sqrt(np.maximum(np.einsum("umm->um", g), 1e-300)) for g in gram]
+    score = [early[1], late[1]]
+    size = [np.sqrt(np.maximum(np.einsum("umm->um", g), 1e-300)) for g in (early[0], late[0])]
     if len(engine.people[0]) == 1:
         return ((score[0] / size[0]) * (score[1] / size[1])).sum(1)
     known = (size[0] > 1e-140) & (size[1] > 1e-140)
@@ -278,17 +278,16 @@ def _amounts(gram: np.ndarray, score: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _crossed(
-    z: np.ndarray, residual: np.ndarray, engine: Engine, sigma: float
+    z: np.ndarray, residual: np.ndarray, known: list[_Evidence], engine: Engine, sigma: float
 ) -> tuple[np.ndarray, float]:
     """``(S,)`` sums of squares of each half under the other's amounts, and the best sigma."""
-    gram, score = _halves(z, residual, engine)
     best, chosen = None, sigma
+    both, early, late = known
     for spread in SPREADS:
         left = residual.copy()
         # what lies in neither half is predicted by both
-        for half, g, v in ((0, gram[1], score[1]), (1, gram[0], score[0]),
-                           (-1, gram[0] + gram[1], score[0] + score[1])):  # fmt: skip
-            amounts = _amounts(g, v, spread * sigma)
+        for half, (gram, score) in ((0, late), (1, early), (-1, both)):
+            amounts = _amounts(gram, score, spread * sigma)
             own = engine.half == half
             left[own] += np.einsum("nm,nm->n", z[own], amounts[engine.unit[own]])
         losses = sums(left**2, engine.sequence)

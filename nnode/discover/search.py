@@ -10,7 +10,7 @@ import numpy as np
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.engine import Engine, row_of, square_of
-from nnode.discover.fit import Fit, evaluated, refine, sums
+from nnode.discover.fit import ROUGH, Fit, evaluated, refine, sums
 from nnode.discover.individual import Individuals, individuals, sharpened
 from nnode.discover.score import Score, Screen, Trace, traces
 from nnode.discover.variables import Variable, curves
@@ -36,8 +36,6 @@ CLOSE = 0.8
 #: probability: an interval that was looked for is flattered, and no name is better than a wrong
 #: one.
 MARGIN, RATHER = 0.1, 0.35
-#: Calibrations of rivals end where a step lowers the cost by less than this share.
-ROUGH = 1e-3
 #: An interval is moved at most so many times.
 SHIFTS = 3
 #: An effect must predict sequences that a calibration left out better, at this error probability.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
-from nnode.discover.variables import Variable, knots_of, lengths_of
+from nnode.discover.variables import Variable, knots_of, waves_of
 from nnode.models.effects.traffic import gaps, rate_of
 from nnode.models.term import State
 
@@ -107,15 +107,10 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         unit: str,
         value: Callable[[State], Tensor],
         seen_values: Tensor,
-        shortest: float,
-        longest: float,
+        between: tuple[float, float],
     ) -> list[Variable]:
         values = seen_values.expand(x.shape)[seen]
-        low, high = float(values.min()), float(values.max())
-        lengths = lengths_of(shortest, longest, high - low)
-        if not lengths:
-            return []
-        return [Variable(f"waves of {name}", unit, value, (low, high), _followers, "", lengths)]
+        return waves_of(name, unit, value, values, between, {"": _followers})
 
     return [
         of("gap", "m", _gap, gap),
@@ -128,6 +123,6 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         of("clock time", "s", _clock, clock),
         of("time since the start", "s", _since_start(first), since),
         of("place in the platoon", "1", _rank, rank.to(x.dtype)),
-        *waves("position", "m", _position, x, *ROAD),
-        *waves("clock time", "s", _clock, clock, max(CLOCK[0], 4 * batch.dt), CLOCK[1]),
+        *waves("position", "m", _position, x, ROAD),
+        *waves("clock time", "s", _clock, clock, (max(CLOCK[0], 4 * batch.dt), CLOCK[1])),
     ]  # fmt: skip

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.engine import Engine, fill, square_of
-from nnode.discover.fit import Fit, limits, refine, sums
+from nnode.discover.fit import ROUGH, Fit, limits, refine, sums
 from nnode.discover.score import Screen
 from nnode.errors import SimulationError
 from nnode.models.system import System
@@ -25,8 +25,6 @@ BENDS = (2, 5, 12)
 RIDGE = 1e-3
 #: Sign flips that p-values of curves come from: there are many curves.
 FLIPS = 7999
-#: Calibrations end where a step lowers the cost by less than this share.
-ROUGH = 1e-3
 #: At most so many curves are calibrated with the model, those that predict best.
 MOST = 6
 #: Columns that are computed at once.
@@ -114,6 +112,29 @@ def lengths_of(shortest: float, longest: float, span: float, most: int = 600) ->
     low, high = 1 / min(longest, span / 2), 1 / shortest
     number = min(int((high - low) * 2 * span), most)
     return tuple(1 / (low + k / (2 * span)) for k in range(number))
+
+
+def waves_of(
+    name: str,
+    unit: str,
+    value: Callable[[State], Tensor],
+    seen: Tensor,
+    between: tuple[float, float],
+    directions: dict[str, Callable[[State], Tensor]],
+) -> list[Variable]:
+    """Waves of a variable in each direction; none where the data span too little of it.
+
+    Args:
+        seen: values that occur.
+        between: the shortest and the longest wave.
+        directions: by level, see :class:`Variable`.
+    """
+    low, high = float(seen.min()), float(seen.max())
+    lengths = lengths_of(*between, high - low)
+    return [
+        Variable(f"waves of {name}", unit, value, (low, high), direction, level, lengths)
+        for level, direction in directions.items() if lengths
+    ]  # fmt: skip
 
 
 @dataclass

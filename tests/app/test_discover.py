@@ -16,6 +16,7 @@ import pytest
 
 from nnode.app import discover as app
 from nnode.app.cli import check_overrides
+from nnode.app.given import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions
@@ -223,7 +224,7 @@ def test_effects_can_be_given_on_the_command_line() -> None:
 
 
 def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
-    full = app.model_options(model, "measured")
+    full = model_options(model, "measured")
     return app._job(full, data, {}, {}, DiscoverOptions(**options), Path("nowhere"))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from nnode.app import discover
+from nnode.app.given import model_options
 from nnode.data.options import TableOptions
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
@@ -34,7 +34,7 @@ def _case(folder: Path, domain: str, table: Path, walls: Path | None, model: Any
     options = DiscoverOptions(sealed=0.4)
     data = TableOptions(domain=domain, path=str(table), walls=None if walls is None else str(walls))
     inputs = read_inputs(data, folder / "data")
-    full = discover.model_options(model, "measured")
+    full = model_options(model, "measured")
     system = build_model(full)
     found = stand_in.diagnose(system, inputs.sequences, options, faults=inputs.faults)
     return Case(table, walls, full, inputs, options, found)
