@@ -9,6 +9,10 @@ from scipy import stats
 
 from nnode.discover.fit import Fit, sums
 
+#: What the other sequences know less of than this share of what all know is not changed by
+#: leaving one out: nothing follows from them.
+ALONE = 0.02
+
 
 def heldout(fit: Fit, sequence: np.ndarray) -> np.ndarray:
     """``(S,)`` cost of each sequence under the parameters that the other sequences give.
@@ -18,18 +22,19 @@ def heldout(fit: Fit, sequence: np.ndarray) -> np.ndarray:
     columns, number = fit.tangents, int(sequence.max()) + 1
     if not columns.shape[1]:
         return sums(fit.residual**2, sequence)
-    scale = np.sqrt((columns**2).sum(0))
-    columns = columns / scale
-    whole = columns.T @ columns
+    # orthonormal columns: what the others know of a direction is then a share of what all know
+    columns = columns / np.sqrt((columns**2).sum(0))
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    columns = left[:, size > 1e-4 * size[0]]
     found = np.zeros(number)
     for s in range(number):
         own = sequence == s
         part, residual = columns[own], fit.residual[own]
-        rest = whole - part.T @ part
+        known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
         # at the minimum the gradient of the others is minus that of this sequence
-        step = np.linalg.lstsq(rest, part.T @ residual, rcond=1e-8)[0]
-        left = residual + part @ step
-        found[s] = left @ left
+        step = vector.T @ (part.T @ residual) / np.maximum(known, ALONE)
+        residual = residual + part @ vector @ np.where(known > ALONE, step, 0.0)
+        found[s] = residual @ residual
     return found
 
 

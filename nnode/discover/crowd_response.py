@@ -172,8 +172,8 @@ def propagate(jacobian: Tensor, step: float) -> tuple[Tensor, Tensor]:
 
     Returns:
         ``(P, F, 2, 4)``: of the positions to the start (x, v); ``(P, F, 2, F, 2)``: to
-        accelerations given at the steps and linear in between. By the classical Runge-Kutta
-        method.
+        accelerations given at the steps, parabolas through three of them in between. By the
+        classical Runge-Kutta method.
     """
     p, f = jacobian.shape[:2]
     full = torch.zeros(p, f, 4, 4, dtype=jacobian.dtype)
@@ -204,6 +204,12 @@ def propagate(jacobian: Tensor, step: float) -> tuple[Tensor, Tensor]:
         if k:
             state = y[:, k - 1, :, :4] @ state
             state[:, :, 2 + 2 * k : 6 + 2 * k] += y[:, k - 1, :, 4:]
+        if k > 1:
+            for past, share in enumerate((1.0, -2.0, 1.0)):
+                for d in range(2):
+                    column = 4 + 2 * (k - past) + d
+                    state[:, d, column] -= share * step**2 / 24
+                    state[:, 2 + d, column] -= share * step / 12
         start[:, k] = state[:, :2, :4]
         forced[:, k] = state[:, :2, 4:].reshape(p, 2, f, 2)
     return start, forced

@@ -160,8 +160,9 @@ class Walk:
     def _compiled(self, parameters: dict[str, Tensor], rows: Tensor, start: Tensor) -> Tensor:
         """``(F, R, P, 4)``; the terms that are not compiled are evaluated once in each step.
 
-        Their accelerations are linear between the steps. In a step they are extrapolated first,
-        and the state after it is corrected when they are known there.
+        In a step their accelerations are extrapolated first, and the state after it is corrected
+        when they are known there: a parabola through the last three steps, for a sway of one
+        second changes too fast for lines.
         """
         windows, h, q = self.windows, self.windows.step, self.forces(rows)
         out = np.empty((windows.steps + 1, len(rows), *start.shape))
@@ -173,8 +174,9 @@ class Walk:
             crowd_kernel.advance(out[n], before, after, out[n + 1], n, h, *fixed)
             if self.beyond.added:
                 found = self._extra(parameters, q, 2 * n + 2, out[n + 1])
-                out[n + 1, ..., :2] += h**2 / 6 * (found - after)
-                out[n + 1, ..., 2:] += h / 2 * (found - after)
+                bend = found - after if n else 0.0
+                out[n + 1, ..., :2] += h**2 / 6 * (found - after) - h**2 / 24 * bend
+                out[n + 1, ..., 2:] += h / 2 * (found - after) - h / 12 * bend
                 before, after = found, 2 * found - before
         return torch.from_numpy(out)
 

@@ -108,7 +108,7 @@ def diagnose(
         verdict=verdict,
         domain=domain,
         model="",
-        effects=[named(found, step, engine.sequence) for step in found.steps],
+        effects=[named(engine, found, step) for step in found.steps],
         data_faults=[],
         not_testable=[one.name for one in absent if not one.testable],
         absences=absent,

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from nnode.discover.edges import intervals as edge_intervals
+from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit
 from nnode.discover.result import (
     Absence,
@@ -29,10 +31,10 @@ WIDE, POWER = 1.96, 0.84
 STANDS_OUT = 0.01
 
 
-def named(search: Search, step: Step, sequence: np.ndarray) -> NamedEffect:
+def named(engine: Engine, search: Search, step: Step) -> NamedEffect:
     """An accepted effect with its coefficients in the final fit."""
     effect = step.chosen.score.effect
-    coefficients = _coefficients(search.fit, step, sequence)
+    coefficients = _coefficients(engine, search.fit, step)
     return NamedEffect(
         name=effect.name,
         formula=effect.formula,
@@ -53,14 +55,15 @@ def named(search: Search, step: Step, sequence: np.ndarray) -> NamedEffect:
     )
 
 
-def _coefficients(fit: Fit, step: Step, sequence: np.ndarray) -> dict[str, Coefficient]:
+def _coefficients(engine: Engine, fit: Fit, step: Step) -> dict[str, Coefficient]:
     effect = step.chosen.score.effect
     place, own = next(
         (i, t)
         for i, t in enumerate(fit.system.terms)
         if isinstance(t, Effect) and t.name == effect.name
     )
-    intervals = fit.intervals(sequence)
+    intervals = fit.intervals(engine.sequence)
+    edges = edge_intervals(engine, fit, effect.name) if effect.consecutive else {}
     found = {}
     units = {name: strength.unit for name, strength in effect.strengths.items()}
     units |= {name: setting.unit for name, setting in effect.settings.items()}
@@ -76,6 +79,7 @@ def _coefficients(fit: Fit, step: Step, sequence: np.ndarray) -> dict[str, Coeff
         elif step.individuals is not None and name in step.individuals.settings:
             value = float(step.individuals.options[name])
             low, high = step.individuals.settings[name]
+        low, high = edges.get(name, (low, high))
         found[name] = Coefficient(value, low, high, unit)
     return found
 

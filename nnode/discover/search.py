@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nnode.discover.compare import Comparison, compare, heldout
+from nnode.discover.edges import moved
 from nnode.discover.engine import Engine, row_of, square_of
 from nnode.discover.fit import ROUGH, Fit, evaluated, refine, sums
 from nnode.discover.individual import Individuals, individuals, sharpened
@@ -178,6 +179,8 @@ def search(
             break
         found.steps.append(step)
         found.fit = settled(engine, step.chosen.fit.system, rounds=1)
+        if step.chosen.score.effect.consecutive:
+            found.fit = moved(engine, found.fit, step.chosen.name)
         if step.individuals is not None:
             found.fit = _again(engine, found.fit, step.chosen)
         log.info("added %s", step.chosen.name)

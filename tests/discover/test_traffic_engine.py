@@ -9,7 +9,7 @@ import torch
 from nnode.data.sequence import Sequence
 from nnode.discover.compare import compare, heldout
 from nnode.discover.engine import row_of
-from nnode.discover.fit import Fit, evaluated, refine
+from nnode.discover.fit import Fit, evaluated, refine, sums
 from nnode.discover.individual import Individuals, individuals, sharpened
 from nnode.discover.score import Screen, traces
 from nnode.discover.search import search, settled
@@ -234,6 +234,22 @@ def test_heldout_cost_is_that_of_a_refit(reacting: list[Sequence]) -> None:
     one.filter = engine.filter
     value = one.residuals(model(), torch.from_numpy(again.row)[None])[0]
     assert losses[0] == pytest.approx(float(value @ value), rel=0.02)
+
+
+def test_what_one_sequence_knows_alone_is_not_judged_by_the_others() -> None:
+    rng = np.random.default_rng(0)
+    sequence = np.repeat(np.arange(4), 50)
+    jacobian = rng.normal(size=(200, 2))
+    one, other = jacobian[sequence == 2].T
+    jacobian[:, 1] *= 1e-7
+    jacobian[sequence == 2, 1] = other - one * (one @ other) / (one @ one)
+    residual = rng.normal(size=200)
+    fit = Fit(System([]), ["a", "b"], np.zeros(2), residual, jacobian, np.ones(2, dtype=bool))
+    losses = heldout(fit, sequence)
+    assert losses[2] == pytest.approx(sums(residual**2, sequence)[2], rel=0.1)
+    fit.jacobian = jacobian[:, :1]
+    fit.free = np.ones(1, dtype=bool)
+    np.testing.assert_allclose(losses, heldout(fit, sequence), rtol=1e-3)
 
 
 def test_comparison_is_bounded_by_every_sequence() -> None:
