@@ -26,7 +26,7 @@ from typing import Any
 from nnode.app.torture_child import Child
 from nnode.app.torture_report import Row
 from nnode.app.torture_targets import Target, quiet, targets
-from nnode.errors import NNodeError
+from nnode.errors import ConfigError, NNodeError
 
 #: Bytes of address space that a child may take beyond what it has when it starts.
 ROOM = 2 << 30
@@ -105,7 +105,13 @@ def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -
     scratch, outside = folder / "fuzz", folder / "outside"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
-    chosen = [t for t in targets(scratch, outside) if names is None or t.name in names]
+    known = targets(scratch, outside)
+    strange = sorted(set(names or []) - {t.name for t in known})
+    if strange:
+        raise ConfigError(
+            f"targets: {strange[0]} is unknown, expected some of {', '.join(t.name for t in known)}"
+        )
+    chosen = [t for t in known if names is None or t.name in names]
     whole = sum(target.share for target in chosen)
     found = []
     for target in chosen:
