@@ -6,7 +6,7 @@ import logging
 import sys
 import time
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
@@ -28,6 +28,9 @@ class OnTerminal:
 
     def __init__(self, *columns: ProgressColumn, forks: bool = False) -> None:
         self._bar: Progress | None = None
+        self._forks = forks
+        #: handlers of the log that write to the terminal, above the bar for as long as it is there
+        self._moved: list[tuple[logging.StreamHandler[Any], Any]] = []
         if sys.stderr.isatty():
             # what is printed belongs to the results; the bar shall not be among them in a file
             self._bar = Progress(
@@ -42,6 +45,14 @@ class OnTerminal:
     def __enter__(self) -> Self:
         if self._bar:
             self._bar.start()
+            if not self._forks:
+                self._moved = [
+                    (one, one.setStream(sys.stderr))  # which the bar has made its own
+                    for one in logging.getLogger().handlers
+                    if isinstance(one, logging.StreamHandler)
+                    and one.stream.isatty()
+                    and one.stream is not sys.stderr
+                ]
         return self
 
     def __exit__(
@@ -50,6 +61,8 @@ class OnTerminal:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        for handler, stream in self._moved:
+            handler.setStream(stream)
         if self._bar:
             self._bar.stop()
 
@@ -85,6 +98,16 @@ class Stages(OnTerminal):
         if self._bar:
             self._task = self._bar.add_task(title, total=1.0, text="")
 
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._bar and error is None:
+            self._bar.update(self._task, completed=1.0, text="")
+        super().__exit__(kind, error, trace)
+
     def begin(self, stage: str) -> None:
         """A stage begins; those before it are done."""
         names = list(self.shares)
@@ -97,7 +120,7 @@ class Stages(OnTerminal):
         self.done = self._before + self.shares[self._stage] * min(max(part, 0.0), 1.0)
         if self._bar:
             self._bar.update(self._task, completed=self.done, text=self.text())
-            if not self._bar.live.auto_refresh:
+            if self._forks:
                 self._bar.refresh()
         elif self.line_is_due():
             log.info("%s: %s", self.title, self.text())

@@ -60,10 +60,12 @@ def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, fo
     def work() -> None:
         os.dup2(follower, 2)
         sys.stdout, sys.stderr = open(1, "w"), open(2, "w")  # noqa: SIM115
+        logging.basicConfig(stream=sys.stderr, format="%(message)s", force=True)
         with Stages("work", {"a": 1.0, "b": 1.0}, forks=forks) as stages:
             stages.begin("a")
             stages.begin("b")
-            stages.within(1.0)
+            logging.warning("by the way")
+            stages.within(0.5)
         print("result: 7")
 
     child = Child(work, tmp_path / "out")
@@ -77,3 +79,7 @@ def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, fo
     assert child.status() == 0
     assert (tmp_path / "out").read_text() == "result: 7\n"
     assert re.search(rb"work .*0:00:00.* b", shown)
+    if not forks:  # above the bar, in a line of its own
+        assert re.search(
+            rb"\nby the way *\r?\n", re.sub(rb"\x1b\[[0-9;?]*[a-zA-Z]|\r", b"\n", shown)
+        )
