@@ -106,7 +106,15 @@ def composed(name: str, overrides: list[str]) -> DictConfig:
     try:
         return compose(name, overrides, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(str(error).splitlines()[0]) from None
+        raise ConfigError(_unfit(str(error).splitlines())) from None
+
+
+def _unfit(said: list[str]) -> str:
+    """What is said of choices that do not go together."""
+    file = re.match(r"In '(.*)': .*raised while composing", said[0])
+    if file is None or len(said) < 2:
+        return said[0]
+    return f"{file[1].replace('/', '=')} does not go with the other choices: {said[1]}"
 
 
 def _loader(folder: Path, extra: Path | None) -> ConfigLoader:

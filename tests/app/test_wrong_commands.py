@@ -70,6 +70,10 @@ WRONG = [
     ("train optimizer=sgd", "expected one of adadelta, adam, cbo, lbfgs"),
     ("train experiment=demo", "did you mean demo_crowd?"),
     ("train experiment=[demo_traffic,paper_traffic]", "expected one of demo_crowd"),
+    (
+        "train experiment=demo_crowd solver=fused",
+        "experiment=demo_crowd does not go with the other choices: Key 'gradient'",
+    ),
     ("train study=traffic", "this script has no study= to choose"),
     ("evaluate model=lin", "this script has no model= to choose, it has data=, solver="),
     ("train trainer.foo=1", "option trainer.foo is unknown (trainer has: max_epochs"),

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.request import urlopen
 
 import pytest
@@ -55,32 +56,24 @@ def asked(address: str, path: str) -> object:
 
 
 def test_curves_are_served(address: str) -> None:
-    assert asked(address, "data/plugin/scalars/tags") == {
-        "tensorboard": {
-            name: {"displayName": "", "description": ""} for name in ("cost/train", "parameters/v0")
-        }
-    } or {"cost/train", "parameters/v0"} <= set(
-        asked(address, "data/plugin/scalars/tags")["tensorboard"]  # type: ignore[index]
-    )
-    rows = asked(address, "data/plugin/scalars/scalars?run=tensorboard&tag=cost/train")
-    assert [row[1:] for row in rows] == [[0, 4.0], [1, 2.0], [2, 1.0]]  # type: ignore[attr-defined]
+    tags: Any = asked(address, "data/plugin/scalars/tags")
+    assert {"cost/train", "parameters/v0"} <= set(tags["tensorboard"])
+    rows: Any = asked(address, "data/plugin/scalars/scalars?run=tensorboard&tag=cost/train")
+    assert [row[1:] for row in rows] == [[step, cost] for step, cost in enumerate(COSTS)]
+
+
+#: What TensorBoard itself, or the browser without a graphics card, complains of.
+KNOWN = r"Multiple instances of Three\.js|fallback to software WebGL"
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="needs a Chromium")
-def test_the_page_loads_offline_without_errors(address: str, tmp_path: Path) -> None:
+def test_the_page_shows_them_offline_without_errors(address: str, tmp_path: Path) -> None:
+    asked(address, "data/plugin/scalars/tags")
     with Browser(tmp_path) as browser:
         browser.open(address)
-        shown = "document.body.innerText + [...document.querySelectorAll('*')].length"
         end = time.monotonic() + 20
         while "cost" not in browser.evaluate("document.body.innerText"):
-            assert time.monotonic() < end, browser.evaluate(shown)
+            assert time.monotonic() < end, browser.evaluate("document.body.innerText")
             time.sleep(0.2)
-        browser.picture(tmp_path / "tensorboard.png")
-        outside = [one for one in browser.requests if not one.startswith(address)]
-        errors = [one for one in browser.complaints if not re.search(KNOWN, one)]
-    assert errors == []
-    assert all(re.search(KNOWN, one) for one in outside), outside
-
-
-#: What TensorBoard itself asks for or complains of, whatever it shows.
-KNOWN = r"fonts\.(googleapis|gstatic)\.com"
+        assert [one for one in browser.requests if not one.startswith(address)] == []
+        assert [one for one in browser.complaints if not re.search(KNOWN, one)] == []
