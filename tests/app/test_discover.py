@@ -208,7 +208,7 @@ def test_a_signal_leaves_no_half_report(run: Path, tmp_path: Path) -> None:
         (["discover.efects=[inertia]"], r"did you mean discover\.effects"),
         (["discover.page=perhaps"], "discover.page=perhaps is refused"),
         (["model=line"], r"model=line is unknown.*did you mean lin"),
-        (["discover.max_effects=many"], "could not be converted to Integer"),
+        (["discover.max_effects=many"], "expected a whole number"),
     ],
 )
 def test_a_wrong_option_is_refused_in_words(given: list[str], message: str) -> None:
