@@ -300,7 +300,7 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
     frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
     frame.to_csv(table, index=False)
 
-    def nothing(*arguments: Any, faults: dict[str, Any]) -> Any:
+    def nothing(*arguments: Any, faults: dict[str, Any], stages: Any) -> Any:
         found = stand_in.diagnose(*arguments, faults=faults)
         known = faults["lane/1"][0]
         # what the diagnosis reports itself: one fault that the reader knows, one of its own
