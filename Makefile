@@ -21,8 +21,8 @@ demo: setup
 	@echo "== crowd: people in a corridor, forces as networks"
 	$(BIN)/python scripts/train.py experiment=demo_crowd data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/crowd
 	@echo "== results"
-	@$(BIN)/python scripts/plot_forces.py checkpoint=[$(DEMO)/traffic/checkpoints/best.pt] hydra.run.dir=$(DEMO)/traffic/forces
-	@$(BIN)/python scripts/plot_forces.py checkpoint=[$(DEMO)/crowd/checkpoints/best.pt] hydra.run.dir=$(DEMO)/crowd/forces
+	@$(BIN)/python scripts/plot_forces.py checkpoint=$(DEMO)/traffic/checkpoints/best.pt hydra.run.dir=$(DEMO)/traffic/forces
+	@$(BIN)/python scripts/plot_forces.py checkpoint=$(DEMO)/crowd/checkpoints/best.pt hydra.run.dir=$(DEMO)/crowd/forces
 	@echo "TensorBoard: $(BIN)/tensorboard --logdir $(DEMO)"
 	@echo "runs:        $(DEMO)/traffic/tensorboard $(DEMO)/crowd/tensorboard"
 	@echo "checkpoints: $(DEMO)/traffic/checkpoints/best.pt $(DEMO)/crowd/checkpoints/best.pt"

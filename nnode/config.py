@@ -68,7 +68,7 @@ class PrepareConfig:
 class EvaluateConfig:
     """``scripts/evaluate.py``: errors of a checkpoint beside its baselines."""
 
-    checkpoint: str = MISSING
+    checkpoint: str = MISSING  # RUN/checkpoints/best.pt
     data: Any = MISSING
     solver: Any = MISSING
     device: Device = Device.auto
@@ -101,12 +101,14 @@ class PlotForcesConfig:
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`nnode.app.benchmark`."""
 
+    # problems: paper | stress | steps | crowd | people | scale
     shapes: list[str] = field(
         default_factory=lambda: ["paper", "stress", "steps", "crowd", "people", "scale"]
     )
     engines: list[str] | None = None  # null times all that cover a problem
-    repeats: int = 5
+    repeats: int = 5  # timings of each, of which the median counts
     restarts: int = 16  # of the ensemble
+    # of the timings; agreement is checked in float64
     dtype: Precision = Precision.float32
     redraw: str | None = None  # a benchmark.json to draw, and time nothing
 
@@ -122,12 +124,14 @@ class BenchmarkConfig:
 class DiscoveryBenchmarkOptions:
     """Which truths ``scripts/benchmark_discovery.py`` hides, how strongly, in how much data."""
 
-    domains: list[str] = field(default_factory=lambda: ["traffic", "crowd"])
-    arms: list[str] | None = None  # null: all
+    domains: list[str] = field(default_factory=lambda: ["traffic", "crowd"])  # or one of them
+    # what is hidden: single | pair | nothing | outside | near_miss | no_excitation | fault;
+    # null: all
+    arms: list[str] | None = None
     effects: list[str] | None = None  # null: all; else only cases that hide one of these
     seeds: int = 10  # per effect, pair or fault
     nothing_seeds: int = 70  # per kind of nothing, of which there are three
-    first_seed: int = 0
+    first_seed: int = 0  # of the cases
     strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
     noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
     sizes: list[int] = field(default_factory=lambda: [20])  # numbers of sequences
@@ -164,13 +168,14 @@ class DiscoverConfig:
 class TortureConfig:
     """``scripts/torture.py``: misuse on purpose."""
 
+    # what is tried: kills | disk | folder | fuzz
     campaigns: list[str] = field(default_factory=lambda: ["kills", "disk", "folder", "fuzz"])
     kills: int = 200  # over all jobs
     jobs: list[str] | None = None  # scripts that are tortured; null: all that keep results
     repeats: int = 4  # second runs in a folder, per job
     inputs: int = 104000  # malformed files over all targets
     targets: list[str] | None = None  # what is given them; null: every reader and loader
-    seed: int = 0
+    seed: int = 0  # of moments of kills and of malformed files
 
 
 SCHEMAS: dict[tuple[str | None, str], Any] = {

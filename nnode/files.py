@@ -10,13 +10,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nnode.errors import WriteError
+from nnode.errors import DataError, WriteError
 
 #: Ends the names of files that are being written; ``.NAME.PROCESS`` stands before it.
 PARTIAL = ".partial"
 
 #: What the system answers where there is no room, or where nothing may be written.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
+
+#: What it answers where a file stands in place of a folder, or the other way round.
+_NO_FOLDER = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG}
 
 
 @contextmanager
@@ -46,17 +49,34 @@ def disk_words(folder: Path) -> Iterator[None]:
         folder: where the work inside writes.
 
     Raises:
-        WriteError: for the system's errors of that kind; all others pass.
+        WriteError: for the system's errors of that kind, and where a file stands in place of the
+            folder; all others pass.
+        DataError: for a file that may not be read.
     """
     try:
         yield
     except OSError as error:
+        if error.errno in _NO_FOLDER:
+            raise WriteError(
+                f"{folder} cannot be used as a folder: {error.strerror} "
+                f"({error.filename or folder}); choose another one with hydra.run.dir="
+            ) from error
         if error.errno not in _NO_ROOM:
             raise
+        if _shut(error):
+            raise DataError(
+                f"{error.filename} cannot be read: {error.strerror}; allow it, or take another file"
+            ) from error
         raise WriteError(
             f"{error.filename or folder} cannot be written: {error.strerror}. What was written "
             "before is kept; make room, or choose another folder with hydra.run.dir="
         ) from error
+
+
+def _shut(error: OSError) -> bool:
+    """Whether it is a file that is there, but may not be read."""
+    place = error.filename
+    return isinstance(place, str) and os.path.isfile(place) and not os.access(place, os.R_OK)
 
 
 def write_text(path: Path, text: str) -> Path:

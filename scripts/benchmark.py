@@ -1,8 +1,11 @@
 """Time all engines on the same problems, after checking that they agree.
 
-python scripts/benchmark.py
-python scripts/benchmark.py benchmark.shapes=[stress] benchmark.repeats=3
-python scripts/benchmark.py benchmark.shapes=[paper] benchmark.engines=[odeint,fused_1]
+Examples:
+  python scripts/benchmark.py
+  python scripts/benchmark.py 'benchmark.shapes=[stress]' benchmark.repeats=3
+  python scripts/benchmark.py 'benchmark.shapes=[paper]' 'benchmark.engines=[odeint,fused_1]'
+
+Results: tables, benchmark.json, and benchmark.png where there is enough to draw.
 """
 
 from nnode.app.benchmark import benchmark

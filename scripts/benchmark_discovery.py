@@ -1,13 +1,18 @@
 """Hide effects in synthetic data, diagnose, and score against the truth.
 
-python scripts/benchmark_discovery.py
-python scripts/benchmark_discovery.py benchmark_discovery.domains=[traffic] \\
-    benchmark_discovery.arms=[single,nothing] benchmark_discovery.seeds=3
-python scripts/benchmark_discovery.py benchmark_discovery.domains=[traffic] \\
-    benchmark_discovery.arms=[single] benchmark_discovery.noises=[0,0.05,0.3] \\
-    benchmark_discovery.sizes=[5,20,80]
+Examples:
+  # everything: hours
+  python scripts/benchmark_discovery.py
+  # a part of it
+  python scripts/benchmark_discovery.py 'benchmark_discovery.domains=[traffic]' \\
+      'benchmark_discovery.arms=[single,nothing]' benchmark_discovery.seeds=3
+  # against noise and number of sequences
+  python scripts/benchmark_discovery.py 'benchmark_discovery.domains=[traffic]' \\
+      'benchmark_discovery.arms=[single]' 'benchmark_discovery.noises=[0,0.05,0.3]' \\
+      'benchmark_discovery.sizes=[5,20,80]'
 
-The same command goes on where it was stopped.
+Results: a page with tables of what was found, missed and invented. The same command goes on where
+it was stopped.
 """
 
 from nnode.app.benchmark_discovery import benchmark_discovery

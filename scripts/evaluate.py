@@ -1,7 +1,14 @@
 """Errors of a calibrated model beside its baselines.
 
-python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt
-python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
+Examples:
+  # on the sequences that its training held out
+  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt
+  # on other data
+  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
+  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt part=all
+
+Results: a table, and metrics.json. Data and solver are those of the training where none are
+chosen.
 """
 
 from functools import partial

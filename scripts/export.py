@@ -1,8 +1,14 @@
 """A run's results in the formats of other programs.
 
-python scripts/export.py run=RUN                        # all that fit the run's model
-python scripts/export.py run=RUN to=jupedsim
-python scripts/export.py run=RUN to=[pedpy,parquet] trajectories=simulated part=heldout
+Examples:
+  # all that fit the run's model
+  python scripts/export.py run=RUN
+  # the social force's parameters for JuPedSim, a law's for SUMO
+  python scripts/export.py run=RUN to=jupedsim
+  python scripts/export.py run=RUN 'to=[pedpy,parquet]' trajectories=simulated part=heldout
+
+Results: the files, and what of the model has no counterpart there; docs/exchange.md. Data are those
+of the run where none are chosen.
 """
 
 from nnode.app.cli import run

@@ -1,8 +1,18 @@
 """Turn raw recordings into sequences, with a manifest of everything kept and dropped.
 
-python scripts/prepare_data.py data=esimas
-python scripts/prepare_data.py data=juelich data.source=FOLDER_OR_URL
-python scripts/prepare_data.py data=ngsim data.path=FILE
+Other scripts do so on the fly; this one does it once, to look at what became of the files.
+
+Examples:
+  # the paper's traffic data, downloaded or from the folder in NNODE_DATA
+  python scripts/prepare_data.py data=esimas
+  python scripts/prepare_data.py data=juelich data.source=FOLDER_OR_URL
+  # your own files
+  python scripts/prepare_data.py data=table data.path=mine.csv data.domain=traffic
+  python scripts/prepare_data.py data=vehicles data.path=FILE 'data.columns={vehicle: id, x: pos}'
+  python scripts/prepare_data.py data=sumo data.path=fcd.xml
+
+Results: the sequences, manifest.json, and pictures of those with faults. Train with
+data.prepared=FOLDER.
 """
 
 from nnode.app.cli import run

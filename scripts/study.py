@@ -1,10 +1,13 @@
 """Redo the paper's studies on the real recordings; ends with one page beside its printed numbers.
 
-python scripts/study.py study=traffic
-python scripts/study.py study=crowd study.quick=true
-python scripts/study.py study=traffic study.workers=8 hydra.run.dir=runs/study/mine
+Examples:
+  python scripts/study.py study=traffic
+  # shows within a minute that all works; no figures to cite
+  python scripts/study.py study=crowd study.quick=true
+  python scripts/study.py study=traffic study.workers=8 hydra.run.dir=runs/study/mine
 
-The same command goes on where it was stopped.
+Results: study.html, the same in Markdown, and a CSV of every table and of all parameters. The same
+command goes on where it was stopped.
 """
 
 from nnode.app.cli import run

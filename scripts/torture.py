@@ -1,10 +1,12 @@
 """Misuse on purpose: kills, full disks, two runs in one folder, malformed files.
 
-python scripts/torture.py
-python scripts/torture.py campaigns=[kills] kills=50 jobs=[train,study]
-python scripts/torture.py campaigns=[fuzz] inputs=10000 targets=[juelich,esimas] seed=7
+Examples:
+  # everything: hours
+  python scripts/torture.py
+  python scripts/torture.py 'campaigns=[kills]' kills=50 'jobs=[train,study]'
+  python scripts/torture.py 'campaigns=[fuzz]' inputs=10000 'targets=[juelich,esimas]' seed=7
 
-Ends with one table and report.json; its exit status is not 0 where anything was lost.
+Results: one table and report.json; the exit status is not 0 where anything was lost.
 """
 
 from nnode.app.cli import run

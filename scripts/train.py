@@ -1,10 +1,22 @@
 """Calibrate a model to measured trajectories.
 
-python scripts/train.py model=n4 data=esimas data.recording=1-1_1
-python scripts/train.py -m model=lin,log,n2 seed=1,2,3
-python scripts/train.py -m hydra/launcher=cores model=lin,log,n2
-torchrun --nproc-per-node=2 scripts/train.py model=n4 data=esimas data.recording=1-1_1
-python scripts/train.py resume=RUN/checkpoints/last.pt hydra.run.dir=RUN
+Examples:
+  # one recording of the paper's, its four-neuron network
+  python scripts/train.py model=n4 data=esimas data.recording=1-1_1
+  # compiled kernels and L-BFGS: a hundred times faster
+  python scripts/train.py model=lin data=esimas solver=fused optimizer=lbfgs
+  # your own table: columns sequence, time, agent, x; in SI units
+  python scripts/train.py model=lin data=table data.path=mine.csv data.domain=traffic
+  # sweeps: every model with every seed, one after the other, or on all cores
+  python scripts/train.py -m model=lin,log,n2 seed=1,2,3
+  python scripts/train.py -m hydra/launcher=cores model=lin,log,n2
+  # mini-batches shared by two processes
+  torchrun --nproc-per-node=2 scripts/train.py model=n4 data=esimas data.recording=1-1_1
+  # go on with a run that was stopped
+  python scripts/train.py resume=RUN/checkpoints/last.pt hydra.run.dir=RUN
+
+Results: result.json, checkpoints/best.pt and last.pt, and curves for TensorBoard. A sweep ends
+with sweep.csv. Ctrl-C saves, and says how to go on.
 """
 
 from functools import partial

@@ -59,7 +59,7 @@ def diagnose_case(case: dict[str, Any], peers: bool = False) -> dict[str, Any]:
         }
         table, start, failure = Path(given) / TABLE, time.monotonic(), ""
         try:
-            options = DiscoverOptions(workers=1, page=False, animation=False)
+            options = DiscoverOptions(page=False, animation=False)
             report = discover.diagnose_table(table, what.domain, **told, options=options)
         except NNodeError as error:
             report, failure = {"verdict": ERROR, "effects": []}, f"{type(error).__name__}: {error}"

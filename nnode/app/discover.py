@@ -22,7 +22,7 @@ from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults, TableOptions
-from nnode.discover.diagnose import diagnose
+from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions, check_options
@@ -43,6 +43,7 @@ from nnode.errors import ConfigError
 from nnode.files import write_text
 from nnode.models import System, build_model
 from nnode.models.effects.own import load_own
+from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
 
@@ -84,8 +85,10 @@ def discover(config: DictConfig, folder: Path) -> None:
             options = cast(DiscoverOptions, OmegaConf.to_object(config.discover))
             data = cast(DataOptions, OmegaConf.to_object(config.data))
             job = _job(plain["model"], data, plain["data"], plain["groups"], options, folder)
-            found = _diagnose(job)
-            drawn = _drawn(job, found, folder) if options.page else None
+            with Stages("diagnosis", STAGES) as stages:
+                found = _diagnose(job, stages)
+                stages.begin("drawing")
+                drawn = _drawn(job, found, folder) if options.page else None
         except KeyboardInterrupt:
             number = guard.requested or signal.SIGINT
             raise Interrupted(
@@ -178,11 +181,11 @@ def _job(
     return Job(model, plain_data, groups, system, inputs, options, seconds)
 
 
-def _diagnose(job: Job) -> Found:
+def _diagnose(job: Job, stages: Stages | None = None) -> Found:
     """Run the diagnosis, and add what only its caller knows."""
     set_threads(None, job.system.domain)
     inputs = job.inputs
-    found = diagnose(job.system, inputs.sequences, job.options, faults=inputs.faults)
+    found = diagnose(job.system, inputs.sequences, job.options, faults=inputs.faults, stages=stages)
     diagnosis = found.diagnosis
     # the reader of the data knows the agents by name
     known = {(fault.kind, fault.sequence, fault.time) for fault in inputs.data_faults}

@@ -43,6 +43,17 @@ class Calibration:
     history: pd.DataFrame
     summary: dict[str, Any]
 
+    def __repr__(self) -> str:
+        rows = [
+            f"  {name} = {row.value:.5g} {row.unit}" for name, row in self.parameters.iterrows()
+        ]
+        train, heldout = self.summary["cost_train"], self.summary.get("cost_heldout")
+        cost = f"cost of a training sequence {train:.4g} m² s"
+        if heldout is not None:
+            cost += f", of a held-out one {heldout:.4g} m² s"
+        head = f"{self.summary['model']}, calibrated: {cost}"
+        return "\n".join([head, *rows, f"  folder {self.folder}", "  .plot() .model .history"])
+
     def plot(self) -> Figure:
         """The calibrated speed curve, or the force between two people."""
         return force_figure(self.model)

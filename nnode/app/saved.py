@@ -48,7 +48,7 @@ def path_given(overrides: list[str], option: str) -> str | None:
     for override in reversed(overrides):
         key, _, value = override.partition("=")
         if key == option and value not in ("", "null"):
-            return value.strip("[]").split(",")[0].strip().strip("'\"")
+            return value.strip("[]").split(",")[0].strip().strip("'\"") or None
     return None
 
 

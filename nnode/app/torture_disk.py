@@ -23,6 +23,7 @@ from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_kills import read_whole
 from nnode.app.torture_report import Row
 from nnode.files import PARTIAL
+from nnode.progress import Stages
 
 #: Bytes left on the disk in memory.
 ROOM = (0, 36864, 49152, 65536, 131072)
@@ -46,9 +47,15 @@ def disk(
         mount: whether a disk in memory is tried as well.
     """
     scratch = fresh(folder, "disk")
+    chosen = [
+        job
+        for job in jobs(scratch / "raw")
+        if (job.name in names if names is not None else job.name != "benchmark_discovery")
+    ]
     rows = []
-    for job in jobs(scratch / "raw"):
-        if job.name in names if names is not None else job.name != "benchmark_discovery":
+    with Stages("full disks", {job.name: 1.0 for job in chosen}, forks=True) as stages:
+        for job in chosen:
+            stages.begin(job.name)
             rows += _of_job(root, scratch / job.name, job, mount)
     if not any(row.losses for row in rows):
         shutil.rmtree(scratch)

@@ -10,6 +10,7 @@ from nnode.app.torture_child import Child, script
 from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_report import Row
 from nnode.lock import LOCK
+from nnode.progress import Stages
 
 _REFUSED = "another run works in"
 
@@ -24,9 +25,11 @@ def folder(root: Path, place: Path, names: list[str] | None = None, repeats: int
         repeats: so many second runs, and as many after a kill, per job.
     """
     scratch = fresh(place, "folder")
+    chosen = [job for job in jobs(scratch / "raw") if names is None or job.name in names]
     rows = []
-    for job in jobs(scratch / "raw"):
-        if names is None or job.name in names:
+    with Stages("shared folders", {job.name: 1.0 for job in chosen}, forks=True) as stages:
+        for job in chosen:
+            stages.begin(job.name)
             rows.append(_of_job(root, scratch / job.name, job, repeats))
     if not any(row.losses for row in rows):
         shutil.rmtree(scratch)

@@ -16,6 +16,7 @@ import sys
 import time
 import traceback
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -26,7 +27,8 @@ from typing import Any
 from nnode.app.torture_child import Child
 from nnode.app.torture_report import Row
 from nnode.app.torture_targets import Target, quiet, targets
-from nnode.errors import NNodeError
+from nnode.errors import ConfigError, NNodeError
+from nnode.progress import Stages
 
 #: Bytes of address space that a child may take beyond what it has when it starts.
 ROOM = 2 << 30
@@ -105,14 +107,24 @@ def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -
     scratch, outside = folder / "fuzz", folder / "outside"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
-    chosen = [t for t in targets(scratch, outside) if names is None or t.name in names]
+    known = targets(scratch, outside)
+    strange = sorted(set(names or []) - {t.name for t in known})
+    if strange:
+        raise ConfigError(
+            f"targets: {strange[0]} is unknown, expected some of {', '.join(t.name for t in known)}"
+        )
+    chosen = [t for t in known if names is None or t.name in names]
     whole = sum(target.share for target in chosen)
     found = []
-    for target in chosen:
-        found.append(_all_of(target, round(inputs * target.share / whole), seed, scratch))
-        if outside.exists():
-            found[-1].losses.append(f"{outside} was made")
-            shutil.rmtree(outside) if outside.is_dir() else outside.unlink()
+    shares = {target.name: float(target.share) for target in chosen}
+    with Stages("malformed files", shares, forks=True) as stages:
+        for target in chosen:
+            stages.begin(target.name)
+            number = round(inputs * target.share / whole)
+            found.append(_all_of(target, number, seed, scratch, stages.within))
+            if outside.exists():
+                found[-1].losses.append(f"{outside} was made")
+                shutil.rmtree(outside) if outside.is_dir() else outside.unlink()
     shutil.rmtree(scratch)
     return found
 
@@ -123,7 +135,9 @@ def make(target: Target, seed: int, number: int) -> bytes:
     return target.damage(rng.choice(target.seeds), rng)
 
 
-def _all_of(target: Target, inputs: int, seed: int, scratch: Path) -> Fuzzed:
+def _all_of(
+    target: Target, inputs: int, seed: int, scratch: Path, within: Callable[[float], None]
+) -> Fuzzed:
     """All inputs of a target; a child that dies is a loss, and another one goes on behind it."""
     found, start, next_one = Fuzzed(target.name), time.monotonic(), 0
     notes = scratch / "notes.json"
@@ -135,6 +149,7 @@ def _all_of(target: Target, inputs: int, seed: int, scratch: Path) -> Fuzzed:
             at = _read_number(scratch)
             if at != before:
                 before, last = at, time.monotonic()
+                within(at / inputs)
             elif time.monotonic() - last > 6 * SLOW:
                 child.kill()
         if notes.is_file():

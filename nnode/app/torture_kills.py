@@ -28,6 +28,7 @@ from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.store import MANIFEST, Store
 from nnode.errors import ConfigError, StudyError
 from nnode.files import PARTIAL
+from nnode.progress import Stages
 
 #: So many kills in a row, at most, before a run may end.
 _ROW = 6
@@ -59,10 +60,12 @@ def kills(
     whole = sum(job.share for job in chosen)
     shares = [max(1, number * job.share // whole) for job in chosen]
     shares[0] += max(0, number - sum(shares))
-    rows = [
-        _Killed(root, scratch / job.name, job, random.Random(f"{job.name}-{seed}")).all(share)
-        for job, share in zip(chosen, shares, strict=True)
-    ]
+    rows = []
+    with Stages("kills", {job.name: float(job.share) for job in chosen}, forks=True) as stages:
+        for job, share in zip(chosen, shares, strict=True):
+            stages.begin(job.name)
+            rng = random.Random(f"{job.name}-{seed}")
+            rows.append(_Killed(root, scratch / job.name, job, rng).all(share, stages.within))
     if not any(row.losses for row in rows):
         shutil.rmtree(scratch)
     return rows
@@ -78,8 +81,12 @@ class _Killed:
         self.straight: Any = None
         self.seconds, self.events, self.ended, self.resumed = 0.0, 0, 0, 0
 
-    def all(self, number: int) -> Row:
-        """Kill until ``number`` runs were killed, and compare each end with the straight run's."""
+    def all(self, number: int, within: Callable[[float], None]) -> Row:
+        """Kill until ``number`` runs were killed, and compare each end with the straight run's.
+
+        Args:
+            within: is told which part is done.
+        """
         start = time.monotonic()
         self._straight()
         run = 0
@@ -89,6 +96,7 @@ class _Killed:
             again = True
             while again and self.row.tried < number:
                 self._until_the_end(folder, number)
+                within(self.row.tried / number)
                 # a run that is asked for again, over finished results, must not lose them
                 again = self.rng.random() < 0.3
             if self.row.losses:

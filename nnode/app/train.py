@@ -132,13 +132,14 @@ def train(config: DictConfig, folder: Path) -> None:
     device = world.use(options.device, "trainer.device")
     with world.together():
         model, store = _model(config), None
+        solver = build_solver(OmegaConf.to_object(config.solver), device)  # type: ignore[arg-type]
         if world.first:
             data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
             store = open_data(data, folder / "data")
     place = world.from_first(Path() if store is None else store.folder)
     with world.together():
         store = Store(place) if store is None else store
-        trainer = _trainer(config, folder, model.to(device), store, checkpoint, world)
+        trainer = _trainer(config, folder, model.to(device), solver, store, checkpoint, world)
     start = time.monotonic()
     try:
         trainer.fit()
@@ -182,6 +183,7 @@ def _trainer(
     config: DictConfig,
     folder: Path,
     model: System,
+    solver: Solver,
     store: Store,
     checkpoint: Checkpoint | None,
     world: World,
@@ -206,9 +208,7 @@ def _trainer(
         if parts.heldout
         else None
     )
-    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
-    solver = build_solver(solver_options, next(model.parameters()).device)
-    n = substeps(store[0].dt, solver_options.dt, model.domain)
+    n = substeps(store[0].dt, config.solver.dt, model.domain)
     log.info(
         "%s: %d sequences train, %d held out, %d dropped between; %d steps per sample",
         data.name, len(parts.train), len(parts.heldout), len(parts.dropped), n,

@@ -96,9 +96,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     """
     file = Path(path)
     if not file.is_file():
-        near = sorted(file.parent.glob("*.pt")) if file.parent.is_dir() else []
-        hint = f"; that folder holds {', '.join(p.name for p in near)}" if near else ""
-        raise CheckpointError(f"no checkpoint {file}{hint}")
+        raise CheckpointError(f"no checkpoint {file}; {_where(file)}")
     content = _content(file)
     names = {f.name for f in fields(Checkpoint)}
     if not isinstance(content, dict) or not {"format", "model", "config"} <= set(content):
@@ -120,6 +118,17 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
             "another checkpoint"
         )
     return Checkpoint(**content)
+
+
+def _where(file: Path) -> str:
+    """Where there are checkpoints near a path that is none."""
+    if file.is_dir():
+        near = sorted([*file.glob("*.pt"), *file.glob("checkpoints/*.pt")])
+        return f"it is a folder, {f'name {near[0]}' if near else 'expected a file *.pt'}"
+    near = sorted(file.parent.glob("*.pt")) if file.parent.is_dir() else []
+    if near:
+        return f"that folder holds {', '.join(p.name for p in near)}"
+    return "a training prints where it leaves them: RUN/checkpoints/best.pt"
 
 
 #: What the fields are.
@@ -173,6 +182,8 @@ def _content(file: Path) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what a damaged file makes torch say
             return torch.load(file, map_location="cpu", weights_only=True)
+    except PermissionError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror}") from error
     except Exception as error:  # a damaged file leads to almost any error
         raise CheckpointError(
             f"{file} cannot be opened as a checkpoint: it is damaged or of another kind "

@@ -20,7 +20,7 @@ from nnode.models.system import System
 class OptimizerOptions:
     """What all optimisers share."""
 
-    name: str = MISSING
+    name: str = MISSING  # of the optimiser
 
 
 @dataclass
@@ -28,11 +28,11 @@ class AdadeltaOptions(OptimizerOptions):
     """The paper's: ADADELTA with decaying Gaussian noise."""
 
     name: str = "adadelta"
-    lr: float = 1.0
-    rho: float = 0.95
-    eps: float = 1e-6
+    lr: float = 1.0  # factor on the steps
+    rho: float = 0.95  # memory of squared gradients and steps, below 1
+    eps: float = 1e-6  # added to both under the root
     eta1: float = 1.0  # variance of the noise: eta1 / (1 + k)^eta2
-    eta2: float = 0.55
+    eta2: float = 0.55  # how fast the noise decays with the step k
 
 
 @dataclass
@@ -40,10 +40,10 @@ class AdamOptions(OptimizerOptions):
     """Adam."""
 
     name: str = "adam"
-    lr: float = 0.05
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-8
+    lr: float = 0.05  # step
+    beta1: float = 0.9  # memory of gradients
+    beta2: float = 0.999  # memory of squared gradients
+    eps: float = 1e-8  # added to their root
 
 
 @dataclass
@@ -51,9 +51,9 @@ class LbfgsOptions(OptimizerOptions):
     """L-BFGS with a strong Wolfe line search; wants all sequences in one mini-batch."""
 
     name: str = "lbfgs"
-    lr: float = 1.0
-    max_iter: int = 20  # per step
-    history: int = 20
+    lr: float = 1.0  # first length tried by the line search
+    max_iter: int = 20  # iterations per step, which is an epoch
+    history: int = 20  # steps that the curvature is taken from
 
 
 @dataclass
@@ -61,12 +61,12 @@ class ConsensusOptions(OptimizerOptions):
     """Consensus-based optimisation; wants all sequences in one mini-batch."""
 
     name: str = "cbo"
-    particles: int = 30
-    spread: float = 0.5
-    alpha: float = 30.0
-    drift: float = 1.0
-    sigma: float = 2.0
-    dt: float = 0.1
+    particles: int = 30  # parameter sets at a time
+    spread: float = 0.5  # standard deviation of their start
+    alpha: float = 30.0  # weight of good ones in the consensus
+    drift: float = 1.0  # towards the consensus, per unit of time
+    sigma: float = 2.0  # noise, by the distance from the consensus
+    dt: float = 0.1  # of a step, no unit
 
 
 def _trained(model: System) -> list[torch.nn.Parameter]:

@@ -43,8 +43,8 @@ class Monitor(str, Enum):
 class SolverOptions:
     """What all solvers share."""
 
-    name: str = MISSING
-    dt: float | None = None  # s; null takes the domain's
+    name: str = MISSING  # of the solver
+    dt: float | None = None  # s, step; null: 0.002 in traffic, 0.0625 in crowds
 
 
 @dataclass
@@ -52,10 +52,10 @@ class TorchdiffeqOptions(SolverOptions):
     """See :class:`nnode.solvers.TorchdiffeqSolver`."""
 
     name: str = "torchdiffeq"
-    method: str = "euler"
+    method: str = "euler"  # of torchdiffeq: euler, midpoint, rk4, dopri5, ...
     gradient: Gradient = Gradient.adjoint
-    rtol: float = 1e-6
-    atol: float = 1e-8
+    rtol: float = 1e-6  # relative tolerance of methods that choose their steps
+    atol: float = 1e-8  # absolute tolerance of those, m
 
 
 @dataclass
@@ -63,8 +63,8 @@ class FusedOptions(SolverOptions):
     """See :class:`nnode.solvers.FusedSolver`."""
 
     name: str = "fused"
-    threads: int = 1
-    cutoff: float | None = None  # m, crowds: who is farther away is not felt; null: see below
+    threads: int = 1  # of the compiled kernels
+    cutoff: float | None = None  # m, crowds: who is farther away is not felt; null: by cutoff_error
     cutoff_error: float = 1e-10  # without cutoff: largest social force left out, in units of A
 
 
@@ -72,9 +72,10 @@ class FusedOptions(SolverOptions):
 class TrainerOptions:
     """How long to train, what to watch, what to keep."""
 
-    max_epochs: int = 200
-    evaluate_every: int = 1  # epochs
-    monitor: Monitor = Monitor.train  # heldout makes the held-out cost a training quantity
+    max_epochs: int = 200  # visits to all training sequences
+    evaluate_every: int = 1  # epochs between costs, checkpoints and points of the curves
+    # whose cost chooses the best checkpoint; heldout makes it a training quantity
+    monitor: Monitor = Monitor.train
     patience: int | None = None  # evaluations without progress before stopping; null never
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral

@@ -1,56 +1,20 @@
-"""Progress with rate and time left: a bar on a terminal, a line now and then elsewhere."""
+"""Steps of a training, with rate and time left."""
 
 from __future__ import annotations
 
 import logging
-import sys
 import time
-from types import TracebackType
-from typing import Self
 
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
     TextColumn,
     TimeRemainingColumn,
 )
 
+from nnode.progress import OnTerminal
+
 log = logging.getLogger(__name__)
-
-#: Seconds between lines where no terminal shows the bar.
-LINE_EVERY = 10.0
-
-
-class OnTerminal:
-    """Shows a bar where standard error is a terminal, for as long as the context lasts."""
-
-    def __init__(self, *columns: ProgressColumn) -> None:
-        self._bar = Progress(*columns) if sys.stderr.isatty() else None
-        self._start = self._last_line = time.monotonic()
-
-    def __enter__(self) -> Self:
-        if self._bar:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._bar:
-            self._bar.stop()
-
-    def line_is_due(self) -> bool:
-        """Whether the last line is so long ago that another one may be written; it then counts."""
-        now = time.monotonic()
-        due = now - self._last_line >= LINE_EVERY
-        if due:
-            self._last_line = now
-        return due
 
 
 class Reporter(OnTerminal):

@@ -40,7 +40,8 @@ class Table:
             raise DataError(f"{path} is empty; expected a line of column names and rows") from error
         except Exception as error:  # a damaged file leads to almost any error
             kind = "Parquet" if self.parquet else "comma-separated"
-            raise DataError(f"{path} cannot be read as a {kind} table: {error}") from error
+            said = str(error).strip().removeprefix("Error tokenizing data. C error: ")
+            raise DataError(f"{path} cannot be read as a {kind} table: {said}") from error
         if not isinstance(frame.index, pd.RangeIndex):
             raise DataError(
                 f"{path}: there are more cells in its rows than names in its first line; give "

@@ -43,7 +43,7 @@ class SplitOptions:
 
     heldout: float = 0.2  # share of the sequences, 0 keeps all for training
     mode: SplitMode = SplitMode.auto
-    seed: int = 0
+    seed: int = 0  # of a random split
     gap: float = 5.0  # s; without identifiers, sequences closer in time may share an agent
 
 
@@ -52,17 +52,19 @@ class LoaderOptions:
     """How prepared sequences are streamed as mini-batches."""
 
     batch_size: int = 32  # at most so many sequences per mini-batch; 0 takes all at once
-    workers: int = 0
-    shuffle: bool = True
+    workers: int = 0  # processes that load; 0 loads in the training's own
+    shuffle: bool = True  # a new order in every epoch
 
 
 @dataclass
 class DataOptions:
     """What all data sources share."""
 
-    name: str = MISSING
-    domain: str = MISSING  # traffic | crowd
-    source: str | None = None  # folder with the raw files, or a URL; null downloads
+    name: str = MISSING  # label in results and plots
+    domain: str = MISSING  # traffic (positions x) | crowd (x and y)
+    # folder with the raw files, or a URL; NNODE_DATA in the environment sets that of public data;
+    # null downloads those
+    source: str | None = None
     download: str | None = None  # folder for downloaded files; null: raw/ in the run's folder
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
@@ -90,8 +92,8 @@ class LaneOptions(DataOptions):
     lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
     dt: float = 0.2  # reference time grid, s
     max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
-    min_vehicles: int = 3
-    min_samples: int = 3
+    min_vehicles: int = 3  # fewest vehicles of a platoon
+    min_samples: int = 3  # fewest points of the time grid
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
 
 
@@ -105,6 +107,7 @@ class VehicleTableOptions(LaneOptions):
     """
 
     name: str = "vehicles"
+    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind where they exist
     columns: dict[str, str | None] = field(default_factory=dict)
     position_unit: str = "m"  # m | ft | cm | km
     length_unit: str | None = None  # null: the unit of the positions
@@ -134,14 +137,14 @@ class JuelichOptions(DataOptions):
 
     name: str = "juelich"
     domain: str = "crowd"
-    t_seq: float = 1.0  # s
+    t_seq: float = 1.0  # s, length of a sequence
     frame_rate: float | None = None  # 1/s; null reads it from the file's header
     unit: str | None = None  # cm | m; null reads it from the file's header
     walking_axis: str = "x"  # x | y; walls run along it
     walls: dict[str, list[float]] = field(default_factory=dict)  # recording: [low, high], m
     view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
     velocity: Velocity = Velocity.forward
-    min_agents: int = 1
+    min_agents: int = 1  # fewest people in a sequence
 
 
 @dataclass

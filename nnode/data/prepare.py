@@ -40,6 +40,7 @@ from nnode.data.sumo import read_sumo, sumo_files
 from nnode.data.table import TABLE, WALLS, read_table, table_files
 from nnode.data.vehicles import read_vehicles, vehicle_files
 from nnode.errors import ConfigError, DataError
+from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
 
@@ -114,11 +115,29 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
     folder = Path(folder)
     layout = FORMATS[type(options)]
     downloads = options.download or str(folder / "raw")
-    files = layout.files(replace(options, download=downloads))
-    read = layout.read(files, options)
+    with Stages("preparing", {"reading": 2.0, "looking for faults": 1.0}) as stages:
+        stages.begin("reading")
+        files = layout.files(replace(options, download=downloads))
+        read = layout.read(files, options)
+        stages.begin("looking for faults")
+        return _prepared(options, folder, files, read, stages, draw)
+
+
+def _prepared(
+    options: DataOptions,
+    folder: Path,
+    files: _Files,
+    read: list[Sequence],
+    stages: Stages,
+    draw: Draw | None,
+) -> Store:
+    """Judge the sequences and write the store."""
     domain = _domain(options, read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
-    faults = {s.name: find_faults(s, domain) for s in sequences}
+    faults = {}
+    for number, s in enumerate(sequences):
+        faults[s.name] = find_faults(s, domain)
+        stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
     manifest = {
         "package": {"name": "nnode", "version": __version__},

@@ -126,9 +126,10 @@ def table_path(options: DataOptions, option: str, path: str) -> Path:
             )
         place = Path(options.source).expanduser() / place
     if not place.is_file():
+        found = "is a folder, expected a file" if place.is_dir() else "is not there"
         raise DataError(
-            f"data.{option}: there is no file {place}; set data.{option} to a table of your own, "
-            "tables are not downloaded"
+            f"data.{option}: {place} {found}; set data.{option} to a table of your own, tables "
+            "are not downloaded"
         )
     return place
 

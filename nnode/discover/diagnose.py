@@ -28,12 +28,23 @@ from nnode.errors import DataError
 from nnode.models.effects import CATALOGUE, IndividualEffect
 from nnode.models.extend import effects_of
 from nnode.models.system import System
+from nnode.progress import Stages
 
 #: Structure that is left counts from this share of the squared errors of positions on, at this
 #: error probability over all variables.
 LEFT, SURE = 0.02, 0.01
 #: Named effects do not explain the data where what is left is this share of what they removed.
 TOO_MUCH = 0.5
+
+
+#: Stages of a diagnosis, with the seconds that they take on the motorway recordings.
+STAGES = {
+    "calibrating": 2.0,
+    "locating": 1.5,
+    "naming": 11.5,
+    "comparing on sealed sequences": 1.0,
+    "drawing": 5.0,
+}
 
 
 @dataclass
@@ -62,6 +73,7 @@ def diagnose(
     options: DiscoverOptions,
     *,
     faults: dict[str, list[Fault]] | None = None,
+    stages: Stages | None = None,
 ) -> Found:
     """Find out what a model lacks on some sequences.
 
@@ -70,6 +82,7 @@ def diagnose(
         sequences: without faults, at least three of them.
         options: see :class:`~nnode.discover.options.DiscoverOptions`.
         faults: that were found in other sequences, by name.
+        stages: shows how far the work is.
 
     Raises:
         ConfigError: options that do not fit.
@@ -79,26 +92,31 @@ def diagnose(
     domain = cast(Domain, system.domain)
     names = check_options(options, domain)
     clock = _Clock(time.monotonic(), {})
+    stages = stages or Stages("diagnosis", STAGES)
+    stages.begin("calibrating")
     opened, sealed = divide(sequences, options)
     engine = engine_of(domain, [sequences[i] for i in opened])
     start = copy.deepcopy(system).double()
     base = settled(engine, engine.near(start) if isinstance(engine, TrafficEngine) else start)
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
+    stages.begin("locating")
     variables = engine.variables()
     first = weighed(engine, base, curves(engine, base, variables), SURE)
     located = places(first, _excess(engine, base))
     clock.lap("locate")
+    stages.begin("naming")
     effects = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
     found = search(
         engine, base, effects, alpha=options.alpha, most=options.max_effects, seed=options.seed,
-        variables=variables,
+        variables=variables, within=stages.within,
     )  # fmt: skip
     last = first
     if found.fit is not base:
         last = weighed(engine, found.fit, curves(engine, found.fit, variables), SURE)
     left = [one for one in last if one.removed > LEFT]
     clock.lap("name")
+    stages.begin("comparing on sealed sequences")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
     verdict = _verdict(found, left, removed, bool(faults))
     gap, each = _gap(domain, base_system, found, [sequences[i] for i in sealed])

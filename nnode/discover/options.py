@@ -24,7 +24,6 @@ class DiscoverOptions:
     exclude: list[str] = field(default_factory=list)  # names not to look for
     max_effects: int = 4  # at most so many are added
     step: float | None = None  # s, of the simulation; null takes the domain's
-    workers: int | None = None  # processes; null: one per core
     page: bool = True  # report.html with figures, and figures in TensorBoard
     animation: bool = True  # one sealed sequence as a moving picture in the page
 
@@ -46,8 +45,6 @@ def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
         raise ConfigError(f"discover.max_effects={options.max_effects} must be at least 0")
     if options.step is not None and not (math.isfinite(options.step) and options.step > 0):
         raise ConfigError(f"discover.step={options.step} must be a positive number of s, or null")
-    if options.workers is not None and options.workers < 1:
-        raise ConfigError(f"discover.workers={options.workers} must be at least 1, or null")
     known = [effect.name for effect in CATALOGUE.of(domain)]
     _known("discover.exclude", options.exclude, known, domain)
     chosen = known

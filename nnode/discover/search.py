@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -152,6 +153,7 @@ def search(
     most: int = 4,
     seed: int = 0,
     variables: list[Variable] | None = None,
+    within: Callable[[float], None] = lambda part: None,
 ) -> Search:
     """Forwards until no effect passes, then backwards.
 
@@ -164,12 +166,16 @@ def search(
         seed: of the sign flips.
         variables: no effect is accepted where a curve of one of these predicts better: it is a
             sign of something that the catalogue lacks.
+        within: is told, now and then, about which part of the search is done.
     """
     found = Search(fit)
     while True:
         own = {effect.name for effect in effects_of(found.fit.system)}
         left = [effect for effect in effects if effect.name not in own]
+        begun = len(found.steps)
+        within(begun / (begun + 2))  # of most searches, the last but one round finds nothing more
         look = _look(engine, found.fit, left)
+        within((begun + 0.5) / (begun + 2))
         found.screen = Screen(found.fit, engine.block, seed + len(found.steps))
         found.scores = found.screen.scores(look.traces, look.individuals)
         if len(found.steps) >= most:

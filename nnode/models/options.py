@@ -20,8 +20,8 @@ class Leader(str, Enum):
 class ModelOptions:
     """What all models share."""
 
-    name: str = MISSING  # a label: lin, n4, sf, ...
-    term: str = MISSING  # the term that is calibrated
+    name: str = MISSING  # label in results and plots: lin, n4, sf, ...
+    term: str = MISSING  # the law, network or force that is calibrated
     # named effects beside it: [{name: relative_speed, kappa: 0.3}, ...]
     effects: list[Any] = field(default_factory=list)
 
@@ -31,9 +31,9 @@ class LawOptions(ModelOptions):
     """Lin and Log: a law of the gap with physical parameters."""
 
     leader: Leader = Leader.constant
-    v0: float = 30.0  # m/s, start
-    L: float = 5.0  # m, start
-    L_min: float = 2.0  # m
+    v0: float = 30.0  # m/s, speed on an empty road; where the search starts
+    L: float = 5.0  # m, gap at which all stop; where the search starts
+    L_min: float = 2.0  # m, L stays above it
 
 
 @dataclass
@@ -41,8 +41,8 @@ class NetworkSpeedOptions(ModelOptions):
     """N2, N4, N10: speed as a network of the gap."""
 
     leader: Leader = Leader.constant
-    v0: float = 30.0  # m/s, start
-    hidden: int = 4
+    v0: float = 30.0  # m/s, speed of the first vehicle; where the search starts
+    hidden: int = 4  # neurons in the hidden layer
     box: float | None = None  # weights stay in [-box, box]; null leaves them free
 
 
@@ -50,21 +50,22 @@ class NetworkSpeedOptions(ModelOptions):
 class CrowdOptions(ModelOptions):
     """What crowd models share."""
 
-    tau: float = 0.5  # s
-    mass: float = 1.0  # kg
-    walls: bool = True
-    wall_spacing: float = 0.25  # m between wall points
+    tau: float = 0.5  # s, relaxation towards the desired velocity
+    mass: float = 1.0  # kg, of a person
+    walls: bool = True  # whether walls push, where the data have some
+    wall_spacing: float = 0.25  # m between the points that stand for a wall
 
 
 @dataclass
 class SocialForceOptions(CrowdOptions):
     """SF. A, k, kappa start uniform on [0, 50] where null."""
 
-    A: float | None = None  # N
-    k: float | None = None  # kg/s²
-    kappa: float | None = None  # kg/(m s)
-    r: float = 0.25  # m
-    B: float = 0.05  # m
+    A: float | None = None  # N, repulsion at touch; null starts uniform on [0, 50]
+    k: float | None = None  # kg/s², body force of overlap; null starts uniform on [0, 50]
+    kappa: float | None = None  # kg/(m s), sliding friction; null starts uniform on [0, 50]
+    r: float = 0.25  # m, radius of a person
+    B: float = 0.05  # m, range of the repulsion
+    # walls slow down who slides along them (Helbing et al., 2000); false: the paper's sign
     opposing_wall_friction: bool = False
 
 
@@ -72,5 +73,5 @@ class SocialForceOptions(CrowdOptions):
 class NetworkForceOptions(CrowdOptions):
     """NN: pair and wall force as networks."""
 
-    hidden: int = 4
+    hidden: int = 4  # neurons in the hidden layer of each force
     box: float | None = None  # weights stay in [-box, box]; null leaves them free

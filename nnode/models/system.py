@@ -98,6 +98,11 @@ class System(nn.Module):
         """The first term of a kind, or None."""
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
+    def extra_repr(self) -> str:
+        """The parameters that have a physical meaning, for those who print a model."""
+        values = self.physical().items()
+        return ", ".join(f"{name}={float(value):.5g} {unit}" for name, (value, unit) in values)
+
     def physical(self) -> dict[str, tuple[Tensor, str]]:
         """Name to (value, unit) of the parameters that have a physical meaning."""
         return physical_parameters(self)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,18 @@ SMALL_FONT = 8.0
 DPI = 150
 
 
+class Picture(Figure):
+    """A figure that a notebook shows without Matplotlib's global state."""
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        self.savefig(stream, format="png", dpi=DPI)
+        return stream.getvalue()
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of ``width`` by ``height`` inches that no global state keeps open."""
-    return Figure(figsize=(width, height), layout="constrained")
+    return Picture(figsize=(width, height), layout="constrained")
 
 
 def curve_style(index: int) -> dict[str, Any]:

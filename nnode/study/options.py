@@ -11,7 +11,7 @@ from omegaconf import MISSING
 class StudyOptions:
     """What all studies share."""
 
-    name: str = MISSING
+    name: str = MISSING  # traffic | crowd
     source: str | None = None  # folder with the raw files; null downloads
     download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
     quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
@@ -35,7 +35,7 @@ class TrafficStudyOptions(StudyOptions):
     descent_lr: float = 1.0  # factor on them
     batch_size: int = 32  # sequences in its mini-batches
     particles: int = 40  # of consensus-based optimisation
-    consensus_steps: int = 60
+    consensus_steps: int = 60  # of that
 
 
 @dataclass

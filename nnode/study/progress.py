@@ -7,7 +7,7 @@ import time
 
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
-from nnode.calibrate.progress import OnTerminal
+from nnode.progress import OnTerminal
 
 log = logging.getLogger(__name__)
 

@@ -208,7 +208,7 @@ def test_a_signal_leaves_no_half_report(run: Path, tmp_path: Path) -> None:
         (["discover.efects=[inertia]"], r"did you mean discover\.effects"),
         (["discover.page=perhaps"], "discover.page=perhaps is refused"),
         (["model=line"], r"model=line is unknown.*did you mean lin"),
-        (["discover.max_effects=many"], "could not be converted to Integer"),
+        (["discover.max_effects=many"], "expected a whole number"),
     ],
 )
 def test_a_wrong_option_is_refused_in_words(given: list[str], message: str) -> None:
@@ -300,7 +300,7 @@ def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, m
     frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
     frame.to_csv(table, index=False)
 
-    def nothing(*arguments: Any, faults: dict[str, Any]) -> Any:
+    def nothing(*arguments: Any, faults: dict[str, Any], stages: Any) -> Any:
         found = stand_in.diagnose(*arguments, faults=faults)
         known = faults["lane/1"][0]
         # what the diagnosis reports itself: one fault that the reader knows, one of its own

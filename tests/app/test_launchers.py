@@ -55,6 +55,12 @@ def alone(script: Script, prepared: str, tmp_path_factory: pytest.TempPathFactor
     return folder
 
 
+def problem(*changes: str) -> list[str]:
+    """The problem's options, some of them changed or added."""
+    names = {change.partition("=")[0] for change in changes}
+    return [*(one for one in PROBLEM if one.partition("=")[0] not in names), *changes]
+
+
 def start(*overrides: str, temporary: Path) -> subprocess.Popen[str]:
     """Two processes; their temporary files go to a folder of their own."""
     temporary.mkdir(exist_ok=True)
@@ -91,7 +97,7 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
     run = tmp_path / "run"
     last = run / "checkpoints" / "last.pt"
     # long enough that the signal meets it
-    options = (*PROBLEM, prepared, "trainer.max_epochs=100000", "trainer.save_every=0")
+    options = problem("trainer.max_epochs=100000", "trainer.save_every=0", prepared)
     process = start(*options, f"hydra.run.dir={run}", temporary=tmp_path / "tmp")
     while not last.exists() and process.poll() is None:
         time.sleep(0.05)
@@ -116,7 +122,7 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
 )
 def test_an_error_is_said_once(prepared: str, tmp_path: Path, override: str, message: str) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    process = start(*PROBLEM, prepared, override, run, temporary=tmp_path / "tmp")
+    process = start(*problem(override), prepared, run, temporary=tmp_path / "tmp")
     _, errors = process.communicate(timeout=200)
     assert process.returncode != 0
     assert errors.count(message) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,9 @@ def test_three_lines_find_the_law(table: pd.DataFrame, tmp_path: Path) -> None:
     again = nnode.load(run.folder / "checkpoints" / "best.pt")
     for name, (value, _) in again.physical().items():
         assert float(value) == run.parameters.value[name]
+    assert re.search(r"lin, calibrated: cost .*held-out", repr(run))
+    assert re.search(r"L = \d\.\d+ m\n", repr(run))
+    assert re.search(r"v0=\d+(\.\d+)? m/s, L=", repr(run.model))
     curve = run.plot().axes[0].lines[0].get_xydata()
     assert np.isfinite(np.asarray(curve)).all()
 

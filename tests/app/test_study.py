@@ -52,9 +52,9 @@ def start(*overrides: str) -> subprocess.Popen[str]:
         (["study=trafic"], "study=trafic is unknown, expected one of crowd, traffic"),
         (["study.qick=true"], r"did you mean study\.quick"),
         (["study=traffic", "study.horizons=[1]"], r"option study\.horizons is unknown"),
-        (["study=crowd", "study.horizons=[one]"], "could not be converted to Float"),
+        (["study=crowd", "study.horizons=[one]"], "expected a number"),
         (["study.quick=maybe"], "study.quick=maybe is refused"),
-        (["study.restarts=many"], "could not be converted to Integer"),
+        (["study.restarts=many"], "expected a whole number"),
     ],
 )
 def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) -> None:

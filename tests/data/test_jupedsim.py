@@ -197,7 +197,7 @@ def test_what_a_database_tells_itself_is_not_set(tmp_path: Path) -> None:
 
 
 def test_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="there is no file"):
+    with pytest.raises(DataError, match=r"none\.sqlite is not there"):
         walkway_files(WalkwayOptions(path=str(tmp_path / "none.sqlite")))
 
 

@@ -63,6 +63,7 @@ def diagnose(
     options: DiscoverOptions,
     *,
     faults: dict[str, list[Fault]],
+    stages: object = None,
 ) -> Found:
     """Results that a right diagnosis of :mod:`tests.discover.recorded` would come to."""
     if os.environ.get(WAIT):

@@ -32,7 +32,6 @@ def test_all_effects_of_the_domain_are_looked_for_unless_some_are_chosen() -> No
         ({"alpha": 0.0}, r"discover\.alpha=0\.0 must lie between 0 and 1"),
         ({"max_effects": -1}, r"discover\.max_effects=-1 must be at least 0"),
         ({"step": 0.0}, r"discover\.step=0\.0 must be a positive number"),
-        ({"workers": 0}, r"discover\.workers=0 must be at least 1"),
     ],
 )
 def test_what_no_diagnosis_can_work_with_is_refused(change: dict[str, Any], message: str) -> None:

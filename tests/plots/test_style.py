@@ -30,6 +30,12 @@ def test_save_writes_png_of_150_dpi(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
 
 
+def test_notebooks_show_a_figure() -> None:
+    head = _figure()._repr_png_()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    assert struct.unpack(">II", head[16:24]) == (3 * 150, 2 * 150)
+
+
 def test_failed_save_keeps_the_old_file_and_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
     path = save(_figure(), tmp_path / "a.png")
     before = path.read_bytes()

@@ -1,0 +1,133 @@
+"""How far a work is, with the time left: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from types import TracebackType
+from typing import Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+
+log = logging.getLogger(__name__)
+
+#: Seconds between lines where no terminal shows the bar.
+LINE_EVERY = 10.0
+
+
+class OnTerminal:
+    """Shows a bar where standard error is a terminal, for as long as the context lasts.
+
+    Args:
+        columns: of the bar.
+        forks: whether the work forks processes; the bar then moves only when it is told to,
+            without a thread of its own.
+    """
+
+    def __init__(self, *columns: ProgressColumn, forks: bool = False) -> None:
+        self._bar: Progress | None = None
+        self._forks = forks
+        #: handlers of the log that write to the terminal, above the bar for as long as it is there
+        self._moved: list[tuple[logging.StreamHandler[Any], Any]] = []
+        if sys.stderr.isatty():
+            # what is printed belongs to the results; the bar shall not be among them in a file
+            self._bar = Progress(
+                *columns,
+                console=Console(stderr=True),
+                auto_refresh=not forks,
+                redirect_stdout=not forks,  # what children print is theirs
+                redirect_stderr=not forks,
+            )
+        self._start = self._last_line = time.monotonic()
+
+    def __enter__(self) -> Self:
+        if self._bar:
+            self._bar.start()
+            if not self._forks:
+                self._moved = [
+                    (one, one.setStream(sys.stderr))  # which the bar has made its own
+                    for one in logging.getLogger().handlers
+                    if isinstance(one, logging.StreamHandler)
+                    and one.stream.isatty()
+                    and one.stream is not sys.stderr
+                ]
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for handler, stream in self._moved:
+            handler.setStream(stream)
+        if self._bar:
+            self._bar.stop()
+
+    def line_is_due(self) -> bool:
+        """Whether the last line is so long ago that another one may be written; it then counts."""
+        now = time.monotonic()
+        due = now - self._last_line >= LINE_EVERY
+        if due:
+            self._last_line = now
+        return due
+
+
+class Stages(OnTerminal):
+    """A work of several stages, one after the other; use as a context manager.
+
+    Args:
+        title: of the work.
+        shares: stage to its usual share of the whole time, in any unit.
+        forks: see :class:`OnTerminal`.
+    """
+
+    def __init__(self, title: str, shares: dict[str, float], *, forks: bool = False) -> None:
+        super().__init__(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[text]}"),
+            forks=forks,
+        )
+        whole = sum(shares.values())
+        self.title, self.shares = title, {name: x / whole for name, x in shares.items()}
+        self.done, self._before, self._stage = 0.0, 0.0, ""
+        if self._bar:
+            self._task = self._bar.add_task(title, total=1.0, text="")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._bar and error is None:
+            self._bar.update(self._task, completed=1.0, text="")
+        super().__exit__(kind, error, trace)
+
+    def begin(self, stage: str) -> None:
+        """A stage begins; those before it are done."""
+        names = list(self.shares)
+        self._stage = stage
+        self._before = sum(self.shares[name] for name in names[: names.index(stage)])
+        self.within(0.0)
+
+    def within(self, part: float) -> None:
+        """So much of the stage is done, between 0 and 1; called often."""
+        self.done = self._before + self.shares[self._stage] * min(max(part, 0.0), 1.0)
+        if self._bar:
+            self._bar.update(self._task, completed=self.done, text=self.text())
+            if self._forks:
+                self._bar.refresh()
+        elif self.line_is_due():
+            log.info("%s: %s", self.title, self.text())
+
+    def text(self) -> str:
+        """Stage and time left."""
+        passed = time.monotonic() - self._start
+        if not self.done or passed < 1:
+            return self._stage
+        return f"{self._stage}, about {passed * (1 - self.done) / self.done:.0f} s left"

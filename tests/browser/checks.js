@@ -1,0 +1,97 @@
+// What is looked for in a page, as functions that return a list of faults.
+({
+  visible(e) {
+    return e.checkVisibility({ visibilityProperty: true }) && e.getClientRects().length > 0;
+  },
+
+  name(e) {
+    return `${e.tagName.toLowerCase()} "${(e.innerText || e.alt || e.id).trim().slice(0, 60)}"`;
+  },
+
+  // relative luminance and contrast as in WCAG 2.2
+  channels(colour) {
+    return colour.match(/[\d.]+/g).map(Number);
+  },
+  luminance(rgb) {
+    const [r, g, b] = rgb.map((c) => (c / 255 <= 0.04045 ? c / 3294.6 : ((c / 255 + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  },
+  ground(e) {
+    for (; e; e = e.parentElement) {
+      const [r, g, b, a = 1] = this.channels(getComputedStyle(e).backgroundColor);
+      if (a === 1) return [r, g, b];
+      if (a > 0) throw new Error("a background that is half transparent");
+    }
+    return [255, 255, 255];
+  },
+  contrast(e) {
+    const ink = this.luminance(this.channels(getComputedStyle(e).color).slice(0, 3));
+    const ground = this.luminance(this.ground(e));
+    return (Math.max(ink, ground) + 0.05) / (Math.min(ink, ground) + 0.05);
+  },
+
+  texts() {
+    const found = new Set();
+    const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    while (walker.nextNode()) {
+      const e = walker.currentNode.parentElement;
+      if (walker.currentNode.data.trim() && this.visible(e) && e.tagName !== "STYLE") found.add(e);
+    }
+    return [...found];
+  },
+  pale(least) {
+    return this.texts().filter((e) => this.contrast(e) < least)
+      .map((e) => `${this.name(e)}: contrast ${this.contrast(e).toFixed(2)}`);
+  },
+  small(least) {
+    return this.texts().filter((e) => parseFloat(getComputedStyle(e).fontSize) < least)
+      .map((e) => `${this.name(e)}: ${getComputedStyle(e).fontSize}`);
+  },
+
+  wide(room) {
+    const inBox = (e) => e.closest(".scroll, pre, .skip");
+    return [...document.querySelectorAll("body *")]
+      .filter((e) => this.visible(e) && !inBox(e) && e.getBoundingClientRect().right > room + 1)
+      .map((e) => `${this.name(e)} ends at ${Math.round(e.getBoundingClientRect().right)} of ${room} px`)
+      .concat(document.documentElement.scrollWidth > room ? [`the page is ${document.documentElement.scrollWidth} px wide`] : []);
+  },
+
+  headings() {
+    const levels = [...document.querySelectorAll("h1, h2, h3, h4, h5, h6")].map((e) => Number(e.tagName[1]));
+    const faults = levels.filter((level) => level === 1).length === 1 ? [] : ["not exactly one h1"];
+    levels.forEach((level, i) => {
+      if (i && level > levels[i - 1] + 1) faults.push(`h${level} follows h${levels[i - 1]}`);
+    });
+    return faults;
+  },
+  silent() {
+    const faults = [...document.images].filter((e) => e.alt.trim().length < 15).map((e) => `alt of ${this.name(e)}`);
+    for (const table of document.querySelectorAll("table")) {
+      if (![...table.querySelectorAll("thead th")].length) faults.push("a table without a head");
+      faults.push(...[...table.querySelectorAll("th")].filter((e) => !e.scope).map((e) => `scope of ${this.name(e)}`));
+      if (!table.closest("[aria-labelledby]")) faults.push("a table without a name");
+    }
+    for (const link of document.querySelectorAll("a")) if (!link.innerText.trim()) faults.push("a link without words");
+    for (const part of ["main", "title"]) if (!document.querySelector(part)) faults.push(`no ${part}`);
+    if (!document.documentElement.lang) faults.push("no language");
+    return faults;
+  },
+
+  interactive() {
+    return [...document.querySelectorAll('a[href], button, summary, input, [tabindex="0"]')].filter((e) => this.visible(e));
+  },
+  // what has the focus: its place among the interactive elements, and whether that is seen
+  focus() {
+    const e = document.activeElement;
+    const style = getComputedStyle(e);
+    const ring = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) > 0;
+    const box = e.getBoundingClientRect();
+    const inside = box.bottom > 0 && box.top < innerHeight && box.right > 0 && box.left < innerWidth;
+    return { place: this.interactive().indexOf(e), name: this.name(e), seen: ring && inside };
+  },
+  // plain links may lead elsewhere; nothing else may
+  elsewhere() {
+    const loaded = [...document.querySelectorAll("[src], link[href], object, iframe, script")];
+    return loaded.filter((e) => !(e.src || "").startsWith("data:")).map((e) => e.outerHTML.slice(0, 100));
+  },
+});

@@ -1,0 +1,79 @@
+"""TensorBoard in a real browser, on the curves of a training."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+
+from nnode.calibrate.logbook import Logbook
+from tests.browser.chromium import PROGRAM, Browser
+
+COSTS = [4.0, 2.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """TensorBoard on a run's folder."""
+    folder = tmp_path_factory.mktemp("run")
+    book = Logbook(folder / "tensorboard", {"model": {"name": "lin"}})
+    for step, cost in enumerate(COSTS):
+        book.scalars({"cost/train": cost, "parameters/v0": 25.0 + step}, step)
+    book.close()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tensorboard.main", "--logdir", str(folder), "--host", "127.0.0.1",
+         "--port", "0", "--load_fast", "false"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "no_proxy": "127.0.0.1"},
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        found = next(m[0] for line in process.stdout if (m := re.search(r"http://\S+:\d+/", line)))
+        yield found
+    finally:
+        process.kill()
+        process.wait()
+
+
+def asked(address: str, path: str) -> object:
+    """What TensorBoard's interface answers, as soon as it has read the events."""
+    end = time.monotonic() + 20
+    while True:
+        with urlopen(f"{address}{path}", timeout=10) as answer:
+            found: object = json.load(answer)
+        if found or time.monotonic() > end:
+            return found
+        time.sleep(0.2)
+
+
+def test_curves_are_served(address: str) -> None:
+    tags: Any = asked(address, "data/plugin/scalars/tags")
+    assert {"cost/train", "parameters/v0"} <= set(tags["tensorboard"])
+    rows: Any = asked(address, "data/plugin/scalars/scalars?run=tensorboard&tag=cost/train")
+    assert [row[1:] for row in rows] == [[step, cost] for step, cost in enumerate(COSTS)]
+
+
+#: What TensorBoard itself, or the browser without a graphics card, complains of.
+KNOWN = r"Multiple instances of Three\.js|fallback to software WebGL"
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="needs a Chromium")
+def test_the_page_shows_them_offline_without_errors(address: str, tmp_path: Path) -> None:
+    asked(address, "data/plugin/scalars/tags")
+    with Browser(tmp_path) as browser:
+        browser.open(address)
+        end = time.monotonic() + 20
+        while "cost" not in browser.evaluate("document.body.innerText"):
+            assert time.monotonic() < end, browser.evaluate("document.body.innerText")
+            time.sleep(0.2)
+        assert [one for one in browser.requests if not one.startswith(address)] == []
+        assert [one for one in browser.complaints if not re.search(KNOWN, one)] == []

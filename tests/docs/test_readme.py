@@ -1,0 +1,77 @@
+"""What the README says can be typed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from nnode.app.cli import check_overrides
+from nnode.app.flags import read_command_line
+from nnode.app.help import examples
+from nnode.config import register
+from tests.discover.platoons import platoons
+from tests.docs.test_tutorials import ROOT, blocks
+
+README = ROOT / "README.md"
+PAGES = [
+    README,
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "tutorials").glob("*")),
+]
+
+#: Choices that a page lets its reader make first.
+MADE = {"model=lin_with_speed_zone", "data=i80"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_every_command_has_options_that_exist(page: Path) -> None:
+    register()
+    for language, text in blocks(page):
+        for command in examples(text) if language == "sh" else []:
+            words = shlex.split(command, comments=True)
+            place = next(i for i, word in enumerate(words) if word.startswith("scripts/"))
+            if "…" in words or MADE & set(words):
+                continue
+            line = read_command_line(words[place + 1 :])
+            check_overrides(
+                line.overrides, ROOT / "conf", Path(words[place]).stem, sweep=line.sweeps
+            )
+
+
+def test_every_link_leads_somewhere() -> None:
+    links = re.findall(r"\]\(([^)#]+)", README.read_text())
+    assert len(links) > 10
+    for link in links:
+        assert (ROOT / link).exists(), link
+
+
+def test_your_own_data_in_ten_lines(tmp_path: Path) -> None:
+    (text,) = (t for lang, t in blocks(README) if lang == "python" and "mine.csv" in t)
+    assert len([line for line in text.splitlines() if line.strip()]) <= 10
+    rows = [
+        (number, time, f"{number}/{i}", x)
+        for number, one in enumerate(platoons(number=6, seconds=8.0))
+        for time, places in zip(one.time, one.x[..., 0], strict=True)
+        for i, x in enumerate(places)
+    ]
+    table = pd.DataFrame(rows, columns=["platoon", "t", "car", "pos"])
+    table.to_csv(tmp_path / "mine.csv", index=False)
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": ""},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "lin, calibrated: cost of a training sequence" in done.stdout
+    assert re.search(r"^  v0 = \d+\.\d+ m/s$", done.stdout, re.M)
+    assert (tmp_path / "law.png").stat().st_size > 10_000
+    assert (tmp_path / "runs" / "mine" / "report.html").is_file()

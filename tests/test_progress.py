@@ -1,0 +1,85 @@
+"""Progress: a bar with the time left on a terminal, a quiet line now and then elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pty
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from nnode import progress
+from nnode.app.torture_child import Child
+from nnode.progress import Stages
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_time_left_follows_the_shares_of_the_stages(clock: list[float]) -> None:
+    stages = Stages("work", {"reading": 1.0, "thinking": 3.0})
+    stages.begin("reading")
+    assert stages.text() == "reading"
+    clock[0] = 5.0
+    stages.begin("thinking")
+    assert stages.text() == "thinking, about 15 s left"
+    clock[0] = 10.0
+    stages.within(1 / 3)
+    assert stages.text() == "thinking, about 10 s left"
+    stages.within(7.0)  # a guess that was too low
+    assert stages.text() == "thinking, about 0 s left"
+
+
+def test_elsewhere_a_line_comes_seldom_and_nothing_before_ten_seconds(
+    clock: list[float], caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with caplog.at_level(logging.INFO), Stages("work", {"a": 1.0, "b": 1.0}) as stages:
+        stages.begin("a")
+        for clock[0] in (1.0, 9.0, 10.0, 11.0, 19.0, 21.0):
+            stages.within(clock[0] / 25)
+        stages.begin("b")
+    assert [record.message for record in caplog.records] == [
+        "work: a, about 40 s left",
+        "work: a, about 29 s left",
+    ]
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
+@pytest.mark.parametrize("forks", [False, True])
+def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, forks: bool) -> None:
+    leader, follower = pty.openpty()
+
+    def work() -> None:
+        os.dup2(follower, 2)
+        sys.stdout, sys.stderr = open(1, "w"), open(2, "w")  # noqa: SIM115
+        logging.basicConfig(stream=sys.stderr, format="%(message)s", force=True)
+        with Stages("work", {"a": 1.0, "b": 1.0}, forks=forks) as stages:
+            stages.begin("a")
+            stages.begin("b")
+            logging.warning("by the way")
+            stages.within(0.5)
+        print("result: 7")
+
+    child = Child(work, tmp_path / "out")
+    os.close(follower)
+    shown = b""
+    while child.status(0) is None or b"\x1b[?25h" not in shown:
+        try:
+            shown += os.read(leader, 65536)
+        except OSError:  # the terminal's other end is closed
+            break
+    assert child.status() == 0
+    assert (tmp_path / "out").read_text() == "result: 7\n"
+    assert re.search(rb"work .*0:00:00", shown)
+    if not forks:  # above the bar, in a line of its own
+        assert re.search(
+            rb"\nby the way *\r?\n", re.sub(rb"\x1b\[[0-9;?]*[a-zA-Z]|\r", b"\n", shown)
+        )
