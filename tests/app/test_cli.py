@@ -9,7 +9,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from nnode.app.cli import check_overrides, user_overrides
-from nnode.app.saved import shell_override
+from nnode.app.overrides import shell_override
 from nnode.app.train import build_solver
 from nnode.calibrate.options import FusedOptions
 from nnode.config import register
