@@ -18,7 +18,7 @@ from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.exchange.sumo import equilibrium_gap
 from nnode.models import Linear, System
 from tests.app.conftest import Script, script  # noqa: F401
-from tests.exchange import by_sumo
+from tests.exchange import by_jupedsim, by_sumo
 
 pytestmark = pytest.mark.slow
 
@@ -115,3 +115,23 @@ def test_the_stretch_of_longer_times_is_found(
     assert found["a"] == pytest.approx(STRETCH[0], abs=10)
     assert found["b"] == pytest.approx(STRETCH[1], abs=10)
     assert report["gap"]["closed"] > 0.9
+
+
+def test_jupedsim_s_people_return_to_their_speed(
+    jupedsim: ModuleType,
+    script: Script,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    path = by_jupedsim.crowds(jupedsim, tmp_path / "walk.sqlite")
+    report = diagnosed(
+        script, tmp_path / "run", "model=sf", f"model.r={by_jupedsim.RADIUS}", "model.B=0.08",
+        "data=jupedsim", f"data.path={by_jupedsim.measured(path, ROOM_ERROR)}", "data.t_seq=3",
+    )  # fmt: skip
+    assert report["verdict"] == "named"
+    (effect,) = report["effects"]
+    assert effect["name"] == "preferred_speed"
+    found = {name: c["value"] for name, c in effect["coefficients"].items()}
+    assert found["c"] == pytest.approx(1 / by_jupedsim.REACTION, rel=0.1)
+    assert found["v_pref"] == pytest.approx(by_jupedsim.SPEED, rel=0.02)
+    assert report["gap"]["closed"] > 0.9
+    assert report["gap"]["after"] < 0.3 * report["gap"]["before"]

@@ -209,8 +209,8 @@ def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> 
     )
     (folder / "a.rou.xml").write_text(f'<routes><route id="r" edges="e"/>{cars}</routes>')
     call(sumo / "bin" / "sumo", "-n", road, "-a", types, "-r", folder / "a.rou.xml",
-         "--step-length", 0.2, "--end", seconds, "--fcd-output", folder / "fcd.xml.gz", "--fcd-output.attributes",
-         "id,type,speed,pos,lane")  # fmt: skip
+         "--step-length", 0.2, "--end", seconds, "--fcd-output", folder / "fcd.xml.gz",
+         "--fcd-output.attributes", "id,type,speed,pos,lane")  # fmt: skip
     return folder / "fcd.xml.gz"
 
 
