@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := runs/demo
 
-.PHONY: setup demo test tutorials docs lint study clean
+.PHONY: setup demo test exchange tutorials docs lint study clean
 
 setup: $(VENV)/.installed
 
@@ -30,6 +30,16 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+# The neighbouring programs let run: what they write is read, calibrated and diagnosed. Where one of
+# them cannot be installed, that is said and its tests are skipped.
+exchange: setup
+	@for program in jupedsim sumo; do \
+	  echo "== $$program"; \
+	  $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$$program]" \
+	  || echo "exchange: $$program cannot be installed here, the reason is above; its tests are skipped"; \
+	done
+	$(BIN)/python -m pytest -m "not tutorial" tests/exchange
 
 # Runs every block of code of the tutorials.
 tutorials: setup

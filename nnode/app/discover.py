@@ -15,8 +15,9 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.given import Table, model_options, table_file
-from nnode.app.saved import plain_config, shell_override
+from nnode.app.saved import plain_config
 from nnode.app.train import brief, set_threads
+from nnode.app.typed import changes, group_defaults, shell_override
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
@@ -249,14 +250,10 @@ def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]
 def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     """What can be done with the extended model, as it can be typed."""
     checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
-    name, data = config["model"]["name"], config["data"]
+    name, group = config["model"]["name"], config["groups"]["data"]
     place = shlex.quote(str(folder / MODEL))
-    options = [
-        shell_override(f"data.{key}", data[key])
-        for key in ("path", "domain", "walls")
-        if config["groups"]["data"] == "table" and data.get(key) is not None
-    ]
-    train = ["python scripts/train.py", f"model={name}", f"data={config['groups']['data']}"]
+    train = ["python scripts/train.py", f"model={name}", f"data={group}"]
+    options = changes("data", config["data"], group_defaults("data", group))
     return [
         f"python scripts/evaluate.py {checkpoint}",
         f"python scripts/plot_forces.py {checkpoint}",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -117,12 +115,3 @@ def refuse_changes(
                 f"{saved.get(key)}, asked for is {now[key]}; leave the option out, or start a "
                 "new run without resume="
             )
-
-
-def shell_override(key: str, value: object) -> str:
-    """``key=value`` as it can be typed, whatever characters the value has."""
-    text = str(value)
-    if not re.fullmatch(r"[\w./:+-]*", text):
-        escaped = text.replace("'", "\\'")
-        text = f"'{escaped}'"
-    return shlex.quote(f"{key}={text}")

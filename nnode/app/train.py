@@ -13,8 +13,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
-from nnode.app.saved import merge_saved, plain_config, refuse_changes, shell_override
+from nnode.app.saved import merge_saved, plain_config, refuse_changes
 from nnode.app.sweep import RESULT
+from nnode.app.typed import shell_override
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed

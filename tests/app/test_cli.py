@@ -10,8 +10,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from nnode.app.cli import check_overrides
 from nnode.app.flags import read_command_line
-from nnode.app.saved import shell_override
 from nnode.app.train import build_solver
+from nnode.app.typed import shell_override
 from nnode.calibrate.options import FusedOptions
 from nnode.config import register
 from nnode.errors import ConfigError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -142,7 +143,9 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     page = (run / "report.html").read_text()
     assert f"python scripts/evaluate.py checkpoint={run / 'checkpoints' / 'best.pt'}" in page
     assert f"cp {run / 'model.yaml'} conf/model/lin_with_speed_zone.yaml" in page
-    assert "python scripts/train.py model=lin_with_speed_zone data=table data.path=" in page
+    (train,) = re.findall(r"python scripts/train.py model=lin_with_speed_zone data=table .*", page)
+    assert "data.domain=traffic" in train
+    assert f"data.path={run.parent / 'lane.csv'}" in train
 
 
 def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import warnings
 from pathlib import Path
 from types import ModuleType
@@ -25,15 +24,10 @@ from nnode.exchange.trajectories import write_pedpy
 from nnode.models import Crowd, Linear, Relaxation, SocialForce, Traffic
 from nnode.models.term import State
 from tests.app.conftest import Script, script  # noqa: F401
+from tests.exchange.by_sumo import call
 
 ROOM = [(0, 0), (12, 0), (12, 4), (0, 4)]
 PILLAR = [(5.5, 1.8), (6.5, 1.8), (6.5, 2.2), (5.5, 2.2)]
-
-
-@pytest.fixture(scope="module")
-def jupedsim() -> ModuleType:
-    found: ModuleType = pytest.importorskip("jupedsim", minversion="1.4")
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -192,12 +186,6 @@ def test_a_wall_pushes_alike_who_touches_it(jupedsim: ModuleType) -> None:
 
 
 @pytest.fixture(scope="module")
-def sumo() -> Path:
-    """The folder of SUMO's programs."""
-    return Path(pytest.importorskip("sumo").SUMO_HOME) / "bin"
-
-
-@pytest.fixture(scope="module")
 def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A straight road of 3 km, as a network for SUMO."""
     folder = tmp_path_factory.mktemp("sumo")
@@ -207,14 +195,9 @@ def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "a.edg.xml").write_text(
         '<edges><edge id="e" from="a" to="b" numLanes="1" speed="50"/></edges>'
     )
-    call(sumo / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
+    call(sumo / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
          "-o", folder / "a.net.xml")  # fmt: skip
     return folder / "a.net.xml"
-
-
-def call(*arguments: object) -> None:
-    done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> Path:
@@ -225,9 +208,9 @@ def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> 
         for i in range(5)
     )
     (folder / "a.rou.xml").write_text(f'<routes><route id="r" edges="e"/>{cars}</routes>')
-    call(sumo / "sumo", "-n", road, "-a", types, "-r", folder / "a.rou.xml", "--step-length", 0.2,
-         "--end", seconds, "--fcd-output", folder / "fcd.xml.gz", "--fcd-output.attributes",
-         "id,type,speed,pos,lane")  # fmt: skip
+    call(sumo / "bin" / "sumo", "-n", road, "-a", types, "-r", folder / "a.rou.xml",
+         "--step-length", 0.2, "--end", seconds, "--fcd-output", folder / "fcd.xml.gz",
+         "--fcd-output.attributes", "id,type,speed,pos,lane")  # fmt: skip
     return folder / "fcd.xml.gz"
 
 

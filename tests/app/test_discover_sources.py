@@ -1,0 +1,78 @@
+"""A diagnosis of files in the formats of other programs, as the script makes it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.app.conftest import Script
+from tests.discover.recorded import corridor, lane
+
+
+@pytest.fixture
+def highd(tmp_path: Path) -> Path:
+    """Platoons of cars, each in a lane of its own, 5 frames/s."""
+    table = pd.read_csv(lane(tmp_path / "lane.csv", sequences=5, seconds=8.0, cars=3))
+    number = pd.factorize(table["agent"])[0] + 1
+    frame = ((table["time"] - 40 * table["sequence"]) * 5).round().astype(int)
+    pd.DataFrame(
+        {
+            "frame": frame, "id": number, "x": table["x"] - 4.5, "width": 4.5,
+            "laneId": table["sequence"] + 1,
+        }
+    ).to_csv(tmp_path / "01_tracks.csv", index=False)  # fmt: skip
+    pd.DataFrame({"id": sorted(set(number)), "class": "Car", "drivingDirection": 2}).to_csv(
+        tmp_path / "01_tracksMeta.csv", index=False
+    )
+    (tmp_path / "01_recordingMeta.csv").write_text("id,frameRate\n1,5\n")
+    return tmp_path / "01_tracks.csv"
+
+
+@pytest.fixture
+def pedpy(tmp_path: Path) -> Path:
+    """People in a corridor, 10 frames/s, a text with the area beside it."""
+    table = pd.read_csv(corridor(tmp_path / "walk.csv", sequences=5, seconds=2.0, people=4)[0])
+    number = pd.factorize(table["agent"])[0] + 1
+    rows = zip(
+        number, (table["time"] * 10).round().astype(int), table["x"], table["y"], strict=True
+    )
+    text = "".join(f"{who} {frame} {x:.4f} {y:.4f} 0\n" for who, frame, x, y in rows)
+    (tmp_path / "walk.txt").write_text(f"# framerate: 10 fps\n# id frame x/m y/m z/m\n{text}")
+    (tmp_path / "area.wkt").write_text("POLYGON ((-6 0, 6 0, 6 4, -6 4, -6 0))")
+    return tmp_path / "walk.txt"
+
+
+def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
+    done = script(
+        "discover", *overrides, "discover.page=false", "discover.workers=1", "discover.sealed=0.4",
+        f"hydra.run.dir={folder}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    assert f"verdict: {report['verdict']}" in done.stdout
+    return report
+
+
+def test_highd_ends_with_a_verdict(highd: Path, script: Script, tmp_path: Path) -> None:
+    report = diagnosed(
+        script, tmp_path / "run", "model=lin", "model.leader=measured", "data=highd",
+        f"data.path={highd}", "data.window=null", "discover.effects=[inertia]",
+    )  # fmt: skip
+    assert report["verdict"] in ("none", "unknown")  # their law has no inertia
+    assert report["effects"] == report["data_faults"] == []
+    assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 5
+
+
+def test_pedpy_ends_with_a_verdict(pedpy: Path, script: Script, tmp_path: Path) -> None:
+    report = diagnosed(
+        script, tmp_path / "run", "model=sf", "model.B=0.3", "data=pedpy", f"data.path={pedpy}",
+        f"data.geometry={pedpy.with_name('area.wkt')}", "data.t_seq=2",
+        "discover.effects=[gait_sway]",
+    )  # fmt: skip
+    assert report["verdict"] in ("none", "unknown")  # nobody sways
+    assert report["effects"] == report["data_faults"] == []
+    assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 5

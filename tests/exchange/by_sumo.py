@@ -1,0 +1,136 @@
+"""Platoons in lanes of their own, simulated by SUMO."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+#: Of SUMO's passenger car: its own length and gap at rest, m, the time that drivers keep, s, and
+#: their comfortable braking, m/s².
+LENGTH, MIN_GAP, TAU, DECEL = 5.0, 2.5, 1.0, 4.5
+#: Speeds between which leaders choose anew every PERIOD s, m/s.
+SLOW, FAST, PERIOD = 10.0, 18.0, 5.0
+#: Length of a road, m, and SUMO's step, s.
+ROAD, STEP = 3000.0, 0.2
+
+
+def platoons(
+    home: Path,
+    folder: Path,
+    *,
+    number: int = 16,
+    cars: int = 5,
+    seconds: float = 30.0,
+    spread: float = 0.0,
+    seed: int = 0,
+    steer: Callable[[ModuleType], None] | None = None,
+) -> Path:
+    """SUMO's floating car data of platoons under its own car-following model, Krauss' with noise.
+
+    Every platoon has a road of its own. Its leader drives as fast as a variable speed sign says;
+    the others, who may drive at twice the limit, are only bound by whom they follow.
+
+    Args:
+        home: SUMO's folder.
+        folder: receives its files.
+        spread: the platoons start within so many metres.
+        steer: is called before every step with SUMO's interface for Python.
+    """
+    rng = np.random.default_rng(seed)
+    road = _roads(home, folder, number)
+    signs, cars_of = [], []
+    for k in range(number):
+        speeds = rng.uniform(SLOW, FAST, int(seconds / PERIOD) + 1)
+        steps = "".join(
+            f'<step time="{PERIOD * i:g}" speed="{v:.2f}"/>' for i, v in enumerate(speeds)
+        )
+        signs.append(f'<variableSpeedSign id="s{k}" lanes="e{k}_0">{steps}</variableSpeedSign>')
+        x = 50.0 + 40.0 * cars + rng.uniform(0, spread)
+        for i in range(cars):
+            cars_of.append(
+                f'<vehicle id="p{k}-{i}" type="{"own" if i else "lead"}" route="r{k}" depart="0" '
+                f'departPos="{x:.2f}" departSpeed="{speeds[0]:.2f}"/>'
+            )
+            x -= LENGTH + MIN_GAP + speeds[0] * rng.uniform(1.0, 2.0)
+    routes = "".join(f'<route id="r{k}" edges="e{k}"/>' for k in range(number))
+    types = (
+        '<vType id="lead" speedDev="0" sigma="0"/>'
+        f'<vType id="own" speedDev="0" speedFactor="2" length="{LENGTH}" minGap="{MIN_GAP}" '
+        f'tau="{TAU}" decel="{DECEL}"/>'
+    )
+    (folder / "a.add.xml").write_text(f"<additional>{types}{''.join(signs)}</additional>")
+    (folder / "a.rou.xml").write_text(f"<routes>{routes}{''.join(cars_of)}</routes>")
+    command = [
+        home / "bin" / "sumo", "-n", road, "-a", folder / "a.add.xml", "-r", folder / "a.rou.xml",
+        "--step-length", STEP, "--seed", seed, "--fcd-output", folder / "fcd.xml.gz",
+        "--fcd-output.attributes", "id,type,pos,lane", "--no-step-log",
+    ]  # fmt: skip
+    if steer is None:
+        call(*command, "--end", seconds + STEP)
+    else:
+        _steered(home, [str(part) for part in command], round(seconds / STEP) + 1, steer)
+    return folder / "fcd.xml.gz"
+
+
+def measured(path: Path, error: float, seed: int = 0) -> Path:
+    """The same positions, each with a normal error of ``error`` m, as a camera would have them."""
+    rng = np.random.default_rng(seed)
+    with gzip.open(path, "rt") as file:
+        text = file.read()
+    found = path.with_name("measured.xml.gz")
+    with gzip.open(found, "wt") as file:
+        file.write(
+            re.sub(
+                r' pos="([^"]+)"',
+                lambda m: f' pos="{float(m[1]) + error * rng.standard_normal():.3f}"',
+                text,
+            )
+        )
+    return found
+
+
+def call(*arguments: object) -> None:
+    """Run a program that must not fail."""
+    done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def _roads(home: Path, folder: Path, number: int) -> Path:
+    """Parallel straight roads of one lane."""
+    nodes = "".join(
+        f'<node id="a{k}" x="0" y="{50 * k}"/><node id="b{k}" x="{ROAD:g}" y="{50 * k}"/>'
+        for k in range(number)
+    )
+    edges = "".join(
+        f'<edge id="e{k}" from="a{k}" to="b{k}" numLanes="1" speed="50"/>' for k in range(number)
+    )
+    (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "a.edg.xml").write_text(f"<edges>{edges}</edges>")
+    call(home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
+         "-o", folder / "a.net.xml")  # fmt: skip
+    return folder / "a.net.xml"
+
+
+def _steered(
+    home: Path, command: list[str], steps: int, steer: Callable[[ModuleType], None]
+) -> None:
+    """Run SUMO step by step."""
+    sys.path.append(str(home / "tools"))
+    try:
+        import traci
+    finally:
+        sys.path.remove(str(home / "tools"))
+    traci.start(command)
+    try:
+        for _ in range(steps):
+            steer(traci)
+            traci.simulationStep()
+    finally:
+        traci.close()
