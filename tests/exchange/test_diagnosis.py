@@ -1,8 +1,7 @@
 """What the neighbouring programs simulate is calibrated, and what their models have beyond the
 calibrated one is found, by the scripts.
 
-Positions get an error as a camera's: the diagnosis takes what is not noise apart by its course in
-time, and simulated positions have no noise at all.
+Positions get an error as a camera's, but for one test of what a program wrote.
 """
 
 from __future__ import annotations
@@ -94,6 +93,25 @@ def test_sumo_s_drivers_mind_the_speed_ahead(
     assert report["gap"]["after"] < 0.1 * report["gap"]["before"]
     own = load_checkpoint(tmp_path / "checkpoints" / "best.pt").build()
     assert equilibrium_gap(law(own), MEAN) == pytest.approx(GAP, rel=0.05)
+
+
+def test_sumo_s_drivers_are_understood_without_any_noise(
+    sumo: Path,
+    script: Script,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    path = by_sumo.platoons(sumo, tmp_path)
+    report = diagnosed(
+        script, tmp_path / "run", "model=lin", "model.leader=measured", "data=sumo",
+        f"data.path={path}", "data.window=null",
+    )  # fmt: skip
+    (effect,) = report["effects"]
+    kin = {"asymmetric_response", "relative_speed"}
+    assert effect["name"] in kin
+    assert {other["name"] for other in effect["alternatives"]} <= kin
+    found = {name: c["value"] for name, c in effect["coefficients"].items()}
+    assert found.get("kappa_close", found.get("kappa")) == pytest.approx(KAPPA, abs=0.1)
+    assert report["gap"]["closed"] > 0.9
 
 
 def test_the_stretch_of_longer_times_is_found(
