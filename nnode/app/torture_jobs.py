@@ -17,7 +17,7 @@ from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare
 from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import demo_data
-from nnode.study.page import Block, TableBlock
+from nnode.pages.page import Block, TableBlock
 from nnode.study.runner import Task, run_tasks
 from nnode.study.traffic_tasks import fit, scan
 

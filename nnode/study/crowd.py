@@ -10,12 +10,12 @@ from typing import Any
 
 from nnode.data.store import Store
 from nnode.errors import ConfigError
+from nnode.pages.page import Block
 from nnode.study import crowd_tasks as tasks
 from nnode.study.crowd_data import ALL, prepare_horizon
 from nnode.study.crowd_page import blocks
 from nnode.study.crowd_results import Crowd
 from nnode.study.options import CrowdStudyOptions
-from nnode.study.page import Block
 from nnode.study.runner import Task, run_tasks
 
 TITLE = "Crowd: social force and networks in a two-way corridor"

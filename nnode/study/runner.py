@@ -19,12 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import nnode
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
 from nnode.study.progress import TaskProgress
 from nnode.study.workers import Call, Outcome, calls_here, calls_in_processes
+from nnode.version import VERSION
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class Task:
         return {
             "function": f"{self.function.__module__}.{self.function.__qualname__}",
             "arguments": self.arguments,
-            "version": nnode.__version__,
+            "version": VERSION,
             "fingerprint": fingerprint,
         }
 

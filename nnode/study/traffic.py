@@ -13,10 +13,10 @@ from nnode.data.options import EsimasOptions, Faults
 from nnode.data.prepare import prepare
 from nnode.data.store import Store
 from nnode.errors import ConfigError
+from nnode.pages.page import Block
 from nnode.study import printed_traffic as printed
 from nnode.study import traffic_tasks as tasks
 from nnode.study.options import TrafficStudyOptions
-from nnode.study.page import Block
 from nnode.study.runner import Task, run_tasks
 from nnode.study.traffic_page import blocks
 from nnode.study.traffic_results import LAWS, NETWORKS, Study
