@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from nnode.app.torture_child import Child, script
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare
@@ -47,6 +48,26 @@ class Job:
     share: int = 1
     again: Callable[[Path], list[str] | None] = lambda folder: None
     before: Callable[[], None] = field(default=lambda: None)
+
+    def child(
+        self, root: Path, given: list[str], folder: Path, output: Path,
+        prelude: Callable[[], object] = lambda: None,
+    ) -> Child:  # fmt: skip
+        """Start it in a process of its own, in a run's folder.
+
+        Args:
+            root: of the repository.
+            given: overrides.
+            output: receives what it prints.
+            prelude: done in the process as the last thing before the script.
+        """
+
+        def work() -> None:
+            self.before()
+            prelude()
+            script(root, self.name, [*given, f"hydra.run.dir={folder}"])
+
+        return Child(work, output)
 
 
 def timeless(value: Any) -> Any:
