@@ -46,6 +46,7 @@ coverage: setup
 	rm -rf runs/coverage && mkdir -p runs/coverage
 	$(BIN)/coverage run -m pytest
 	$(BIN)/coverage combine --quiet
+	rm -f runs/coverage/data.*  # of processes that were killed while they wrote it
 	$(BIN)/coverage report
 
 # Runs every block of code of the tutorials.
