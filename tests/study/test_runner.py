@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 import torch
 
+from nnode import progress
 from nnode.app.benchmark_problems import Shape, pose
-from nnode.calibrate import progress
 from nnode.errors import StudyError
 from nnode.solvers import TorchdiffeqSolver
 from nnode.study import runner
