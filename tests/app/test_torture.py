@@ -13,6 +13,7 @@ from nnode.app.torture_fuzz import fuzz
 from nnode.app.torture_jobs import jobs
 from nnode.app.torture_report import Row, keep
 from nnode.app.torture_targets import Target
+from nnode.config import register
 from tests.app.conftest import ROOT, Script
 
 
@@ -81,6 +82,7 @@ def test_a_reader_that_misbehaves_is_a_loss(
 
 
 def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
+    register()
     for job in jobs(tmp_path / "raw"):
         check_overrides(job.first, ROOT / "conf", job.name)
 
