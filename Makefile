@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := runs/demo
 
-.PHONY: setup demo test exchange tutorials docs lint study clean
+.PHONY: setup demo test exchange coverage tutorials docs lint study clean
 
 setup: $(VENV)/.installed
 
@@ -40,6 +40,14 @@ exchange: setup
 	  || echo "exchange: $$program cannot be installed here, the reason is above; its tests are skipped"; \
 	done
 	$(BIN)/python -m pytest -m "not tutorial" tests/exchange
+
+# Which lines of the package the tests run; below 90 % it fails.
+coverage: setup
+	rm -rf runs/coverage && mkdir -p runs/coverage
+	$(BIN)/coverage run -m pytest
+	$(BIN)/coverage combine --quiet
+	rm -f runs/coverage/data.*  # of processes that were killed while they wrote it
+	$(BIN)/coverage report
 
 # Runs every block of code of the tutorials.
 tutorials: setup

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from nnode.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from nnode.app.discover import diagnose_table as diagnose

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from nnode import __version__
+from nnode.version import VERSION
 
 
 def cores() -> int:
@@ -46,7 +46,7 @@ def machine(packages: Iterable[str]) -> dict[str, Any]:
 def how_made(packages: Iterable[str]) -> dict[str, str]:
     """What a page says of how it was made: command, date, machine, versions."""
     here = machine(packages)
-    versions = {"nnode": __version__, **here["versions"]}
+    versions = {"nnode": VERSION, **here["versions"]}
     return {
         "Command": shlex.join(["python", *sys.argv]),
         "Date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),

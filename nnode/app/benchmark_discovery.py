@@ -15,7 +15,7 @@ from nnode.errors import ConfigError
 from nnode.groundtruth import ARMS, Case
 from nnode.groundtruth.arms import cases, hides
 from nnode.machine import cores
-from nnode.study.page import write_page
+from nnode.pages.page import write_page
 from nnode.study.runner import run_tasks
 
 #: Arms that need many cases: they show how often something is named where nothing is hidden.

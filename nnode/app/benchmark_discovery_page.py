@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from typing import Any
 
 import pandas as pd
 
-import nnode
 from nnode.app import benchmark_discovery_tables as tables
 from nnode.groundtruth import ARMS
-from nnode.machine import machine
+from nnode.machine import how_made
+from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.plots.benchmark_discovery import confusion_figure, map_figure
-from nnode.study.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 
 TITLE = "The diagnosis against hidden truths"
 SUBTITLE = (
@@ -140,15 +137,11 @@ def _figures(frame: pd.DataFrame, domain: str) -> list[Block]:
 
 
 def _made(frame: pd.DataFrame, seconds: float, workers: int) -> Provenance:
-    here = machine(_PACKAGES)
-    versions = {"nnode": nnode.__version__, **here["versions"]}
     return Provenance(
         {
-            "Command": shlex.join(["python", *sys.argv]),
             "Cases": str(len(frame)),
             "Time": f"{seconds:.0f} s in this run with {workers} worker process(es); one diagnosis "
             f"{frame['seconds'].median():.1f} s (median), {frame['seconds'].max():.1f} s (most)",
-            "Machine": f"{here['processor']}, {here['cores']} cores, {here['system']}",
-            "Versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
+            **how_made(_PACKAGES),
         }
     )

@@ -17,7 +17,7 @@ from nnode.config import SCHEMAS
 from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
 from nnode.discover.diagnose import divide, engine_of
-from nnode.discover.engine import Engine, fill, row_of
+from nnode.discover.engine import Engine, fill, row_of, square_of
 from nnode.discover.fit import Fit, refine
 from nnode.discover.inputs import read_inputs
 from nnode.discover.options import DiscoverOptions
@@ -89,7 +89,7 @@ def peers_on_table(
 
     whole = engine_of(domain, [sequences[i] for i in sealed], whole=True)
     whole.settle(fit.system, row_of(fit.system))
-    before, floor = _cost(whole, fit.system), whole.noise_floor()
+    before, floor = square_of(whole, fit.system), whole.noise_floor()
     split = {"sealed": [sequences[i].name for i in sealed]}
     reports = {}
     for name, choose in PEERS.items():
@@ -97,7 +97,7 @@ def peers_on_table(
         names = list(dict.fromkeys(columns[j].effect.name for j in np.flatnonzero(theta)))
         after = before
         if names:
-            after = _cost(whole, _calibrated(engine, _with(fit, columns, values, theta)))
+            after = square_of(whole, _calibrated(engine, _with(fit, columns, values, theta)))
         reports[name] = {
             "verdict": "named" if names else "none",
             "effects": [{"name": n, "coefficients": {}, "alternatives": []} for n in names],
@@ -113,11 +113,6 @@ def _calibrated(engine: Engine, system: System) -> System:
         return refine(engine, system).system
     except SimulationError:
         return system
-
-
-def _cost(engine: Engine, system: System) -> float:
-    """Mean square error of the sequences, m²; infinite where the model blows up."""
-    return float(engine.squares(system, row_of(system)).means().mean())
 
 
 def _with(fit: Fit, columns: list[Column], values: np.ndarray, theta: np.ndarray) -> System:

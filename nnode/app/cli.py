@@ -15,7 +15,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nnode import __version__
 from nnode.app.flags import read_command_line
 from nnode.app.help import help_text
 from nnode.app.launchers import check_launcher, has_no_part, out_of_sight
@@ -26,6 +25,7 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
 from nnode.files import disk_words
+from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
 
@@ -80,7 +80,7 @@ def _arguments(
         raise ConfigError(f"no configuration folder {folder}; run scripts/{name}.py in place")
     line = read_command_line(sys.argv[1:])
     if "--version" in line.flags:
-        print(f"nnode {__version__}")
+        print(f"nnode {VERSION}")
         sys.exit()
     given = line.overrides
     asked = "--help" in line.flags

@@ -14,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted
 from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
+from nnode.pages.page import Block, Provenance, write_page
 from nnode.study.options import StudyOptions
-from nnode.study.page import Block, Provenance, write_page
 
 log = logging.getLogger(__name__)
 

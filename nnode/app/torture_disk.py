@@ -18,7 +18,6 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from nnode.app.torture_child import Child, script
 from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_kills import read_whole
 from nnode.app.torture_report import Row
@@ -124,13 +123,7 @@ def _run(
     again = job.again(folder)
     # a training that goes on, so that it has something to write
     given = job.first if again is None else [*again, "trainer.max_epochs=8"]
-
-    def work() -> None:
-        job.before()
-        prelude()
-        script(root, job.name, [*given, f"hydra.run.dir={folder}"])
-
-    child = Child(work, output)
+    child = job.child(root, given, folder, output, prelude)
     status = child.status(300)
     child.kill()
     return status

@@ -6,7 +6,7 @@ import shutil
 import time
 from pathlib import Path
 
-from nnode.app.torture_child import Child, script
+from nnode.app.torture_child import Child
 from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_report import Row
 from nnode.lock import LOCK
@@ -72,13 +72,7 @@ def _of_job(root: Path, place: Path, job: Job, repeats: int) -> Row:
 
 
 def _start(root: Path, job: Job, run: Path, output: Path) -> Child:
-    given = job.again(run) or job.first
-
-    def work() -> None:
-        job.before()
-        script(root, job.name, [*given, f"hydra.run.dir={run}"])
-
-    return Child(work, output)
+    return job.child(root, job.again(run) or job.first, run, output)
 
 
 def _at_work(run: Path, child: Child) -> bool:

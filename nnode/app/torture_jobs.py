@@ -12,12 +12,13 @@ from typing import Any
 
 import pandas as pd
 
+from nnode.app.torture_child import Child, script
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare
 from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import demo_data
-from nnode.study.page import Block, TableBlock
+from nnode.pages.page import Block, TableBlock
 from nnode.study.runner import Task, run_tasks
 from nnode.study.traffic_tasks import fit, scan
 
@@ -47,6 +48,26 @@ class Job:
     share: int = 1
     again: Callable[[Path], list[str] | None] = lambda folder: None
     before: Callable[[], None] = field(default=lambda: None)
+
+    def child(
+        self, root: Path, given: list[str], folder: Path, output: Path,
+        prelude: Callable[[], object] = lambda: None,
+    ) -> Child:  # fmt: skip
+        """Start it in a process of its own, in a run's folder.
+
+        Args:
+            root: of the repository.
+            given: overrides.
+            output: receives what it prints.
+            prelude: done in the process as the last thing before the script.
+        """
+
+        def work() -> None:
+            self.before()
+            prelude()
+            script(root, self.name, [*given, f"hydra.run.dir={folder}"])
+
+        return Child(work, output)
 
 
 def timeless(value: Any) -> Any:
@@ -156,7 +177,7 @@ def jobs(raw: Path) -> list[Job]:
             before=lambda: _small_study(raw)),
         Job("discover",
             ["model=lin", "model.leader=measured", "data=table", f"data.path={table}",
-             "data.domain=traffic", "discover.effects=[relative_speed]", "discover.workers=1",
+             "data.domain=traffic", "discover.effects=[relative_speed]",
              "discover.max_effects=1", "discover.step=0.2", "discover.animation=false",
              "discover.page=false"],
             _reported, lambda folder: 0.0, 23),

@@ -21,7 +21,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from nnode.app.torture_child import Child, script
+from nnode.app.torture_child import Child
 from nnode.app.torture_jobs import Job, fresh, jobs
 from nnode.app.torture_report import Row
 from nnode.calibrate.checkpoint import load_checkpoint
@@ -122,14 +122,8 @@ class _Killed:
     def _run(self, folder: Path, prelude: Callable[[], object] = lambda: None) -> Child:
         given = self.job.again(folder)
         self.resumed += given is not None
-        overrides = [*(self.job.first if given is None else given), f"hydra.run.dir={folder}"]
-
-        def work() -> None:
-            self.job.before()
-            prelude()
-            script(self.root, self.job.name, overrides)
-
-        return Child(work, self.place / "output.txt")
+        overrides = self.job.first if given is None else given
+        return self.job.child(self.root, overrides, folder, self.place / "output.txt", prelude)
 
     def _until_the_end(self, folder: Path, number: int) -> None:
         for attempt in range(_ROW + 1):

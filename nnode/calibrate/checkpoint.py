@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import nnode
 from nnode.errors import CheckpointError, NNodeError
 from nnode.files import disk_words, replacing
 from nnode.models import System, build_model
+from nnode.version import VERSION
 
 #: Raised when the layout of a checkpoint changes.
 FORMAT = 1
@@ -48,7 +48,7 @@ class Checkpoint:
     split: dict[str, list[str]] = field(default_factory=dict)
     free_speed: float | None = None
     format: int = FORMAT
-    version: str = nnode.__version__
+    version: str = VERSION
 
     def build(self) -> System:
         """The model, with the parameters of this checkpoint."""

@@ -16,7 +16,6 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
-from nnode import __version__
 from nnode.data.download import sha256
 from nnode.data.esimas import esimas_files, read_esimas
 from nnode.data.highd import highd_files, read_highd
@@ -41,6 +40,7 @@ from nnode.data.table import TABLE, WALLS, read_table, table_files
 from nnode.data.vehicles import read_vehicles, vehicle_files
 from nnode.errors import ConfigError, DataError
 from nnode.progress import Stages
+from nnode.version import VERSION
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def _prepared(
         stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
     manifest = {
-        "package": {"name": "nnode", "version": __version__},
+        "package": {"name": "nnode", "version": VERSION},
         "options": plain(options),
         "domain": domain,
         "dt": _interval(kept),

@@ -7,14 +7,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nnode.discover.variables import Variable, knots_of, waves_of
-from nnode.models.crowd import dot
+from nnode.discover.variables import Variable, clock, knots_of, since_start, waves_of
+from nnode.models.crowd import dot, velocity
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
     heading,
     local_density,
     right_of,
-    velocity,
 )
 from nnode.models.effects.crowd_places import wall_distance
 from nnode.models.term import State
@@ -108,18 +107,6 @@ def _away_from_wall(state: State) -> Tensor:
     return _nearest_wall(state)[1]
 
 
-def _clock(state: State) -> Tensor:
-    return (state.scene.start + state.t)[:, None].expand(state.x.shape[:2])
-
-
-def _since_start(first: dict[str, float]) -> Of:
-    def value(state: State) -> Tensor:
-        start = torch.tensor([first[name] for name in state.scene.names], dtype=state.x.dtype)
-        return (state.scene.start - start + state.t)[:, None].expand(state.x.shape[:2])
-
-    return value
-
-
 def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
     """The variables of people, with knots where there are data.
 
@@ -134,8 +121,8 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
     looks: list[tuple[str, str, Of, dict[str, Of], int]] = [
         ("position x", "m", _position(0), axes, FINE),
         ("position y", "m", _position(1), axes, KNOTS),
-        ("clock time", "s", _clock, axes, KNOTS),
-        ("time since the start", "s", _since_start(first), own, KNOTS),
+        ("clock time", "s", clock, axes, KNOTS),
+        ("time since the start", "s", since_start(first), own, KNOTS),
         ("speed", "m/s", _speed, own, KNOTS),
     ]
     if bool((agent.sum(1) > 1).any()):
@@ -158,4 +145,4 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
         for level, direction in directions.items():
             found.append(Variable(name, unit, value, knots, direction, level))
     found += waves_of("position x", "m", _position(0), state.x[..., 0][agent], WAY, axes)
-    return found + waves_of("clock time", "s", _clock, _clock(state)[agent], CLOCK, axes)
+    return found + waves_of("clock time", "s", clock, clock(state)[agent], CLOCK, axes)

@@ -27,7 +27,7 @@ from nnode.discover.report import (
 )
 from nnode.discover.result import Diagnosis
 from nnode.machine import how_made
-from nnode.study.page import Block, Heading, Provenance, Text, write_page
+from nnode.pages.page import Block, Heading, Provenance, Text, write_page
 
 TENSORBOARD = "tensorboard"
 

@@ -8,20 +8,20 @@ import numpy as np
 
 from nnode.data.sequence import Sequence
 from nnode.discover.deviation import Deviation, deviation, simulate, smooth_velocity
-from nnode.discover.found import Found
-from nnode.discover.inputs import Inputs
-from nnode.discover.options import DiscoverOptions
-from nnode.discover.report import amount, individual, interval
-from nnode.plots.discover_maps import approach_maps, neighbour_maps, plane_maps, time_space_maps
-from nnode.plots.discover_marks import (
+from nnode.discover.figures.maps import approach_maps, neighbour_maps, plane_maps, time_space_maps
+from nnode.discover.figures.marks import (
     coefficient_intervals,
     flexible_curve,
     place_curves,
     sealed_costs,
 )
-from nnode.plots.discover_paths import film_strip, moving_picture, pair, rmse, trajectories
+from nnode.discover.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
+from nnode.discover.found import Found
+from nnode.discover.inputs import Inputs
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.report import amount, individual, interval
+from nnode.pages.page import FigureBlock, MovingBlock
 from nnode.plots.quality import faults_figure
-from nnode.study.page import FigureBlock, MovingBlock
 
 #: Faulty sequences and variables that are drawn.
 FAULTY, PLACES = 10, 9

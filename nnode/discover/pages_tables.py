@@ -9,7 +9,7 @@ import pandas as pd
 from nnode.data.quality import KINDS
 from nnode.discover.report import amount, estimate, in_unit
 from nnode.discover.result import Diagnosis
-from nnode.study.page import TableBlock
+from nnode.pages.page import TableBlock
 
 #: Faults that the page lists; its CSV has all.
 LISTED = 30

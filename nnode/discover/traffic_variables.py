@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
-from nnode.discover.variables import Variable, knots_of, waves_of
+from nnode.discover.variables import Variable, clock, knots_of, since_start, waves_of
 from nnode.models.effects.traffic import gaps, rate_of
 from nnode.models.term import State
 
@@ -42,10 +42,6 @@ def _position(state: State) -> Tensor:
     return state.x[..., 0]
 
 
-def _clock(state: State) -> Tensor:
-    return (state.scene.start + state.t)[:, None].expand(state.x.shape[:2])
-
-
 def _speed(state: State) -> Tensor:
     return rate_of(state)
 
@@ -67,14 +63,6 @@ def _rank(state: State) -> Tensor:
     return (number - 1 - place).to(state.x.dtype)
 
 
-def _since_start(first: dict[str, float]) -> Callable[[State], Tensor]:
-    def value(state: State) -> Tensor:
-        start = torch.tensor([first[name] for name in state.scene.names], dtype=state.x.dtype)
-        return (state.scene.start - start + state.t)[:, None].expand(state.x.shape[:2])
-
-    return value
-
-
 def traffic_variables(batch: Batch) -> list[Variable]:
     """The variables of platoons, with knots where there are data.
 
@@ -87,11 +75,11 @@ def traffic_variables(batch: Batch) -> list[Variable]:
     x, v = batch.x[..., 0], batch.v[..., 0]
     gap = torch.cat([torch.diff(x), torch.full_like(x[..., :1], torch.nan)], -1)
     difference = torch.cat([torch.diff(v), torch.zeros_like(v[..., :1])], -1)
-    clock = batch.start[:, None] + batch.dt * torch.arange(len(x))[:, None, None]
+    times = batch.start[:, None] + batch.dt * torch.arange(len(x))[:, None, None]
     first: dict[str, float] = {}
     for name, start in zip(batch.names, batch.start.tolist(), strict=True):
         first[name] = min(first.get(name, start), start)
-    since = clock - torch.tensor([first[name] for name in batch.names])[:, None]
+    since = times - torch.tensor([first[name] for name in batch.names])[:, None]
     lead = v[:, torch.arange(len(batch)), last][..., None].expand(x.shape)
     ahead = torch.cat([gap[..., 1:], gap[..., -1:]], -1)
     ahead = torch.where(ahead.isnan() | (ahead > PADDING_GAP / 2), gap, ahead)
@@ -120,9 +108,9 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         of("rear gap", "m", _rear_gap, behind),
         of("speed of the leader", "m/s", _leader_speed, lead),
         of("position", "m", _position, x),
-        of("clock time", "s", _clock, clock),
-        of("time since the start", "s", _since_start(first), since),
+        of("clock time", "s", clock, times),
+        of("time since the start", "s", since_start(first), since),
         of("place in the platoon", "1", _rank, rank.to(x.dtype)),
         *waves("position", "m", _position, x, ROAD),
-        *waves("clock time", "s", _clock, clock, (max(CLOCK[0], 4 * batch.dt), CLOCK[1])),
+        *waves("clock time", "s", clock, times, (max(CLOCK[0], 4 * batch.dt), CLOCK[1])),
     ]  # fmt: skip

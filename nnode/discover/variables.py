@@ -104,6 +104,25 @@ def knots_of(values: np.ndarray, most: int = 9) -> tuple[float, ...]:
     return tuple(float(knot) for knot in kept)
 
 
+def clock(state: State) -> Tensor:
+    """``(B, N)`` s: the time of the recording."""
+    return (state.scene.start + state.t)[:, None].expand(state.x.shape[:2])
+
+
+def since_start(first: dict[str, float]) -> Callable[[State], Tensor]:
+    """``(B, N)`` s: the time since the first sample of the sequence.
+
+    Args:
+        first: clock time of that sample, s, by the sequence's name.
+    """
+
+    def value(state: State) -> Tensor:
+        start = torch.tensor([first[name] for name in state.scene.names], dtype=state.x.dtype)
+        return (state.scene.start - start + state.t)[:, None].expand(state.x.shape[:2])
+
+    return value
+
+
 def lengths_of(shortest: float, longest: float, span: float, most: int = 600) -> tuple[float, ...]:
     """Lengths of waves that data over ``span`` tell apart; the shorter ones are left out where
     there are too many."""

@@ -28,7 +28,12 @@ def _positive(**options: float) -> None:
             raise ValueError(f"{name}={value} must be positive")
 
 
-def _velocity(state: State) -> Tensor:
+def velocity(state: State) -> Tensor:
+    """``(B, N, 2)`` m/s.
+
+    Raises:
+        ValueError: the model is of first order.
+    """
     if state.v is None:
         raise ValueError("a term of a second-order model needs velocities")
     return state.v
@@ -50,7 +55,7 @@ class Relaxation(Term):
         self.tau = tau
 
     def forward(self, state: State) -> Tensor:
-        v = _velocity(state)
+        v = velocity(state)
         way = state.scene.destination - state.x
         desired = way * (norm(v) / norm(way))[..., None]
         return (desired - v) / self.tau
@@ -89,7 +94,7 @@ class InteractionForce(Term):
             state: positions and velocities.
             ahead: s; all positions are extrapolated by this time at their velocities.
         """
-        x, v, scene = state.x, _velocity(state), state.scene
+        x, v, scene = state.x, velocity(state), state.scene
         other, speed = state.others
         dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
         if isinstance(ahead, Tensor) or ahead:
@@ -100,7 +105,7 @@ class InteractionForce(Term):
 
     def components(self, state: State) -> dict[str, Tensor]:
         """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
-        x, v, scene = state.x, _velocity(state), state.scene
+        x, v, scene = state.x, velocity(state), state.scene
         parts = {"pair": self.pairs(state).sum(2)}
         if self.walls and scene.wall.shape[1]:
             wall, normal, real = scene.walls_of_each()

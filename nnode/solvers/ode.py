@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchdiffeq import odeint, odeint_adjoint
 from torchdiffeq._impl.odeint import SOLVERS
 from torchdiffeq._impl.solvers import FixedGridODESolver
@@ -14,31 +14,12 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
+from nnode.solvers.rates import Rates
 
 FIXED_STEP = tuple(
     name for name, solver in SOLVERS.items() if issubclass(solver, FixedGridODESolver)
 )
 GRADIENTS = ("adjoint", "discrete")
-
-
-class _Rates(nn.Module):
-    """The right-hand side per step: time counted in steps is exact in any precision.
-
-    A sequence that is shorter than its batch stands still after its end, so that nothing that
-    nobody measured can blow up and spoil the gradient of the others.
-    """
-
-    def __init__(self, system: System, batch: Batch, steps: int) -> None:
-        super().__init__()
-        self.system, self.scene, self.dt = system, system.scene(batch), batch.dt / steps
-        last = batch.valid.any(-1).sum(0) - 1
-        self.end = steps * last[:, None, None]
-        self.ragged = bool((last < batch.n_samples - 1).any())
-
-    def forward(self, step: Tensor, y: Tensor) -> Tensor:
-        rate: Tensor = self.dt * self.system(step * self.dt, y, self.scene)
-        # the end itself still moves: integrating backwards starts there
-        return rate.where(step <= self.end, 0.0) if self.ragged else rate
 
 
 def _whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
@@ -105,7 +86,7 @@ class TorchdiffeqSolver:
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         n = substeps(batch.dt, self.dt, system.domain)
-        rates = _Rates(system, batch, n)
+        rates = Rates(system, batch, n)
         y0 = system.initial(batch)
         t = n * torch.arange(batch.n_samples, dtype=y0.dtype, device=y0.device)
         options = {"grid_constructor": _whole_steps} if self.method in FIXED_STEP else {}

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nnode.data.store import Store
 from nnode.errors import ConfigError
+from nnode.pages.page import Block
 from nnode.study import crowd_tasks as tasks
 from nnode.study.crowd_data import ALL, prepare_horizon
 from nnode.study.crowd_page import blocks
 from nnode.study.crowd_results import Crowd
 from nnode.study.options import CrowdStudyOptions
-from nnode.study.page import Block
-from nnode.study.runner import Task, run_tasks
+from nnode.study.runner import Task, hash_of, run_tasks
 
 TITLE = "Crowd: social force and networks in a two-way corridor"
 SUBTITLE = (
@@ -56,7 +53,7 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
             _round(study, number),
             folder,
             workers=options.workers,
-            fingerprint=_fingerprint(stores),
+            fingerprint=hash_of({f"{kind}-{h:g}": s for (kind, h), s in stores.items()}),
             title=f"crowd study, part {number + 1} of {len(options.horizons) + 1}",
         )
         study.found.update(found)
@@ -74,11 +71,6 @@ def _checked(options: CrowdStudyOptions) -> CrowdStudyOptions:
     if not options.horizons or min(options.horizons) <= 0:
         raise ConfigError(f"study.horizons={options.horizons}: expected positive times in s")
     return replace(options, horizons=sorted(set(options.horizons)))
-
-
-def _fingerprint(stores: dict[tuple[str, float], Store]) -> str:
-    content = {f"{kind}-{h:g}": store.manifest["files"] for (kind, h), store in stores.items()}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def starts(restarts: int, kind: str, scope: str, first: bool) -> int:

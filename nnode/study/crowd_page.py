@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.plots.study_crowd import horizon_costs
 from nnode.study import printed_crowd as printed
 from nnode.study.crowd_data import ALL, GROUP, RECORDING
 from nnode.study.crowd_fit import NAMES
 from nnode.study.crowd_page_forces import force_blocks, restart_blocks
 from nnode.study.crowd_results import LABELS, MODELS, SIMPLE, Crowd
-from nnode.study.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.study.statistics import Paired
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from nnode.pages.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.plots.crowd import force_contours
 from nnode.plots.interaction import Part, Vector
 from nnode.plots.settings import SETTINGS, Setting, six_settings
@@ -17,7 +18,6 @@ from nnode.study import printed_crowd as printed
 from nnode.study.crowd_data import ALL, chosen, mean_speed, sequences
 from nnode.study.crowd_fit import NAMES, system_of
 from nnode.study.crowd_results import LABELS, MODELS, Crowd, One
-from nnode.study.page import Block, FigureBlock, Heading, TableBlock, Text
 
 #: Starts within this share of the least cost count as equally good.
 NEAR = 0.05

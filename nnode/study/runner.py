@@ -7,24 +7,26 @@ again with some options changed, computes only what it has not computed before.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import nnode
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
+from nnode.data.store import Store
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
 from nnode.study.progress import TaskProgress
 from nnode.study.workers import Call, Outcome, calls_here, calls_in_processes
+from nnode.version import VERSION
 
 log = logging.getLogger(__name__)
 
@@ -68,13 +70,19 @@ class Task:
         return {
             "function": f"{self.function.__module__}.{self.function.__qualname__}",
             "arguments": self.arguments,
-            "version": nnode.__version__,
+            "version": VERSION,
             "fingerprint": fingerprint,
         }
 
     def call(self) -> Call:
         """The function, and the arguments as JSON gives them back: the same in any process."""
         return self.function, json.loads(json.dumps(self.arguments))
+
+
+def hash_of(stores: Mapping[str, Store]) -> str:
+    """Of the content of all files of prepared data: a fingerprint of tasks that read them."""
+    content = {name: store.manifest["files"] for name, store in stores.items()}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def run_tasks(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +11,11 @@ from nnode.data.options import EsimasOptions, Faults
 from nnode.data.prepare import prepare
 from nnode.data.store import Store
 from nnode.errors import ConfigError
+from nnode.pages.page import Block
 from nnode.study import printed_traffic as printed
 from nnode.study import traffic_tasks as tasks
 from nnode.study.options import TrafficStudyOptions
-from nnode.study.page import Block
-from nnode.study.runner import Task, run_tasks
+from nnode.study.runner import Task, hash_of, run_tasks
 from nnode.study.traffic_page import blocks
 from nnode.study.traffic_results import LAWS, NETWORKS, Study
 
@@ -56,7 +54,7 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
         )  # fmt: skip
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
     assert options.workers is not None
-    how: dict[str, Any] = {"workers": options.workers, "fingerprint": _fingerprint(stores)}
+    how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(stores)}
     first = list(_tasks(options, stores))
     found = run_tasks(first, folder, title="traffic study", **how)
     again = [] if options.quick else _wider(first, found)
@@ -116,11 +114,6 @@ def _prepared(options: TrafficStudyOptions, policy: str, folder: Path) -> Store:
         name="esimas", source=options.source, download=download, faults=Faults(policy)
     )
     return prepare(chosen, folder / "data" / policy)
-
-
-def _fingerprint(stores: dict[str, Store]) -> str:
-    content = {policy: store.manifest["files"] for policy, store in stores.items()}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _sizes(store: Store) -> dict[str, int]:

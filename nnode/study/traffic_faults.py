@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import torch
 
+from nnode.pages.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.plots.study_traffic import space_time
 from nnode.solvers.fused.engine import FusedSolver
-from nnode.study.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.study.traffic_problem import Problem
 from nnode.study.traffic_results import AVERAGE, Study, least
 

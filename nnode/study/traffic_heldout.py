@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from nnode.study.page import Block, Heading, TableBlock, Text
+from nnode.pages.page import Block, Heading, TableBlock, Text
 from nnode.study.statistics import holm, paired
 from nnode.study.traffic_results import LAWS, NETWORKS, Study, cell
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from nnode.pages.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.plots.study_traffic import descents
-from nnode.study.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.study.traffic_results import AVERAGE, ORDER, Study, cell
 
 #: A cost gradient takes the time of about so many simulations, which the figure counts.

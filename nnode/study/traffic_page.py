@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.plots.study_traffic import law_panels, leader_speeds
 from nnode.plots.traffic import measured_gaps
 from nnode.study import printed_traffic as printed
-from nnode.study.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.study.statistics import average_interval
 from nnode.study.traffic_faults import fault_blocks
 from nnode.study.traffic_heldout import heldout_blocks

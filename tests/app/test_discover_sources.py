@@ -48,7 +48,7 @@ def pedpy(tmp_path: Path) -> Path:
 
 def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
     done = script(
-        "discover", *overrides, "discover.page=false", "discover.workers=1", "discover.sealed=0.4",
+        "discover", *overrides, "discover.page=false", "discover.sealed=0.4",
         f"hydra.run.dir={folder}",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -8,10 +8,13 @@ from typing import Any
 
 import pytest
 
+from nnode.app.overrides import check_overrides
 from nnode.app.torture_fuzz import fuzz
+from nnode.app.torture_jobs import jobs
 from nnode.app.torture_report import Row, keep
 from nnode.app.torture_targets import Target
-from tests.app.conftest import Script
+from nnode.config import register
+from tests.app.conftest import ROOT, Script
 
 
 def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
@@ -76,6 +79,23 @@ def test_a_reader_that_misbehaves_is_a_loss(
     assert f"did open {outside}" in words
     assert "MemoryError" in words
     assert len(found.losses) == 16 - found.read + sum("did open" in w for w in found.losses)
+
+
+def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
+    register()
+    for job in jobs(tmp_path / "raw"):
+        check_overrides(job.first, ROOT / "conf", job.name)
+
+
+def test_only_a_training_with_a_checkpoint_is_gone_on_with(tmp_path: Path) -> None:
+    known = {job.name: job for job in jobs(tmp_path / "raw")}
+    run = tmp_path / "run"
+    last = run / "checkpoints" / "last.pt"
+    last.parent.mkdir(parents=True)
+    assert [job.again(run) for job in known.values()] == [None] * len(known)
+    last.touch()
+    assert known["train"].again(run) == [f"resume={last}", f"data.source={tmp_path / 'raw'}"]
+    assert known["prepare_data"].again(run) is None
 
 
 def test_a_campaign_replaces_its_own_rows(tmp_path: Path) -> None:

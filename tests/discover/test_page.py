@@ -20,7 +20,7 @@ from nnode.discover.report import sentence
 from nnode.discover.result import DataFault
 from nnode.models import build_model
 from nnode.models.build import add_effects
-from nnode.study.page import Heading, Text
+from nnode.pages.page import Heading, Text
 from tests.discover.conftest import Case
 
 CONFIG = {"data": {"name": "table"}, "model": {"name": "lin_with_speed_zone"}}

@@ -13,6 +13,7 @@ import torch
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import write_store
 from nnode.errors import ConfigError
+from nnode.pages.page import TableBlock, write_page
 from nnode.plots.interaction import evaluate_force, interaction
 from nnode.study import crowd, crowd_forces, printed_crowd
 from nnode.study.crowd_data import ALL, Place, cut, fold_of, parts, time_groups, turned
@@ -20,7 +21,6 @@ from nnode.study.crowd_fit import calibrate, costs, new_system, row_of, system_o
 from nnode.study.crowd_page import verdict
 from nnode.study.crowd_tasks import even_pace
 from nnode.study.options import CrowdStudyOptions
-from nnode.study.page import TableBlock, write_page
 from nnode.study.statistics import Paired
 from tests.study.corridor import corridor, sequence
 

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 import torch
 
-import nnode
+from nnode import progress
 from nnode.app.benchmark_problems import Shape, pose
-from nnode.calibrate import progress
 from nnode.errors import StudyError
 from nnode.solvers import TorchdiffeqSolver
+from nnode.study import runner
 from nnode.study.runner import Task, run_tasks
 from tests.app.conftest import ROOT
 from tests.study import work
@@ -90,7 +90,7 @@ def test_what_was_kept_holds_only_for_the_same_task(tmp_path: Path, monkeypatch)
     assert run(Task("square-2", work.cube, {"x": 5.0, **log})) == {"square-2": 125.0}
     assert run(one, three, fingerprint="other data") == {"square-1": 1.0, "square-3": 9.0}
     assert calls(tmp_path) == ["1", "3"]
-    monkeypatch.setattr(nnode, "__version__", "99")
+    monkeypatch.setattr(runner, "VERSION", "99")
     run(one, fingerprint="other data")
     assert calls(tmp_path) == ["1"]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from nnode.pages.page import Block, TableBlock
 from nnode.study.options import StudyOptions
-from nnode.study.page import Block, TableBlock
 from nnode.study.runner import run_tasks
 from tests.study import work
 

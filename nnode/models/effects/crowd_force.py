@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import InteractionForce, dot
+from nnode.models.crowd import InteractionForce, dot, velocity
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
-from nnode.models.effects.crowd_pairs import Neighbours, company, heading, velocity
+from nnode.models.effects.crowd_pairs import Neighbours, company, heading
 from nnode.models.system import System
 from nnode.models.term import Interval, State
 

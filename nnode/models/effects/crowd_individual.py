@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import Relaxation
+from nnode.models.crowd import Relaxation, velocity
 from nnode.models.effects.base import CATALOGUE, IndividualEffect, Probe, Setting, Strength
-from nnode.models.effects.crowd_pairs import heading, right_of, velocity
+from nnode.models.effects.crowd_pairs import heading, right_of
 from nnode.models.system import System
 from nnode.models.term import Interval, State
 

@@ -6,14 +6,13 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import dot, norm
+from nnode.models.crowd import dot, norm, velocity
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
     PairEffect,
     heading,
     right_of,
-    velocity,
 )
 from nnode.models.system import System
 from nnode.models.term import Interval, State

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import SocialForce, dot, norm
+from nnode.models.crowd import SocialForce, dot, norm, velocity
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.system import System
 from nnode.models.term import Interval, State
@@ -21,17 +21,6 @@ def radius(system: System | None) -> float:
     """m: of a person, that of the base law where it has one."""
     force = None if system is None else system.find(SocialForce)
     return RADIUS if force is None else force.r
-
-
-def velocity(state: State) -> Tensor:
-    """``(B, N, 2)`` m/s.
-
-    Raises:
-        ValueError: the model is of first order.
-    """
-    if state.v is None:
-        raise ValueError("a term of a second-order model needs velocities")
-    return state.v
 
 
 def heading(v: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
 from nnode.models.system import System, Traffic
+from nnode.solvers.rates import Rates
 
 #: Jacobians of one batched call may hold so many numbers.
 _ROOM = 16_000_000
@@ -28,32 +29,20 @@ class _Problem:
     """The right-hand side per step, and what else does not change."""
 
     def __init__(self, system: System, batch: Batch, substeps: int) -> None:
-        self.system, self.scene = system, system.scene(batch)
-        self.dt, self.per = batch.dt / substeps, substeps
+        self.rate, self.per = Rates(system, batch, substeps), substeps
         self.samples = batch.n_samples
         self.steps = substeps * (batch.n_samples - 1)
-        last = batch.valid.any(-1).sum(0) - 1
-        self.end = substeps * last[:, None, None]
-        self.ragged = bool((last < batch.n_samples - 1).any())
-        self.measured = isinstance(system, Traffic) and system.leader == "measured"
-
-    def rate(self, step: Tensor, y: Tensor) -> Tensor:
-        """``(B, N, order * D)``: change of ``y`` in one step."""
-        rate: Tensor = self.dt * self.system(step * self.dt, y, self.scene)
-        # as in the torchdiffeq solver: a sequence that has ended stands still
-        return rate.where(step <= self.end, 0.0) if self.ragged else rate
 
     def rates(self, steps: Tensor, y: Tensor) -> Tensor:
-        """The same for many steps in one call: ``(S,)`` and ``(S, B, N, order * D)``."""
-        if not self.measured:
-            return torch.func.vmap(self.rate)(steps, y)
-        assert isinstance(self.system, Traffic)
-        system = self.system
-        places = torch.stack([self.scene.measured_at(step * self.dt) for step in steps])
+        """The rate of many steps in one call: ``(S,)`` and ``(S, B, N, order * D)``."""
+        rate, system = self.rate, self.rate.system
+        if not (isinstance(system, Traffic) and system.leader == "measured"):
+            return torch.func.vmap(rate)(steps, y)
+        places = torch.stack([rate.scene.measured_at(step * rate.dt) for step in steps])
 
         def one(step: Tensor, y: Tensor, place: Tensor) -> Tensor:
-            rate = self.dt * system.rates_behind(step * self.dt, y, self.scene, place)
-            return rate.where(step <= self.end, 0.0) if self.ragged else rate
+            change = rate.dt * system.rates_behind(step * rate.dt, y, rate.scene, place)
+            return rate.until_the_end(step, change)
 
         return torch.func.vmap(one)(steps, y, places)
 

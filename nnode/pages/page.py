@@ -1,4 +1,4 @@
-"""A study's page: text, tables and figures as one HTML file, as Markdown, and as CSV."""
+"""A page of results: text, tables and figures as one HTML file, as Markdown, and as CSV."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 from nnode.errors import ConfigError
 from nnode.files import write_bytes, write_text
+from nnode.pages import tables
 from nnode.plots.style import save
-from nnode.study import tables
 
 #: Folder of the figures beside the page.
 FIGURES = "figures"
@@ -276,7 +276,7 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
                     }
                 )
     environment = Environment(
-        loader=PackageLoader("nnode.study", "template"),
+        loader=PackageLoader("nnode.pages", "template"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

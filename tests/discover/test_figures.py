@@ -11,16 +11,10 @@ from PIL import Image
 
 from nnode.data.sequence import Sequence
 from nnode.discover.deviation import Deviation
-from nnode.models import build_model
-from nnode.models.build import add_effects
-from nnode.plots import discover_paths
-from nnode.plots.crowd import force_contours
-from nnode.plots.discover_maps import neighbour_maps, plane_maps, time_space_maps
-from nnode.plots.discover_marks import AFTER, BEFORE, sealed_costs
-from nnode.plots.discover_paths import film_strip, moving_picture, pair, rmse, trajectories
-from nnode.plots.settings import six_settings
-from nnode.plots.traffic import speed_curves
-from tests.discover import stand_in  # noqa: F401 - registers an effect of crowds
+from nnode.discover.figures import paths
+from nnode.discover.figures.maps import neighbour_maps, plane_maps, time_space_maps
+from nnode.discover.figures.marks import AFTER, BEFORE, sealed_costs
+from nnode.discover.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
 
 
 def lane_map(scale: float) -> Deviation:
@@ -81,7 +75,7 @@ def test_trajectories_and_moments_of_a_platoon() -> None:
     assert len(trajectories(s, both).axes) == 4
     assert len(trajectories(s, pair(late, None)).axes) == 2
     strip = film_strip(s, both)
-    assert len(strip.axes) == 2 * discover_paths.MOMENTS
+    assert len(strip.axes) == 2 * paths.MOMENTS
     last = strip.axes[-2]
     measured, simulated = (np.asarray(line.get_xdata()) for line in last.lines)
     assert measured - simulated == pytest.approx(0.5 * s.time[-1])
@@ -100,31 +94,5 @@ def test_a_moving_picture_takes_the_time_it_took(monkeypatch) -> None:
         image.seek(k)
         duration += image.info["duration"]
     assert duration == pytest.approx(1000 * s.time[-1], abs=250)
-    monkeypatch.setattr(discover_paths, "BYTES", len(content) - 1)
+    monkeypatch.setattr(paths, "BYTES", len(content) - 1)
     assert moving_picture(s, pair(s.x, s.x)) is None
-
-
-LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0, "L_min": 2.0}
-FORCE = {
-    "name": "sf", "term": "social_force", "A": 1.0, "k": 1.0, "kappa": 1.0, "r": 0.25, "B": 0.1,
-    "mass": 1.0, "walls": True, "wall_spacing": 0.25, "tau": 0.5, "opposing_wall_friction": False,
-}  # fmt: skip
-
-
-def test_a_speed_curve_says_which_effects_it_leaves_out() -> None:
-    plain, extended = build_model(LAW), build_model(LAW)
-    add_effects(extended, [{"name": "relative_speed", "kappa": 0.3}, {"name": "inertia"}])
-    title = speed_curves({"lin": plain}).axes[0].get_title(loc="left")
-    assert "without" not in title
-    title = speed_curves({"plain": plain, "lin+": extended}).axes[0].get_title(loc="left")
-    assert title.endswith("lin+: its law, without its effects relative_speed, inertia")
-    many = {f"m{i}": extended for i in range(3)}
-    assert "3 models have effects" in speed_curves(many).axes[0].get_title(loc="left")
-
-
-def test_force_figures_say_which_effects_they_leave_out() -> None:
-    model = build_model(FORCE)
-    assert "without" not in force_contours(model, 0).get_suptitle()
-    add_effects(model, [{"name": "made_up_wind", "w_x": 0.1}])
-    assert "without its effects made_up_wind" in force_contours(model, 0).get_suptitle()
-    assert "without its effects made_up_wind" in six_settings(model)[0].get_suptitle()

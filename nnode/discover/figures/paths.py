@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from nnode.data.sequence import Sequence
-from nnode.plots.discover_maps import draw_walls
-from nnode.plots.discover_marks import AFTER, BEFORE
+from nnode.discover.figures.maps import draw_walls
+from nnode.discover.figures.marks import AFTER, BEFORE
 from nnode.plots.style import FONT, GREY, SMALL_FONT, dress, new_figure
 
 #: Moments of a film strip.

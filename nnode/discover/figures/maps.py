@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from nnode.discover.deviation import Deviation
@@ -127,9 +128,7 @@ def _coloured(
         dress(ax, x=labels[0], y=labels[1], title=title, grid=False)
         ax.label_outer()
     assert mesh is not None
-    bar = figure.colorbar(mesh, ax=list(axes), extend="both", aspect=30, pad=0.02)
-    bar.set_label("measured − simulated speed (m/s)", fontsize=FONT)
-    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    _bar(figure, mesh, axes, "both", "measured − simulated speed (m/s)")
     return figure
 
 
@@ -179,10 +178,17 @@ def _arrows(
         dress(ax, x=labels[0], y=labels[1], title=f"{name}: {rms:.2g} m/s² rms")
         ax.label_outer()
     assert drawn is not None
-    bar = figure.colorbar(drawn, ax=list(axes), extend="max", aspect=30, pad=0.02)
-    bar.set_label("mean of measured − simulated\nacceleration (m/s²)", fontsize=FONT)
-    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    _bar(figure, drawn, axes, "max", "mean of measured − simulated\nacceleration (m/s²)")
     return figure
+
+
+def _bar(
+    figure: Figure, drawn: ScalarMappable, axes: Iterable[Axes], extend: str, label: str
+) -> None:
+    """The scale of colours beside all panels."""
+    bar = figure.colorbar(drawn, ax=list(axes), extend=extend, aspect=30, pad=0.02)
+    bar.set_label(label, fontsize=FONT)
+    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
 
 
 def _rms(values: np.ndarray) -> float:

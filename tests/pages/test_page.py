@@ -14,8 +14,7 @@ import pandas as pd
 import pytest
 
 from nnode.errors import ConfigError
-from nnode.plots.style import dress, new_figure
-from nnode.study.page import (
+from nnode.pages.page import (
     Block,
     FigureBlock,
     Heading,
@@ -24,7 +23,8 @@ from nnode.study.page import (
     Text,
     write_page,
 )
-from nnode.study.tables import number
+from nnode.pages.tables import number
+from nnode.plots.style import dress, new_figure
 
 #: Elements that have no end.
 VOID = {"meta", "img", "br", "hr", "link", "input"}

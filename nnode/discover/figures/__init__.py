@@ -1,0 +1,1 @@
+"""Figures of a diagnosis: where a model parts from measurement, before and after."""

@@ -1,0 +1,1 @@
+"""Pages of results: text, tables and figures as HTML, Markdown and CSV."""

@@ -1,0 +1,70 @@
+"""A whole diagnosis in memory: what is hidden is named, and what is not is bounded."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nnode.discover.diagnose import diagnose
+from nnode.discover.options import DiscoverOptions
+from nnode.errors import DataError
+from nnode.models import System
+from nnode.models.build import build_model
+from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
+
+OPTIONS = DiscoverOptions(effects=["relative_speed", "speed_zone"], sealed=0.25)
+
+
+def law() -> System:
+    options = {"leader": "measured", "v0": 25.0, "L": 7.0, "L_min": 1.0}
+    return build_model({"term": "lin", "name": "lin", **options})
+
+
+def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes() -> None:
+    given = law()
+    before = {name: value.clone() for name, value in given.state_dict().items()}
+    sequences = platoons(relative_speed(0.4), number=8, driver=0.2)
+    found = diagnose(given, sequences, OPTIONS)
+    d = found.diagnosis
+    assert d.verdict == "named"
+    (effect,) = d.effects
+    assert (effect.name, effect.where) == ("relative_speed", "everybody, everywhere")
+    assert effect.p_value < 0.05
+    assert effect.gain > 0
+    kappa = effect.coefficients["kappa"]
+    assert kappa.value == pytest.approx(0.4, abs=0.05)
+    assert kappa.low < 0.4 < kappa.high
+    assert kappa.unit == "1"
+    assert [one.name for one in d.absences] == ["speed_zone"]
+    # two sequences were sealed, and every one is predicted better
+    assert sorted(d.split["open"] + d.split["sealed"]) == sorted(s.name for s in sequences)
+    assert [one["name"] for one in d.sealed] == d.split["sealed"]
+    assert len(d.split["sealed"]) == 2
+    assert all(one["after"] < one["before"] for one in d.sealed)
+    gap = d.gap
+    assert gap.closed == pytest.approx((gap.before - gap.after) / (gap.before - gap.noise_floor))
+    assert gap.closed > 0.3
+    assert d.notes == []
+    # the model that was given is left alone
+    assert all(torch.equal(before[name], value) for name, value in given.state_dict().items())
+    names = [term.name for term in found.extended.terms if hasattr(term, "name")]
+    assert "relative_speed" in names
+
+
+def test_nothing_is_named_where_the_law_is_right() -> None:
+    found = diagnose(law(), platoons(number=8, driver=0.2), OPTIONS)
+    d = found.diagnosis
+    assert (d.verdict, d.effects, d.unknown) == ("none", [], None)
+    assert {one.name for one in d.absences} == {"relative_speed", "speed_zone"}
+    kappa = next(one for one in d.absences if one.name == "relative_speed")
+    assert kappa.testable
+    assert kappa.bound is not None
+    assert kappa.bound < 0.4
+    assert d.base["v0"]["after"] == pytest.approx(V0, rel=0.05)
+    assert d.base["L"]["after"] == pytest.approx(LENGTH, rel=0.05)
+    assert d.gap.after == d.gap.before
+
+
+def test_two_sequences_are_too_few() -> None:
+    with pytest.raises(DataError, match="at least 3 sequences without a fault, there are 2"):
+        diagnose(law(), platoons(number=2), OPTIONS)

@@ -1,0 +1,91 @@
+"""Words and intervals of a verdict, from curves and scores whose numbers are known."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.discover import judge
+from nnode.discover.result import Coefficient
+from nnode.discover.score import Screen
+from nnode.discover.variables import Curves, Variable
+from nnode.models.effects import CATALOGUE
+
+
+def curves(heights: list[float], errors: list[float], removed: float, name: str = "gap") -> Curves:
+    """A curve of a variable with knots at 0, 10, 20, ..."""
+    knots = tuple(10.0 * k for k in range(len(heights)))
+    variable = Variable(name, "m", lambda s: s.x[..., 0], knots, lambda s: torch.ones_like(s.x))
+    return Curves(
+        variable, np.zeros(1), np.array(heights), np.array(errors), np.zeros(1), cast(Any, None),
+        0.001, np.zeros(1), removed,
+    )  # fmt: skip
+
+
+def test_a_place_is_the_stretch_of_one_sign_around_the_highest_knot() -> None:
+    # knots 1 to 3 stand out upwards, the fifth downwards, and neither the first nor the fourth
+    one = curves([0.1, 2.0, 4.0, 1.0, 0.0, -3.0], [1.0, 0.5, 0.5, 0.25, 1.0, 1.0], removed=0.06)
+    (found,) = judge.places([one], excess=0.24)
+    assert (found.variable, found.unit, found.low, found.high) == ("gap", "m", 10.0, 30.0)
+    # weights 4, 4 and 16
+    assert found.deviation == pytest.approx((4 * 2.0 + 4 * 4.0 + 16 * 1.0) / 24)
+    assert found.error == pytest.approx(24**-0.5)
+    assert found.share == pytest.approx(0.25)
+    # the two-sided tail of 8 standard errors, for six knots that were looked at
+    assert found.p_value == pytest.approx(6 * 1.2441921e-15, rel=1e-6)
+    assert found.curve["deviation"] == [0.1, 2.0, 4.0, 1.0, 0.0, -3.0]
+    assert found.curve["at"] == [0.0, 10.0, 20.0, 30.0, 40.0, 50.0]
+
+
+def test_what_does_not_stand_out_or_explains_nothing_is_no_place() -> None:
+    flat = curves([0.1, -0.2], [1.0, 1.0], removed=0.1)
+    useless = curves([9.0, 0.0], [1.0, 1.0], removed=0.0)
+    assert judge.places([flat, useless], excess=0.2) == []
+    # no place holds more than all there is to explain
+    (whole,) = judge.places([curves([9.0, 0.0], [1.0, 1.0], removed=0.5)], excess=0.2)
+    assert whole.share == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "options", "words"),
+    [
+        ("speed_zone", {"a": (120.0, "m"), "b": (260.5, "m")}, {}, "x in [120, 260.5] m"),
+        ("speed_period", {"a": (5.0, "s"), "b": (60.0, "s")}, {}, "t in [5, 60] s"),
+        ("leader_length", {"beta": (1.0, "1")}, {}, "everybody, everywhere"),
+        ("leader_length", {"beta": (1.0, "1")}, {"kind": "truck"}, "vehicles of class truck"),
+        (
+            "leader_length",
+            {"x_o": (1.25, "m"), "y_o": (-0.5, "m")},
+            {},
+            "around (1.25, -0.50) m",
+        ),
+    ],
+)
+def test_where_an_effect_acts_in_words(
+    name: str, found: dict[str, tuple[float, str]], options: dict[str, Any], words: str
+) -> None:
+    coefficients = {key: Coefficient(v, v, v, unit) for key, (v, unit) in found.items()}
+    assert judge._where(CATALOGUE.effects[name], coefficients, options) == words
+
+
+def test_scores_are_on_the_scale_of_a_standard_normal_variable() -> None:
+    rng = np.random.default_rng(3)
+    sizes = rng.uniform(0.5, 2.0, (25, 1)) * np.ones((1, 20_000))
+    parts = 3.0 * np.sqrt(sizes) * rng.standard_normal(sizes.shape)
+    signs = np.ones((1, 25))
+
+    def standardised(factor: float) -> np.ndarray:
+        found = Screen._standardised(
+            cast(Any, None), factor * parts, factor**2 * sizes, signs, usual=9.0
+        )
+        return np.asarray(found[0])
+
+    found = standardised(1.0)
+    # two parts in a hundred: the error of 20,000 draws and the approximation's own
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(1.0, abs=0.02)
+    assert np.mean(found > 1.96) == pytest.approx(0.05, abs=0.006)
+    # as little as the unit of the effect's coefficient matters
+    assert standardised(10.0) == pytest.approx(found)

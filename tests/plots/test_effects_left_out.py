@@ -1,0 +1,35 @@
+"""Figures of extended models say which effects they do not show."""
+
+from __future__ import annotations
+
+from nnode.models import build_model
+from nnode.models.build import add_effects
+from nnode.plots.crowd import force_contours
+from nnode.plots.settings import six_settings
+from nnode.plots.traffic import speed_curves
+from tests.discover import stand_in  # noqa: F401 - registers an effect of crowds
+
+LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0, "L_min": 2.0}
+FORCE = {
+    "name": "sf", "term": "social_force", "A": 1.0, "k": 1.0, "kappa": 1.0, "r": 0.25, "B": 0.1,
+    "mass": 1.0, "walls": True, "wall_spacing": 0.25, "tau": 0.5, "opposing_wall_friction": False,
+}  # fmt: skip
+
+
+def test_a_speed_curve_says_which_effects_it_leaves_out() -> None:
+    plain, extended = build_model(LAW), build_model(LAW)
+    add_effects(extended, [{"name": "relative_speed", "kappa": 0.3}, {"name": "inertia"}])
+    title = speed_curves({"lin": plain}).axes[0].get_title(loc="left")
+    assert "without" not in title
+    title = speed_curves({"plain": plain, "lin+": extended}).axes[0].get_title(loc="left")
+    assert title.endswith("lin+: its law, without its effects relative_speed, inertia")
+    many = {f"m{i}": extended for i in range(3)}
+    assert "3 models have effects" in speed_curves(many).axes[0].get_title(loc="left")
+
+
+def test_force_figures_say_which_effects_they_leave_out() -> None:
+    model = build_model(FORCE)
+    assert "without" not in force_contours(model, 0).get_suptitle()
+    add_effects(model, [{"name": "made_up_wind", "w_x": 0.1}])
+    assert "without its effects made_up_wind" in force_contours(model, 0).get_suptitle()
+    assert "without its effects made_up_wind" in six_settings(model)[0].get_suptitle()

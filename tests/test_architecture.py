@@ -1,0 +1,73 @@
+"""The packages' line is kept: imports go one way, files stay short."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MOST_LINES = 400
+
+LINT = "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
+
+
+def lint(root: Path) -> subprocess.CompletedProcess[str]:
+    """Hold the package in a folder against the contracts of its ``pyproject.toml``."""
+    # in a process of its own: the package to look at is the one that Python would import
+    return subprocess.run(
+        [sys.executable, "-c", LINT], cwd=root, capture_output=True, text=True, check=False
+    )
+
+
+def test_imports_go_one_way() -> None:
+    done = lint(ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def with_line(file: str, line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The same for a copy of the package with another line at the end of a file."""
+    shutil.copytree(ROOT / "nnode", folder / "nnode", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    with (folder / "nnode" / file).open("a", encoding="utf-8") as source:
+        source.write(f"\n{line}\n")
+    return lint(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "lower", "upper"),
+    [
+        ("data/store.py", "import nnode.models.term", "data", "models"),
+        ("models/term.py", "def late():\n    import nnode.solvers", "models", "solvers"),
+        ("plots/style.py", "if TYPE_CHECKING:\n    import nnode.discover.fit", "plots", "discover"),
+        ("solvers/base.py", "from nnode import load", "solvers", "app"),
+        ("errors.py", "import nnode.files", "errors", "files"),
+        ("groundtruth/case.py", "import nnode.discover", "groundtruth", "discover"),
+        ("groundtruth/case.py", "import nnode.models", "groundtruth", "models"),
+        ("discover/fit.py", "import nnode.groundtruth", "discover", "groundtruth"),
+    ],
+)
+def test_a_wrong_import_is_found(
+    file: str, line: str, lower: str, upper: str, tmp_path: Path
+) -> None:
+    done = with_line(file, line, tmp_path)
+    assert done.returncode == 1
+    assert f"nnode.{lower} is not allowed to import nnode.{upper}" in done.stdout
+
+
+def test_a_package_without_a_place_is_found(tmp_path: Path) -> None:
+    done = with_line("homeless.py", "", tmp_path)
+    assert done.returncode == 1
+    assert "nnode.homeless" in done.stdout
+
+
+def test_files_stay_short() -> None:
+    lines = {
+        str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines())
+        for file in (ROOT / "nnode").rglob("*.py")
+    }
+    assert lines
+    assert {file: number for file, number in lines.items() if number > MOST_LINES} == {}
