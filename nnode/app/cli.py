@@ -92,11 +92,19 @@ def _arguments(
     check_launcher(given)
     free = check_overrides(given, folder, name, sweep=line.sweeps or asked, extra=line.folder)
     if asked:
-        print(help_text(given, folder, name, line.folder))
+        _show(help_text(given, folder, name, line.folder))
         sys.exit()
     # what goes into a mapping that takes any name is added, not only replaced
     sys.argv[1:] = [f"++{a}" if a in free else a for a in sys.argv[1:]]
     return read_command_line(sys.argv[1:]).overrides
+
+
+def _show(text: str) -> None:
+    """Print a long text; a reader that has seen enough, such as head, is no error."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _end(error: NNodeError) -> NoReturn:

@@ -17,7 +17,7 @@ from nnode.app.cli import check_overrides
 from nnode.app.flags import read_command_line
 from nnode.app.help import examples, help_text, remarks, script_words
 from nnode.config import SCHEMAS, register
-from tests.app.conftest import ROOT
+from tests.app.conftest import ROOT, environment
 
 CONF = ROOT / "conf"
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
@@ -111,3 +111,15 @@ def test_a_script_prints_its_help() -> None:
     assert done.stdout.startswith("Find what a model lacks: ")
     assert "  model.kappa=null " in done.stdout
     assert done.stderr == ""
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "evaluate.py"), "--help"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
