@@ -60,21 +60,28 @@ class Fit:
     def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:
         """``(K, 2)`` confidence intervals that allow for any dependence within a sequence.
 
-        The covariance is the sandwich of sums over sequences, with Student's quantile; NaN for
-        parameters at a bound and where there are fewer than three sequences.
+        By the jackknife: how the parameters move when each sequence is left out, in one step of
+        Gauss and Newton, with Student's quantile. NaN for parameters at a bound and where there
+        are fewer than three sequences.
 
-        Source: Liang & Zeger 1986; Cameron & Miller 2015, Journal of Human Resources 50.
+        Source: MacKinnon, Nielsen & Webb 2023, Journal of Econometrics 232 (CV3).
         """
         found = np.full((len(self.row), 2), np.nan)
         number = len(np.unique(sequence))
         columns = self.tangents
         if number < 3 or not columns.shape[1]:
             return found
-        inverse = np.linalg.pinv(columns.T @ columns)
-        scores = sums(columns * self.residual[:, None], sequence)
-        factor = number / (number - 1)
-        cov = factor * inverse @ (scores.T @ scores) @ inverse
-        half = stats.t.ppf(0.5 + level / 2, number - 1) * np.sqrt(np.maximum(np.diag(cov), 0))
+        scale = np.sqrt((columns**2).sum(0))
+        columns = columns / scale
+        whole = columns.T @ columns
+        moved = np.zeros((number, columns.shape[1]))
+        for k, label in enumerate(np.unique(sequence)):
+            own = columns[sequence == label]
+            rest = whole - own.T @ own
+            # what one sequence alone tells of is not known at all without it
+            moved[k] = np.linalg.pinv(rest, rcond=1e-9) @ (own.T @ self.residual[sequence == label])
+        spread = (number - 1) / number * (moved**2).sum(0) / scale**2
+        half = stats.t.ppf(0.5 + level / 2, number - 1) * np.sqrt(spread)
         found[self.free] = self.row[self.free, None] + half[:, None] * np.array([-1.0, 1.0])
         return found
 

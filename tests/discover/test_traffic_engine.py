@@ -197,10 +197,14 @@ def test_drivers_who_differ_are_recognised() -> None:
 
 @pytest.mark.parametrize("what", ["the hour", "the place in the platoon"])
 def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
-    rng = np.random.default_rng(6)
-    common = rng.normal(0, 0.1, (12, 1) if what == "the hour" else (1, 4))
-    *_, p_value = who_differs(paced(np.broadcast_to(common, (12, 4))))
-    assert p_value > 0.05
+    alarms = 0
+    for seed in range(6, 12):
+        rng = np.random.default_rng(seed)
+        common = rng.normal(0, 0.1, (12, 1) if what == "the hour" else (1, 4))
+        *_, p_value = who_differs(paced(np.broadcast_to(common, (12, 4))))
+        alarms += p_value <= 0.05
+    # one of twenty is expected; two of six would be a chance of 3 %
+    assert alarms <= 1
 
 
 # -- statistics ------------------------------------------------------------------------------
