@@ -150,7 +150,10 @@ def test_runs_of_a_sweep_in_other_processes(
     assert "sweep.csv" in done.stdout
 
 
-def test_failures_of_an_earlier_sweep_in_the_same_folder_do_not_count(tmp_path: Path) -> None:
+def test_failures_of_an_earlier_sweep_in_the_same_folder_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep, "_sweep", {})  # commands that later tests fork inherit this process
     config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
     for job in ("0", "1"):
         sweep.record_failure(tmp_path / job, "of an earlier sweep")

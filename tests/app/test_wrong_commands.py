@@ -191,8 +191,8 @@ def test_a_file_that_may_not_be_read(run: Run, tmp_path: Path) -> None:
 
 def test_what_is_shown_in_place_of_working(run: Run) -> None:
     status, said = run("train --cfg job model=n4 -p model")
-    assert status == 0
+    assert status == 0, said
     assert "hidden: 4" in said
     status, said = run("train --version")
-    assert status == 0
+    assert status == 0, said
     assert re.fullmatch(r"nnode \d+\.\d+\.\d+\n", said)
