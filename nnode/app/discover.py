@@ -14,7 +14,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.given import Table, model_options, table_file
+from nnode.app.given import Table, model_options, table_options
 from nnode.app.saved import plain_config
 from nnode.app.train import brief, set_threads
 from nnode.app.typed import changes, group_defaults, shell_override
@@ -22,7 +22,7 @@ from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
-from nnode.data.options import DataOptions, Faults, TableOptions
+from nnode.data.options import DataOptions, Faults
 from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
@@ -140,10 +140,7 @@ def diagnose_table(
     groups = {"model": str(own["name"]), "data": "table"}
     with TemporaryDirectory(prefix="nnode-") as scratch:
         place = Path(scratch) if folder is None else Path(folder)
-        table = TableOptions(
-            domain=domain, path=str(table_file(data, place)), name="table", faults=Faults.drop,
-            walls=None if walls is None else str(Path(walls).absolute()),
-        )  # fmt: skip
+        table = table_options(data, domain, walls, place)
         job = _job(own, table, _plain(table), groups, chosen, place)
         found = _diagnose(job)
         if folder is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 from omegaconf import OmegaConf
 
+from nnode.data.options import TableOptions
 from nnode.errors import ConfigError
 
 #: Models by the names that ``conf/model`` gives them.
@@ -67,11 +68,16 @@ def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
     return {"name": model, **MODELS[model]}
 
 
-def table_file(data: Table, folder: Path) -> Path:
-    """A table as a file, in ``folder`` where it is none yet."""
-    if not isinstance(data, pd.DataFrame):
-        return Path(data).absolute()
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "table.parquet"
-    data.to_parquet(path, index=False)
-    return path.absolute()
+def table_options(data: Table, domain: str, walls: str | Path | None, folder: Path) -> TableOptions:
+    """A table as a data set; one that is no file yet becomes one in ``folder``."""
+    if isinstance(data, pd.DataFrame):
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "table.parquet"
+        data.to_parquet(path, index=False)
+    else:
+        path = Path(data)
+    return TableOptions(
+        domain=domain,
+        path=str(path.absolute()),
+        walls=None if walls is None else str(Path(walls).absolute()),
+    )

@@ -16,13 +16,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from nnode.app.given import Table, model_options, named, table_file
+from nnode.app.given import Table, model_options, table_options
 from nnode.app.sweep import RESULT
 from nnode.app.train import train
 from nnode.calibrate.checkpoint import load
 from nnode.calibrate.optimizers import LbfgsOptions
 from nnode.calibrate.options import FusedOptions, TrainerOptions
-from nnode.data.options import TableOptions
 from nnode.models import System
 from nnode.plots import force_figure
 
@@ -98,15 +97,12 @@ def fit(
     """
     place = Path(mkdtemp(prefix="nnode-fit-")) if folder is None else Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    options = TableOptions(
-        domain=domain,
-        path=str(table_file(data, place)),
-        walls=None if walls is None else str(Path(walls).absolute()),
-    )
+    own = model_options(model, leader)
+    options = table_options(data, domain, walls, place)
     options.split.heldout = heldout
     config = OmegaConf.create(
         {
-            "model": model_options(named(model), leader),
+            "model": own,
             "data": OmegaConf.structured(options),
             "solver": OmegaConf.structured(FusedOptions()),
             "optimizer": OmegaConf.structured(LbfgsOptions()),
@@ -114,7 +110,7 @@ def fit(
             "seed": seed,
             "resume": None,
             "groups": {
-                "model": str(named(model)["name"]),
+                "model": str(own["name"]),
                 "data": "table",
                 "solver": "fused",
                 "optimizer": "lbfgs",

@@ -17,25 +17,13 @@ ALONE = 0.02
 def heldout(fit: Fit, sequence: np.ndarray) -> np.ndarray:
     """``(S,)`` cost of each sequence under the parameters that the other sequences give.
 
-    One Gauss and Newton step from the full fit leads to the parameters without a sequence.
+    See :meth:`Fit.left_out`.
     """
-    columns, number = fit.tangents, int(sequence.max()) + 1
-    if not columns.shape[1]:
-        return sums(fit.residual**2, sequence)
-    # orthonormal columns: what the others know of a direction is then a share of what all know
-    columns = columns / np.sqrt((columns**2).sum(0))
-    left, size, _ = np.linalg.svd(columns, full_matrices=False)
-    columns = left[:, size > 1e-4 * size[0]]
-    found = np.zeros(number)
-    for s in range(number):
-        own = sequence == s
-        part, residual = columns[own], fit.residual[own]
-        known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
-        # at the minimum the gradient of the others is minus that of this sequence
-        step = vector.T @ (part.T @ residual) / np.maximum(known, ALONE)
-        residual = residual + part @ vector @ np.where(known > ALONE, step, 0.0)
-        found[s] = residual @ residual
-    return found
+    columns, residual = fit.tangents, fit.residual
+    if columns.shape[1]:
+        moved = fit.left_out(sequence, ALONE)
+        residual = residual + (columns * moved[sequence]).sum(1)
+    return sums(residual**2, sequence)
 
 
 @dataclass(frozen=True)

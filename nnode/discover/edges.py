@@ -12,6 +12,7 @@ from scipy import stats
 from nnode.discover.engine import Engine, fill
 from nnode.discover.fit import Fit, refine
 from nnode.models.effects import Effect
+from nnode.models.extend import place_of
 
 #: Places on either side of an edge, the nearest at this share of the whole extent.
 PLACES, NEAREST = 16, 5e-4
@@ -75,7 +76,7 @@ class Profile:
 
 def profiles(engine: Engine, fit: Fit, name: str) -> dict[str, Profile]:
     """The profile of both edges of a named effect."""
-    place = _place(fit, name)
+    place = place_of(fit.system, name)
     effect = fit.system.terms[place]
     assert isinstance(effect, Effect)
     cells = effect.probes(engine.batch, fit.system)
@@ -161,24 +162,12 @@ def _rises(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
 def _unit(engine: Engine, fit: Fit, name: str) -> float:
     """What a unit of the likelihood ratio is in this cost: the variance of the residuals, and how
     much wider than by independent residuals the strengths' intervals are."""
-    place = _place(fit, name)
-    variance = fit.cost / max(len(fit.residual) - int(fit.free.sum()), 1)
-    columns, names = fit.tangents, [n for n, f in zip(fit.names, fit.free, strict=True) if f]
-    plain = variance * np.diag(np.linalg.pinv(columns.T @ columns))
-    wide = fit.intervals(engine.sequence)
-    number = len(np.unique(engine.sequence))
-    quantile = float(stats.t.ppf(0.975, max(number - 1, 1)))
-    ratios = [
-        ((wide[k, 1] - wide[k, 0]) / 2 / quantile) ** 2 / plain[names.index(full)]
-        for k, full in enumerate(fit.names)
-        if full in names and full.startswith(f"terms.{place}.")
-        and full.rsplit(".", 1)[1] not in ("a", "b")
-    ]  # fmt: skip
-    known = [ratio for ratio in ratios if np.isfinite(ratio)]
-    return variance * max([1.0, *known])
-
-
-def _place(fit: Fit, name: str) -> int:
-    """Of a named effect among the terms."""
-    terms = enumerate(fit.system.terms)
-    return next(i for i, t in terms if isinstance(t, Effect) and t.name == name)
+    place, columns = place_of(fit.system, name), fit.tangents
+    variance = fit.cost / max(len(fit.residual) - columns.shape[1], 1)
+    plain = np.full(len(fit.row), np.nan)
+    plain[fit.free] = variance * np.diag(np.linalg.pinv(columns.T @ columns))
+    ratios = fit.errors(engine.sequence) ** 2 / plain
+    effect = fit.system.terms[place]
+    assert isinstance(effect, Effect)
+    own = [ratios[fit.names.index(f"terms.{place}.{strength}")] for strength in effect.strengths]
+    return variance * max([1.0, *(float(ratio) for ratio in own if np.isfinite(ratio))])

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 #: Dampings that are tried side by side, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
 
+#: Singular values of scaled tangents below this share of the largest one say nothing.
+COLLINEAR = 1e-4
+#: A share of the knowledge of a parameter that is none, but for rounding.
+UNKNOWN = 1e-9
+
 #: Tolerance of calibrations whose result is compared, not kept.
 ROUGH = 1e-3
 
@@ -57,33 +62,48 @@ class Fit:
         """``(n, F)`` derivatives with respect to the parameters that are free."""
         return self.jacobian[:, self.free]
 
-    def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:
-        """``(K, 2)`` confidence intervals that allow for any dependence within a sequence.
+    def left_out(self, sequence: np.ndarray, least: float) -> np.ndarray:
+        """``(S, F)`` how the free parameters move when each sequence is left out of the fit.
 
-        By the jackknife: how the parameters move when each sequence is left out, in one step of
-        Gauss and Newton, with Student's quantile. NaN for parameters at a bound and where there
-        are fewer than three sequences.
+        One Gauss and Newton step from the full fit. A direction of the parameters stays where the
+        other sequences know less than the share ``least`` of what all know of it.
+        """
+        columns = self.tangents
+        scale = np.sqrt((columns**2).sum(0))
+        # an orthonormal basis: what the others know of a direction is then a share of the whole
+        basis, size, turn = np.linalg.svd(columns / scale, full_matrices=False)
+        kept = size > COLLINEAR * size[0]
+        basis, back = basis[:, kept], (turn[kept] / size[kept, None] / scale).T
+        found = np.zeros((int(sequence.max()) + 1, len(scale)))
+        for s in range(len(found)):
+            own = sequence == s
+            part, residual = basis[own], self.residual[own]
+            known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
+            # at the minimum the gradient of the others is minus that of this sequence
+            step = vector.T @ (part.T @ residual) / np.maximum(known, least)
+            found[s] = back @ (vector @ np.where(known > least, step, 0.0))
+        return found
+
+    def errors(self, sequence: np.ndarray) -> np.ndarray:
+        """``(K,)`` standard errors that allow for any dependence within a sequence.
+
+        By the jackknife over sequences. NaN for parameters at a bound and where there are fewer
+        than three sequences.
 
         Source: MacKinnon, Nielsen & Webb 2023, Journal of Econometrics 232 (CV3).
         """
-        found = np.full((len(self.row), 2), np.nan)
+        found = np.full(len(self.row), np.nan)
         number = len(np.unique(sequence))
-        columns = self.tangents
-        if number < 3 or not columns.shape[1]:
-            return found
-        scale = np.sqrt((columns**2).sum(0))
-        columns = columns / scale
-        whole = columns.T @ columns
-        moved = np.zeros((number, columns.shape[1]))
-        for k, label in enumerate(np.unique(sequence)):
-            own = columns[sequence == label]
-            rest = whole - own.T @ own
-            # what one sequence alone tells of is not known at all without it
-            moved[k] = np.linalg.pinv(rest, rcond=1e-9) @ (own.T @ self.residual[sequence == label])
-        spread = (number - 1) / number * (moved**2).sum(0) / scale**2
-        half = stats.t.ppf(0.5 + level / 2, number - 1) * np.sqrt(spread)
-        found[self.free] = self.row[self.free, None] + half[:, None] * np.array([-1.0, 1.0])
+        if number >= 3 and self.free.any():
+            moved = self.left_out(sequence, UNKNOWN)
+            found[self.free] = np.sqrt((number - 1) / number * (moved**2).sum(0))
         return found
+
+    def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:
+        """``(K, 2)`` confidence intervals: :meth:`errors` with Student's quantile."""
+        number = len(np.unique(sequence))
+        half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(sequence)
+        return np.stack([self.row - half, self.row + half], 1)
 
 
 def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:

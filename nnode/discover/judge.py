@@ -24,6 +24,7 @@ from nnode.discover.search import Search, Step
 from nnode.discover.symbolic import symbolic
 from nnode.discover.variables import Curves, normal_tail
 from nnode.models.effects import Effect
+from nnode.models.extend import place_of
 
 #: Normal quantiles: of an interval of 95 %, and of a power of 80 %.
 WIDE, POWER = 1.96, 0.84
@@ -57,11 +58,8 @@ def named(engine: Engine, search: Search, step: Step) -> NamedEffect:
 
 def _coefficients(engine: Engine, fit: Fit, step: Step) -> dict[str, Coefficient]:
     effect = step.chosen.score.effect
-    place, own = next(
-        (i, t)
-        for i, t in enumerate(fit.system.terms)
-        if isinstance(t, Effect) and t.name == effect.name
-    )
+    place = place_of(fit.system, effect.name)
+    own = fit.system.terms[place]
     intervals = fit.intervals(engine.sequence)
     edges = edge_intervals(engine, fit, effect.name) if effect.consecutive else {}
     found = {}

@@ -18,7 +18,7 @@ from nnode.discover.score import Score, Screen, Trace, traces
 from nnode.discover.variables import Variable, curves
 from nnode.errors import SimulationError
 from nnode.models.effects import Effect, IndividualEffect
-from nnode.models.extend import effects_of, extended, without
+from nnode.models.extend import effects_of, extended, place_of, without
 from nnode.models.system import System
 
 log = logging.getLogger(__name__)
@@ -77,7 +77,7 @@ class Candidate:
         """Whether an interval has kept its ends in their order."""
         if not self.score.effect.consecutive:
             return True
-        own = next(e for e in effects_of(self.fit.system) if e.name == self.name)
+        own = self.fit.system.terms[place_of(self.fit.system, self.name)]
         first, last = (float(own.get_parameter(name).detach()) for name in ("a", "b"))
         return first < last
 
@@ -86,9 +86,7 @@ class Candidate:
         if self.individuals is not None and self.individuals.interval[0] <= 0:
             return False
         intervals = self.fit.intervals(sequence)
-        place = next(
-            i for i, t in enumerate(self.fit.system.terms) if getattr(t, "name", "") == self.name
-        )
+        place = place_of(self.fit.system, self.name)
         known = [
             (strength.neutral, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
             for name, strength in self.score.effect.strengths.items()

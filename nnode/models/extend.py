@@ -26,10 +26,19 @@ def extended(system: System, effect: Effect) -> tuple[System, int]:
 def without(system: System, name: str) -> System:
     """A copy of a model without the effect of a name."""
     found = copy.deepcopy(system)
-    for i, term in enumerate(found.terms):
+    del found.terms[place_of(found, name)]
+    return found
+
+
+def place_of(system: System, name: str) -> int:
+    """Of the effect of a name among the model's terms.
+
+    Raises:
+        ValueError: the model has no such effect.
+    """
+    for i, term in enumerate(system.terms):
         if isinstance(term, Effect) and term.name == name:
-            del found.terms[i]
-            return found
+            return i
     raise ValueError(f"the model has no effect {name}")
 
 
