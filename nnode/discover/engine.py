@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from nnode.data.sequence import Batch
+from nnode.discover.recorded import recorded
 from nnode.models.effects import Effect, Probe
 from nnode.models.scene import Scene
 from nnode.models.system import System
@@ -19,6 +20,9 @@ from nnode.models.term import State
 
 if TYPE_CHECKING:
     from nnode.discover.variables import Variable
+
+
+Rate = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass
@@ -184,10 +188,22 @@ class Ensemble:
         """Time derivative of the states ``(R, B, N, ...)`` at time ``t`` (s)."""
         return self._rate(self._parameters, t, y)
 
-    def runge_kutta(self, t: Tensor, y: Tensor, h: float, k1: Tensor) -> Tensor:
-        """The states after a step of ``h`` s by the classical method of fourth order, from
-        those and their rates ``k1`` before."""
-        k2 = self.rate(t + h / 2, y + h / 2 * k1)
-        k3 = self.rate(t + h / 2, y + h / 2 * k2)
-        k4 = self.rate(t + h, y + h * k3)
-        return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    def recorded_rate(self, t: Tensor, y: Tensor) -> Rate:
+        """:meth:`rate` for many calls with states like ``y``."""
+        names, values = list(self._parameters), list(self._parameters.values())
+
+        def rate(t: Tensor, y: Tensor, *values: Tensor) -> Tensor:
+            found: Tensor = self._rate(dict(zip(names, values, strict=True)), t, y)
+            return found
+
+        graph = recorded(rate, [t, y, *values])
+        return lambda t, y: graph(t, y, *values)
+
+
+def runge_kutta(rate: Rate, t: Tensor, y: Tensor, h: float, k1: Tensor) -> Tensor:
+    """The states after a step of ``h`` s by the classical method of fourth order, from those
+    and their rates ``k1`` before."""
+    k2 = rate(t + h / 2, y + h / 2 * k1)
+    k3 = rate(t + h / 2, y + h / 2 * k2)
+    k4 = rate(t + h, y + h * k3)
+    return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

@@ -32,13 +32,13 @@ class Response:
         self.time = batch.dt * torch.arange(len(states), dtype=torch.float64)
         k, b, n, w = states.shape
         rates = self._rates_of(system)
-        columns = []
-        for i in range(n * w):
-            along = torch.zeros(n * w, dtype=torch.float64)
-            along[i] = 1.0
-            change = along.reshape(n, w).expand(k, b, n, w)
-            columns.append(jvp(rates, (states,), (change,))[1].reshape(k, b, n * w))
-        matrix = torch.stack(columns, -1)
+        ways = torch.eye(n * w, dtype=torch.float64).reshape(n * w, 1, 1, n, w)
+
+        def along(way: Tensor) -> Tensor:
+            found: Tensor = jvp(rates, (states,), (way.expand(states.shape),))[1]
+            return found
+
+        matrix = vmap(along)(ways).reshape(n * w, k, b, n * w).permute(1, 2, 3, 0)
         half, one = batch.dt / 2, torch.eye(n * w, dtype=torch.float64)
         self._factors = torch.linalg.lu_factor(one - half * matrix[1:])
         self._before = one + half * matrix[:-1]

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.engine import Ensemble, Squares, fill, names_of, row_of
+from nnode.discover.engine import Ensemble, Squares, fill, names_of, row_of, runge_kutta
 from nnode.discover.fit import limits
 from nnode.discover.response import Response
 from nnode.discover.smooth import noise_variance, smooth, velocity
@@ -104,16 +104,17 @@ class TrafficEngine:
         steps = max(1, math.ceil(batch.dt / longest - 1e-9))
         h = batch.dt * stride / steps
         y = runs.start(batch)
-        rate, found = runs.rate(_time(0.0), y), [y]
+        rate = runs.recorded_rate(_time(0.0), y)
+        slope, found = rate(_time(0.0), y), [y]
         number = math.ceil((batch.n_samples - 1) / stride) * steps
         for step in range(number):
             t = step * h
-            after = runs.runge_kutta(_time(t), y, h, rate)
-            slope = runs.rate(_time(t + h), after)
-            found += _between(y, rate, after, slope, h, stride)
+            after = runge_kutta(rate, _time(t), y, h, slope)
+            then = rate(_time(t + h), after)
+            found += _between(y, slope, after, then, h, stride)
             if (step + 1) % steps == 0:
                 found.append(after)
-            y, rate = after, slope
+            y, slope = after, then
         return torch.stack(found[: batch.n_samples], 1)
 
     def deviations(self, system: System, rows: Tensor) -> Tensor:

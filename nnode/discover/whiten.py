@@ -60,12 +60,17 @@ class PlatoonFilter:
 
     def __call__(self, residual: Tensor) -> Tensor:
         """``(..., K, B, N)`` whitened residuals of ``(..., K, B, N)``."""
-        columns = _lagged(residual, len(self.own))
-        rest = residual.clone()
-        for weight, column in zip([*self.own, *self.ahead], columns, strict=True):
-            if weight:
-                rest -= float(weight) * column
-        return rest / self.scale
+        rest, k = residual / self.scale, residual.shape[-3]
+        for late, weight in enumerate([0.0, *self.own]):
+            if weight and late < k:
+                share = -float(weight) / self.scale
+                rest[..., late:, :, :].add_(residual[..., : k - late, :, :], alpha=share)
+        for late, weight in enumerate(self.ahead):
+            if weight and late < k:
+                share = -float(weight) / self.scale
+                own = rest[..., late:, :, :-1]
+                own.add_(residual[..., : k - late, :, 1:], alpha=share)
+        return rest
 
 
 def _lagged(e: Tensor, order: int) -> list[Tensor]:
