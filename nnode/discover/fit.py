@@ -26,8 +26,9 @@ COLLINEAR = 1e-4
 #: A share of the knowledge of a parameter that is none, but for rounding.
 UNKNOWN = 1e-9
 
-#: Tolerance of calibrations whose result is compared, not kept.
-ROUGH = 1e-3
+#: Tolerance of calibrations whose result is compared with others that are far off, and with
+#: others that are near.
+ROUGH, FINE = 1e-3, 1e-6
 
 
 @dataclass

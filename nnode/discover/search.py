@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.edges import moved
 from nnode.discover.engine import Engine, row_of, square_of
-from nnode.discover.fit import ROUGH, Fit, evaluated, refine, sums
+from nnode.discover.fit import FINE, ROUGH, Fit, evaluated, refine, sums
 from nnode.discover.individual import Individuals, individuals, sharpened
 from nnode.discover.score import Score, Screen, Trace, traces
 from nnode.discover.variables import Variable, curves
@@ -30,6 +30,9 @@ FLOOR = 0.02
 EXACT = 1e-6
 #: Effects whose trace explains this share of what the best one explains are calibrated too.
 RIVAL = 0.25
+#: Of two effects whose held-out gains differ by less than this share, the simpler one is chosen,
+#: or the likelier one.
+NEAR = 0.97
 #: At most so many effects are calibrated in a round.
 RIVALS = 5
 #: A rival whose held-out gain is below this share of the best one's is told apart from it.
@@ -238,6 +241,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         removed = (square - square_of(engine, fit.system)) / found.square
         candidates.append(Candidate(score, fit, losses, compare(before, losses), removed, one))
     candidates.sort(key=lambda c: -c.gain.gain)
+    candidates = _sharpened(engine, candidates, before)
     passing = [
         c for c in candidates
         if c.score.p_value <= alpha
@@ -259,6 +263,19 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals)
+
+
+def _sharpened(engine: Engine, candidates: list[Candidate], before: np.ndarray) -> list[Candidate]:
+    """Candidates in their order, those near the best calibrated to the end: kin differ by less
+    than a rough calibration leaves."""
+    found = []
+    for one in candidates:
+        if one.individuals is None and one.gain.gain >= CLOSE * candidates[0].gain.gain > 0:
+            fit = refine(engine, one.fit.system, tolerance=FINE)
+            losses = heldout(fit, engine.sequence)
+            one = replace(one, fit=fit, losses=losses, gain=compare(before, losses))
+        found.append(one)
+    return sorted(found, key=lambda c: -c.gain.gain)
 
 
 def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
@@ -343,12 +360,16 @@ def _peopled(engine: Engine, system: System, one: Individuals) -> tuple[System, 
 
 
 def _simplest(candidates: list[Candidate]) -> Candidate:
-    """The best candidate, or one with fewer parameters that is as good."""
+    """The best candidate, or one that is as good and has fewer parameters, or as many and a
+    greater likelihood."""
     best = candidates[0]
     for other in candidates[1:]:
-        fewer = len(other.fit.row) < len(best.fit.row)
-        near = other.gain.gain >= 0.97 * best.gain.gain
-        if fewer and near and compare(other.losses, best.losses).p_value > APART:
+        number = len(other.fit.row), len(best.fit.row)
+        likelier = number[0] == number[1] and other.fit.cost < best.fit.cost
+        plain = other.individuals is None and best.individuals is None
+        preferred = number[0] < number[1] or (likelier and plain)
+        near = other.gain.gain >= NEAR * best.gain.gain
+        if preferred and near and compare(other.losses, best.losses).p_value > APART:
             best = other
     return best
 
