@@ -46,6 +46,9 @@ SHIFTS = 3
 #: An effect must predict sequences that a calibration left out better, at this error probability.
 #: False alarms are held by its score; an effect that acts in few sequences helps few of them.
 BETTER = 0.05
+#: Further effects are held to this share of the error probability: a model that has one more
+#: effect is nearer to the data, but what is left of them is not all chance.
+LATER = 0.5
 #: Two rivals are told apart at this error probability; two of a kin at a smaller one.
 APART, KIN_APART = 0.05, 0.01
 
@@ -181,7 +184,7 @@ def search(
         found.scores = found.screen.scores(look.traces, look.individuals)
         if len(found.steps) >= most:
             break
-        step = _round(engine, found, look, alpha)
+        step = _round(engine, found, look, alpha if not found.steps else LATER * alpha)
         if step is None or _outdone(engine, found.fit, step.chosen, variables or []):
             break
         found.steps.append(step)

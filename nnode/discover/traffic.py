@@ -325,10 +325,11 @@ def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:
     """Windows, and of each the number of samples after its start that are not compared.
 
     What is compared are pieces of equal length that share their boundary sample; each is
-    preceded by the time in which a start is forgotten.
+    preceded by the time in which a start is forgotten. Whole sequences are compared from their
+    start on.
     """
     intervals = sequence.n_samples - 1
-    if intervals < 1:
+    if intervals < 1 or not math.isfinite(length):
         return [(sequence, 0)]
     forget = int(min(FORGET, SHARE * intervals * sequence.dt) / sequence.dt + 1e-9)
     number = max(1, round((intervals - forget) * sequence.dt / length))

@@ -14,7 +14,7 @@ from nnode.discover.individual import Individuals, individuals, sharpened
 from nnode.discover.score import Screen, traces
 from nnode.discover.search import search, settled
 from nnode.discover.smooth import noise_variance, smooth, velocity
-from nnode.discover.traffic import LARGE, TrafficEngine, drawn_in
+from nnode.discover.traffic import FORGET, LARGE, TrafficEngine, drawn_in
 from nnode.discover.variables import curves, weighed
 from nnode.models import System
 from nnode.models.build import add_effects, build_model
@@ -66,8 +66,11 @@ def test_windows_share_out_what_is_compared() -> None:
     engine = TrafficEngine(long)
     whole = TrafficEngine(long, np.inf)
     assert len(engine.batch) > len(whole.batch) == 2
-    # boundary samples belong to the window before
-    assert len(engine.sequence) == len(whole.sequence)
+    # boundary samples belong to the window before; whole sequences are compared from their start
+    samples, vehicles = long[0].x.shape[0], long[0].x.shape[1]
+    forgotten = int(FORGET / long[0].dt + 1e-9)
+    assert len(whole.sequence) == 2 * (samples - 1) * (vehicles - 1)
+    assert len(engine.sequence) == 2 * (samples - 1 - forgotten) * (vehicles - 1)
     assert set(engine.block[engine.sequence == 1]).isdisjoint(engine.block[engine.sequence == 0])
 
 
