@@ -25,6 +25,8 @@ DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
 COLLINEAR = 1e-4
 #: A share of the knowledge of a parameter that is none, but for rounding.
 UNKNOWN = 1e-9
+#: From this share on, a direction that is not known makes a parameter unknown.
+APIECE = 1e-6
 
 #: Tolerance of calibrations whose result is compared with others that are far off, and with
 #: others that are near.
@@ -69,27 +71,34 @@ class Fit:
         One Gauss and Newton step from the full fit. A direction of the parameters stays where the
         other sequences know less than the share ``least`` of what all know of it.
         """
+        parts = self._others(sequence)
+        found = np.zeros((len(parts), self.tangents.shape[1]))
+        for s, (known, ways, pull) in enumerate(parts):
+            found[s] = ways @ np.where(known > least, pull / np.maximum(known, least), 0.0)
+        return found
+
+    def _others(self, sequence: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """What is known without each sequence: directions ``(F, M)`` of the free parameters, the
+        share ``(M,)`` of the knowledge of each that the others have, and where they pull it."""
         columns = self.tangents
         scale = np.sqrt((columns**2).sum(0))
         # an orthonormal basis: what the others know of a direction is then a share of the whole
         basis, size, turn = np.linalg.svd(columns / scale, full_matrices=False)
         kept = size > COLLINEAR * size[0]
         basis, back = basis[:, kept], (turn[kept] / size[kept, None] / scale).T
-        found = np.zeros((int(sequence.max()) + 1, len(scale)))
-        for s in range(len(found)):
-            own = sequence == s
-            part, residual = basis[own], self.residual[own]
+        found = []
+        for s in range(int(sequence.max()) + 1):
+            part, residual = basis[sequence == s], self.residual[sequence == s]
             known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
             # at the minimum the gradient of the others is minus that of this sequence
-            step = vector.T @ (part.T @ residual) / np.maximum(known, least)
-            found[s] = back @ (vector @ np.where(known > least, step, 0.0))
+            found.append((known, back @ vector, vector.T @ (part.T @ residual)))
         return found
 
     def errors(self, sequence: np.ndarray) -> np.ndarray:
         """``(K,)`` standard errors that allow for any dependence within a sequence.
 
-        By the jackknife over sequences. NaN for parameters at a bound and where there are fewer
-        than three sequences.
+        By the jackknife over sequences. NaN for parameters at a bound, for those of which one
+        sequence alone tells, and where there are fewer than three sequences.
 
         Source: MacKinnon, Nielsen & Webb 2023, Journal of Econometrics 232 (CV3).
         """
@@ -97,7 +106,11 @@ class Fit:
         number = len(np.unique(sequence))
         if number >= 3 and self.free.any():
             moved = self.left_out(sequence, UNKNOWN)
-            found[self.free] = np.sqrt((number - 1) / number * (moved**2).sum(0))
+            own = np.sqrt((number - 1) / number * (moved**2).sum(0))
+            for known, ways, _ in self._others(sequence):
+                share = ways**2 / np.maximum((ways**2).sum(1, keepdims=True), 1e-300)
+                own[share[:, known <= UNKNOWN].sum(1) > APIECE] = np.nan
+            found[self.free] = own
         return found
 
     def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:

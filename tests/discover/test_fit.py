@@ -30,3 +30,17 @@ def test_intervals_are_those_of_the_jackknife() -> None:
     np.testing.assert_allclose(
         fit.intervals(sequence), np.stack([row - half, row + half], 1), rtol=1e-9
     )
+
+
+def test_what_one_sequence_alone_tells_of_has_no_interval() -> None:
+    rng = np.random.default_rng(5)
+    sequence = np.repeat(np.arange(5), 30)
+    jacobian = rng.normal(size=(150, 3))
+    jacobian[sequence != 2, 1] = 0.0
+    residual = rng.normal(size=150)
+    residual -= jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+    fit = Fit(System([]), ["a", "b", "c"], np.ones(3), residual, jacobian, np.ones(3, dtype=bool))
+    low, high = fit.intervals(sequence).T
+    assert np.isnan([low[1], high[1]]).all()
+    assert (low[[0, 2]] < 1).all()
+    assert (high[[0, 2]] > 1).all()
