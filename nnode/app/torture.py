@@ -16,6 +16,7 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app import torture_disk, torture_folder, torture_fuzz, torture_kills
+from nnode.app.torture_campaign import check_names
 from nnode.app.torture_report import REPORT, Row, keep, show
 from nnode.config import TortureConfig
 from nnode.errors import ConfigError, StudyError
@@ -40,11 +41,7 @@ def torture(config: DictConfig, folder: Path) -> None:
         "folder": lambda: torture_folder.folder(root(), folder, options.jobs, options.repeats),
         "fuzz": lambda: torture_fuzz.rows(folder, options.inputs, options.seed, options.targets),
     }
-    for name in options.campaigns:
-        if name not in campaigns:
-            raise ConfigError(
-                f"campaigns: {name} is unknown, expected some of {', '.join(campaigns)}"
-            )
+    check_names("campaigns", options.campaigns, campaigns)
     if min(options.kills, options.inputs, options.repeats) < 1:
         raise ConfigError("kills, inputs and repeats must be at least 1")
     if not hasattr(os, "fork"):

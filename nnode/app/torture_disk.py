@@ -18,11 +18,11 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from nnode.app.torture_jobs import Job, fresh, jobs
-from nnode.app.torture_kills import read_whole
+from nnode.app.torture_campaign import Work, on_jobs
+from nnode.app.torture_jobs import Job
+from nnode.app.torture_kills import broken
 from nnode.app.torture_report import Row
 from nnode.files import PARTIAL
-from nnode.progress import Stages
 
 #: Bytes left on the disk in memory.
 ROOM = (0, 36864, 49152, 65536, 131072)
@@ -45,24 +45,14 @@ def disk(
         names: of the jobs; None takes all but the benchmark, which writes as the study does.
         mount: whether a disk in memory is tried as well.
     """
-    scratch = fresh(folder, "disk")
-    chosen = [
-        job
-        for job in jobs(scratch / "raw")
-        if (job.name in names if names is not None else job.name != "benchmark_discovery")
-    ]
-    rows = []
-    with Stages("full disks", {job.name: 1.0 for job in chosen}, forks=True) as stages:
-        for job in chosen:
-            stages.begin(job.name)
-            rows += _of_job(root, scratch / job.name, job, mount)
-    if not any(row.losses for row in rows):
-        shutil.rmtree(scratch)
-    return rows
+
+    def plan(chosen: list[Job]) -> tuple[list[float], Work]:
+        return [1.0] * len(chosen), lambda job, place, within: _of_job(root, place, job, mount)
+
+    return on_jobs(folder, "disk", "full disks", plan, names, but=["benchmark_discovery"])
 
 
 def _of_job(root: Path, place: Path, job: Job, mount: bool) -> list[Row]:
-    place.mkdir()
     finished = place / "finished"
     assert _run(root, job, finished, place / "output.txt") == 0, "it fails with room"
     limited = Row("disk", f"{job.name}, size of files", 0)
@@ -99,16 +89,8 @@ def _try(root: Path, job: Job, run: Path, row: Row, what: str, prelude: Callable
         row.losses.append(f"{what}: a traceback in place of words: {words[-1800:]}")
     if status is None or status < 0:
         row.losses.append(f"{what}: it ended by signal, or not at all ({status})")
-    for path in sorted(run.rglob("*")):
-        if not path.is_file():
-            continue
-        if path.name.endswith(PARTIAL):
-            row.losses.append(f"{what}: {path} is left")
-        elif not any(part.startswith(".") for part in path.parts[-3:]):
-            try:
-                read_whole(path)
-            except Exception as error:
-                row.losses.append(f"{what}: {path} is not whole: {type(error).__name__}: {error}")
+    row.losses += [f"{what}: {path} is left" for path in sorted(run.rglob(f"*{PARTIAL}"))]
+    row.losses += [f"{what}: {words}" for words in broken(run)]
     try:
         kept = job.kept(run)
         assert kept or job.name == "discover", "what was finished is gone"

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from pathlib import Path
 
+from nnode.app.torture_campaign import Work, on_jobs
 from nnode.app.torture_child import Child
-from nnode.app.torture_jobs import Job, fresh, jobs
+from nnode.app.torture_jobs import Job
 from nnode.app.torture_report import Row
 from nnode.lock import LOCK
-from nnode.progress import Stages
 
 _REFUSED = "another run works in"
 
@@ -24,21 +23,15 @@ def folder(root: Path, place: Path, names: list[str] | None = None, repeats: int
         names: of the jobs; None takes all.
         repeats: so many second runs, and as many after a kill, per job.
     """
-    scratch = fresh(place, "folder")
-    chosen = [job for job in jobs(scratch / "raw") if names is None or job.name in names]
-    rows = []
-    with Stages("shared folders", {job.name: 1.0 for job in chosen}, forks=True) as stages:
-        for job in chosen:
-            stages.begin(job.name)
-            rows.append(_of_job(root, scratch / job.name, job, repeats))
-    if not any(row.losses for row in rows):
-        shutil.rmtree(scratch)
-    return rows
+
+    def plan(chosen: list[Job]) -> tuple[list[float], Work]:
+        return [1.0] * len(chosen), lambda job, own, within: [_of_job(root, own, job, repeats)]
+
+    return on_jobs(place, "folder", "shared folders", plan, names)
 
 
 def _of_job(root: Path, place: Path, job: Job, repeats: int) -> Row:
     row, start = Row("folder", job.name, 0), time.monotonic()
-    place.mkdir()
     _start(root, job, place / "straight", place / "straight.txt").status()
     straight = job.results(place / "straight")
     for number in range(repeats):

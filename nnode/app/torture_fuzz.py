@@ -24,10 +24,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from nnode.app.torture_campaign import check_names
 from nnode.app.torture_child import Child
 from nnode.app.torture_report import Row
 from nnode.app.torture_targets import Target, quiet, targets
-from nnode.errors import ConfigError, NNodeError
+from nnode.errors import NNodeError
 from nnode.progress import Stages
 
 #: Bytes of address space that a child may take beyond what it has when it starts.
@@ -108,11 +109,7 @@ def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     known = targets(scratch, outside)
-    strange = sorted(set(names or []) - {t.name for t in known})
-    if strange:
-        raise ConfigError(
-            f"targets: {strange[0]} is unknown, expected some of {', '.join(t.name for t in known)}"
-        )
+    check_names("targets", names or [], [target.name for target in known])
     chosen = [t for t in known if names is None or t.name in names]
     whole = sum(target.share for target in chosen)
     found = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -230,15 +229,6 @@ def _lane(raw: Path, table: Path) -> None:
         for s in found for k, t in enumerate(s.time) for n in range(s.n_agents)
     ]  # fmt: skip
     pd.DataFrame(rows).to_csv(table, index=False)
-
-
-def fresh(folder: Path, campaign: str) -> Path:
-    """An empty folder for a campaign whose jobs are forked from this process."""
-    load_libraries()
-    scratch = folder / campaign
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
-    return scratch
 
 
 def load_libraries() -> None:

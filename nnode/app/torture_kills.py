@@ -21,14 +21,14 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from nnode.app.torture_campaign import Work, on_jobs
 from nnode.app.torture_child import Child
-from nnode.app.torture_jobs import Job, fresh, jobs
+from nnode.app.torture_jobs import Job
 from nnode.app.torture_report import Row
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.store import MANIFEST, Store
-from nnode.errors import ConfigError, StudyError
+from nnode.errors import StudyError
 from nnode.files import PARTIAL
-from nnode.progress import Stages
 
 #: So many kills in a row, at most, before a run may end.
 _ROW = 6
@@ -48,27 +48,19 @@ def kills(
         seed: of the moments.
         names: of the jobs; None takes all.
     """
-    scratch = fresh(folder, "kills")
-    known = jobs(scratch / "raw")
-    strange = set(names or ()) - {job.name for job in known}
-    if strange:
-        raise ConfigError(
-            f"jobs: {min(strange)} is unknown, expected some of "
-            f"{', '.join(job.name for job in known)}"
-        )
-    chosen = [job for job in known if names is None or job.name in names]
-    whole = sum(job.share for job in chosen)
-    shares = [max(1, number * job.share // whole) for job in chosen]
-    shares[0] += max(0, number - sum(shares))
-    rows = []
-    with Stages("kills", {job.name: float(job.share) for job in chosen}, forks=True) as stages:
-        for job, share in zip(chosen, shares, strict=True):
-            stages.begin(job.name)
+
+    def plan(chosen: list[Job]) -> tuple[list[float], Work]:
+        whole = sum(job.share for job in chosen)
+        shares = {job.name: max(1, number * job.share // whole) for job in chosen}
+        shares[chosen[0].name] += max(0, number - sum(shares.values()))
+
+        def kill(job: Job, place: Path, within: Callable[[float], None]) -> list[Row]:
             rng = random.Random(f"{job.name}-{seed}")
-            rows.append(_Killed(root, scratch / job.name, job, rng).all(share, stages.within))
-    if not any(row.losses for row in rows):
-        shutil.rmtree(scratch)
-    return rows
+            return [_Killed(root, place, job, rng).all(shares[job.name], within)]
+
+        return [float(job.share) for job in chosen], kill
+
+    return on_jobs(folder, "kills", "kills", plan, names)
 
 
 class _Killed:
@@ -76,7 +68,6 @@ class _Killed:
 
     def __init__(self, root: Path, place: Path, job: Job, rng: random.Random) -> None:
         self.root, self.place, self.job, self.rng = root, place, job, rng
-        self.place.mkdir()
         self.row = Row("kills", job.name, 0)
         self.straight: Any = None
         self.seconds, self.events, self.ended, self.resumed = 0.0, 0, 0, 0
@@ -153,12 +144,7 @@ class _Killed:
             return
 
     def _look(self, folder: Path, before: float | set[str]) -> None:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file() and not any(p.startswith(".") for p in path.parts[-3:]):
-                try:
-                    read_whole(path)
-                except Exception as error:
-                    self._lose(f"{path} is not whole: {type(error).__name__}: {error}")
+        self.row.losses += broken(folder)
         try:
             now = self.job.kept(folder)
         except Exception as error:
@@ -182,6 +168,18 @@ class _Killed:
 
     def _lose(self, words: str) -> None:
         self.row.losses.append(words)
+
+
+def broken(folder: Path) -> list[str]:
+    """The results in a folder that are not whole, in words."""
+    found = []
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not any(part.startswith(".") for part in path.parts[-3:]):
+            try:
+                read_whole(path)
+            except Exception as error:
+                found.append(f"{path} is not whole: {type(error).__name__}: {error}")
+    return found
 
 
 def read_whole(path: Path) -> None:

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from nnode.discover.candidate import Candidate, again, calibrated
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.edges import moved
 from nnode.discover.engine import Engine, row_of, square_of
-from nnode.discover.fit import FINE, ROUGH, Fit, evaluated, refine, sums
-from nnode.discover.individual import Individuals, individuals, sharpened
+from nnode.discover.fit import FINE, Fit, refine, sums
+from nnode.discover.individual import Individuals, individuals
 from nnode.discover.score import Score, Screen, Trace, traces
 from nnode.discover.variables import Variable, curves
 from nnode.errors import SimulationError
 from nnode.models.effects import Effect, IndividualEffect
-from nnode.models.extend import effects_of, extended, place_of, without
+from nnode.models.extend import effects_of, without
 from nnode.models.system import System
 
 log = logging.getLogger(__name__)
@@ -41,8 +41,6 @@ CLOSE = 0.8
 #: probability: an interval that was looked for is flattered, and no name is better than a wrong
 #: one.
 MARGIN, RATHER = 0.1, 0.35
-#: An interval is moved at most so many times.
-SHIFTS = 3
 #: An effect must predict sequences that a calibration left out better, at this error probability.
 #: False alarms are held by its score; an effect that acts in few sequences helps few of them.
 BETTER = 0.05
@@ -51,54 +49,6 @@ BETTER = 0.05
 LATER = 0.5
 #: Two rivals are told apart at this error probability; two of a kin at a smaller one.
 APART, KIN_APART = 0.05, 0.01
-
-
-@dataclass
-class Candidate:
-    """An effect that was added and calibrated with the model.
-
-    Attributes:
-        score: that it was chosen by.
-        fit: of the extended model.
-        losses: ``(S,)`` held-out cost of each sequence.
-        gain: over the model without it.
-        removed: share of the first model's squared errors of positions that it removed.
-        individuals: of an individual effect.
-    """
-
-    score: Score
-    fit: Fit
-    losses: np.ndarray
-    gain: Comparison
-    removed: float
-    individuals: Individuals | None = None
-
-    @property
-    def name(self) -> str:
-        """Of the effect."""
-        return self.score.effect.name
-
-    @property
-    def ordered(self) -> bool:
-        """Whether an interval has kept its ends in their order."""
-        if not self.score.effect.consecutive:
-            return True
-        own = self.fit.system.terms[place_of(self.fit.system, self.name)]
-        first, last = (float(own.get_parameter(name).detach()) for name in ("a", "b"))
-        return first < last
-
-    def strength_excludes_neutral(self, sequence: np.ndarray) -> bool:
-        """Whether the interval of any of its strengths excludes the neutral value."""
-        if self.individuals is not None and self.individuals.interval[0] <= 0:
-            return False
-        intervals = self.fit.intervals(sequence)
-        place = place_of(self.fit.system, self.name)
-        known = [
-            (strength.neutral, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
-            for name, strength in self.score.effect.strengths.items()
-            if f"terms.{place}.{name}" in self.fit.names
-        ]
-        return not known or any(low > neutral or high < neutral for neutral, low, high in known)
 
 
 @dataclass
@@ -192,7 +142,7 @@ def search(
         if step.chosen.score.effect.consecutive:
             found.fit = moved(engine, found.fit, step.chosen.name)
         if step.individuals is not None:
-            found.fit = _again(engine, found.fit, step.chosen)
+            found.fit = again(engine, found.fit, step.chosen)
         log.info("added %s", step.chosen.name)
     return _pruned(engine, found)
 
@@ -234,7 +184,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         least = min((c.fit.cost for c in candidates), default=0.0)
         one = look.of(score.effect.name)
         try:
-            fit, one = _calibrated(engine, found.fit, score, least, one)
+            fit, one = calibrated(engine, found.fit, score, least, one)
         except SimulationError:
             continue
         losses = heldout(fit, engine.sequence)
@@ -290,76 +240,6 @@ def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable
             if test.p_value < RATHER:
                 return True
     return False
-
-
-def _calibrated(
-    engine: Engine, before: Fit, score: Score, hopeless: float, one: Individuals | None
-) -> tuple[Fit, Individuals | None]:
-    """The model with one more effect, and the agents' numbers of an individual one."""
-    system, place = extended(before.system, score.effect(**score.options))
-    if one is not None:
-        system, one = _peopled(engine, system, one)
-        return refine(engine, system, tolerance=ROUGH), one
-    fit = refine(engine, system, tolerance=ROUGH, hopeless=hopeless)
-    if score.effect.consecutive:
-        # a strong effect bends the paths, so that the interval of a weak one would be off
-        for _ in range(SHIFTS):
-            shifted = _shifted(engine, fit, score.effect, place)
-            if shifted is None:
-                break
-            fit = shifted
-    return fit, None
-
-
-def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit | None:
-    """The fit with another interval, where the same effect once more would explain something."""
-    own = fit.system.terms[place]
-    assert isinstance(own, effect)
-    now = own.options()
-    (score,) = Screen(fit, engine.block).scores(traces(engine, fit, effect))
-    if score.gain < ROUGH:
-        return None
-    low, high = score.options["a"], score.options["b"]
-    trials = [
-        {**now, "a": min(now["a"], low), "b": max(now["b"], high)},
-        {**now, "a": max(low, now["a"]), "b": min(high, now["b"])},
-    ]
-    best = None
-    for values in trials:
-        if values["b"] <= values["a"]:
-            continue
-        system = copy.deepcopy(fit.system)
-        system.terms[place] = effect(**values)
-        try:
-            found = refine(engine, system, tolerance=ROUGH, hopeless=fit.cost)
-        except SimulationError:
-            continue
-        if found.cost < (1 - ROUGH) * (fit if best is None else best).cost:
-            best = found
-    return best
-
-
-def _again(engine: Engine, fit: Fit, chosen: Candidate) -> Fit:
-    """Everybody's numbers once more, around the parameters that the model has with them."""
-    kind, one = chosen.score.effect, chosen.individuals
-    assert issubclass(kind, IndividualEffect)
-    assert one is not None
-    if len(engine.people[0]) == 1:
-        plain = evaluated(engine, without(fit.system, kind.name))
-        one = individuals(engine, plain, kind)
-        if one is None:
-            return fit
-    system, chosen.individuals = _peopled(engine, copy.deepcopy(fit.system), one)
-    return refine(engine, system)
-
-
-def _peopled(engine: Engine, system: System, one: Individuals) -> tuple[System, Individuals]:
-    """A model with an individual effect, and everybody's numbers in it."""
-    one = sharpened(engine, system, one)
-    for effect in effects_of(system):
-        if isinstance(effect, one.effect):
-            effect.people = one.people
-    return system, one
 
 
 def _simplest(candidates: list[Candidate]) -> Candidate:
