@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from nnode.discover.result import NamedEffect, Place, Structure
 from nnode.models.effects import CATALOGUE
-from nnode.plots.style import FONT, GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
+from nnode.plots.style import GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
 
 COLUMNS = 3
 #: Sequences that are named one by one.
@@ -134,8 +134,6 @@ def flexible_curve(structure: Structure, unit: str) -> Figure:
     ax.plot(structure.curve["at"], structure.curve["deviation"], color=OKABE_ITO["blue"])
     variable = structure.variables[0] if structure.variables else "variable"
     dress(ax, x=variable, y=f"missing ({unit})")
-    if structure.hint:
-        ax.set_title(f"hint: {structure.hint}", fontsize=FONT, color=GREY, loc="left")
     return figure
 
 
