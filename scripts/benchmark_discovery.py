@@ -11,8 +11,8 @@ Examples:
       'benchmark_discovery.arms=[single]' 'benchmark_discovery.noises=[0,0.05,0.3]' \\
       'benchmark_discovery.sizes=[5,20,80]'
 
-Results: a page with tables of what was found, missed and invented. The same command goes on where
-it was stopped.
+Results: a page with tables of what was found, missed and invented, over all cases that the folder
+holds. The same command goes on where it was stopped.
 """
 
 from nnode.app.benchmark_discovery import benchmark_discovery

@@ -9,14 +9,14 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.benchmark_discovery_page import SUBTITLE, TITLE, blocks_of
-from nnode.app.benchmark_discovery_task import sources, task_of
+from nnode.app.benchmark_discovery_task import diagnose_case, sources, task_of
 from nnode.config import DiscoveryBenchmarkOptions
 from nnode.errors import ConfigError
 from nnode.groundtruth import ARMS, Case
 from nnode.groundtruth.arms import cases, hides
 from nnode.machine import cores
 from nnode.pages.page import write_page
-from nnode.study.runner import run_tasks
+from nnode.study.runner import kept_results, run_tasks
 
 #: Arms that need many cases: they show how often something is named where nothing is hidden.
 _NOTHING = "nothing"
@@ -24,6 +24,8 @@ _NOTHING = "nothing"
 
 def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     """Generate, diagnose and score all cases, write the page, and print where it is.
+
+    The page shows all cases that the folder holds, those of earlier runs of the same code too.
 
     Raises:
         ConfigError: unknown domains, arms or effects, or no case at all.
@@ -36,15 +38,17 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     workers = cores() if options.workers is None else options.workers
     if workers < 1:
         raise ConfigError(f"benchmark_discovery.workers={workers} must be at least 1")
-    results = run_tasks(
+    code = sources()
+    run_tasks(
         [task_of(case, case.seed < options.first_seed + options.peer_seeds) for case in chosen],
         folder,
         workers=workers,
-        fingerprint=sources(),
+        fingerprint=code,
         title="diagnoses",
     )
+    rows = kept_results(folder, diagnose_case, code)
     paths = write_page(
-        blocks_of(list(results.values()), time.monotonic() - start, workers),
+        blocks_of(list(rows.values()), time.monotonic() - start, workers),
         folder,
         title=TITLE,
         subtitle=SUBTITLE,

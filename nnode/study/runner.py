@@ -15,7 +15,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -153,6 +153,26 @@ def run_tasks(
     passed = time.monotonic() - start
     log.info("%s: %d tasks, %d of them kept before, %.1f s", title, len(tasks), before, passed)
     return {key: result for key, result in results.items() if result is not None}
+
+
+def kept_results(
+    folder: Path, function: Callable[..., dict[str, Any]], fingerprint: str
+) -> dict[str, dict[str, Any]]:
+    """Results by key of all tasks of a function that a folder holds and that still hold.
+
+    Args:
+        folder: of the study.
+        function: of the tasks.
+        fingerprint: as in :func:`run_tasks`.
+    """
+    found = {}
+    for path in sorted((folder / KEPT).glob("*.json")):
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            content = json.loads(path.read_text(encoding="utf-8"))
+            task = Task(path.stem, function, content["identity"]["arguments"])
+            if _canonical(content["identity"]) == _canonical(task.identity(fingerprint)):
+                found[task.key] = dict(content["result"])
+    return found
 
 
 def _kept(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:

@@ -111,6 +111,12 @@ def test_a_second_run_computes_nothing_again(tmp_path):
     assert (tmp_path / "figures" / "map_traffic.png").is_file()
 
 
+def test_the_page_shows_what_earlier_runs_have_left(tmp_path):
+    run(tmp_path, domains=["traffic"], arms=["single"], effects=["time_gap"])
+    rows = run(tmp_path, domains=["traffic"], arms=["single"], effects=["relative_speed"])
+    assert sorted(rows["hidden"]) == ["relative_speed", "time_gap"]
+
+
 def test_headline_holds_what_was_asked_for():
     found = cases_of(DiscoveryBenchmarkOptions())
     for domain in ("traffic", "crowd"):

@@ -23,7 +23,7 @@ from nnode.app.benchmark_problems import Shape, pose
 from nnode.errors import StudyError
 from nnode.solvers import TorchdiffeqSolver
 from nnode.study import runner
-from nnode.study.runner import Task, run_tasks
+from nnode.study.runner import Task, kept_results, run_tasks
 from tests.app.conftest import ROOT
 from tests.study import work
 
@@ -50,6 +50,17 @@ def gone(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
         return True
+
+
+def test_kept_results_are_those_of_one_function_and_fingerprint(tmp_path: Path) -> None:
+    run_tasks(squares(tmp_path, 3.0), tmp_path, workers=1, fingerprint="f")
+    run_tasks(squares(tmp_path, 1.0), tmp_path, workers=1, fingerprint="f")
+    run_tasks(squares(tmp_path, 2.0), tmp_path, workers=1, fingerprint="g")
+    cubes = [Task("cube-1", work.cube, {"x": 1.0, "log": str(tmp_path / "calls")})]
+    run_tasks(cubes, tmp_path, workers=1, fingerprint="f")
+    (tmp_path / "tasks" / "broken.json").write_text("{")
+    found = kept_results(tmp_path, work.square, "f")
+    assert found == {"square-1": {"y": 1.0}, "square-3": {"y": 9.0}}
 
 
 @pytest.mark.parametrize("workers", [1, 2])
