@@ -23,6 +23,7 @@ from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.result import Diagnosis, Gap, Verdict
 from nnode.discover.search import Search, search, settled
 from nnode.discover.traffic import TrafficEngine
+from nnode.discover.unbiased import unbiased
 from nnode.discover.variables import Curves, curves, weighed
 from nnode.errors import DataError
 from nnode.models.effects import CATALOGUE, IndividualEffect
@@ -119,6 +120,8 @@ def diagnose(
     stages.begin("comparing on sealed sequences")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
     verdict = _verdict(found, left, removed, bool(faults))
+    if found.steps and domain == "crowd":
+        found.fit = unbiased(found.fit, [sequences[i] for i in opened], options.seed)
     gap, each = _gap(domain, base_system, found, [sequences[i] for i in sealed])
     clock.lap("sealed")
     absent = absences(found)

@@ -45,6 +45,7 @@ class Fit:
         jacobian: ``(n, K)`` derivatives of the residuals.
         free: ``(K,)`` False where a parameter is held at a bound.
         curves: what a deviation depends on, once that was asked for.
+        simulated: ``(K,)`` standard errors of a correction by simulations; None without one.
     """
 
     system: System
@@ -54,6 +55,7 @@ class Fit:
     jacobian: np.ndarray
     free: np.ndarray
     curves: list[Curves] | None = None
+    simulated: np.ndarray | None = None
 
     @property
     def cost(self) -> float:
@@ -111,7 +113,7 @@ class Fit:
                 share = ways**2 / np.maximum((ways**2).sum(1, keepdims=True), 1e-300)
                 own[share[:, known <= UNKNOWN].sum(1) > APIECE] = np.nan
             found[self.free] = own
-        return found
+        return found if self.simulated is None else np.hypot(found, self.simulated)
 
     def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:
         """``(K, 2)`` confidence intervals: :meth:`errors` with Student's quantile."""
