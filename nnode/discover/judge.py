@@ -112,31 +112,32 @@ def _absence(score: Score, critical: float) -> Absence:
     name = min(effect.strengths, key=lambda n: _relative(effect, n, score.error.get(n, 0.0)))
     strength = effect.strengths[name]
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
-    most = _plausible(effect, name)
     known = error > 0 and math.isfinite(error)
-    detectable = (critical + POWER) * error if known else math.inf
-    testable = known and detectable < most
+    detectable, bound = math.inf, math.inf
+    if known:
+        detectable, bound = (critical + POWER) * error, abs(amount) + WIDE * error
+    if score.probes:
+        # what was tried at a size says nothing of smaller ones
+        size, error = min(score.probes, key=lambda one: max(one[0], (critical + POWER) * one[1]))
+        detectable = max(size, (critical + POWER) * error)
+        bound = max(size, abs(amount) + WIDE * error)
+    testable = known and detectable <= strength.expected
     return Absence(
         name=effect.name,
         testable=testable,
         coefficient=name,
         unit=strength.unit,
-        detectable=detectable if known else None,
-        bound=abs(amount) + WIDE * error if testable else None,
+        detectable=detectable if math.isfinite(detectable) else None,
+        bound=bound if testable else None,
         reason="" if testable else (
-            f"even the largest plausible deviation of {name} ({most:.3g} {strength.unit}) "
-            "would not stand out in these data"
+            f"{name} would not stand out in these data even if it were off by "
+            f"{strength.expected:.3g}{'' if strength.unit == '1' else f' {strength.unit}'}"
         ),
     )  # fmt: skip
 
 
-def _plausible(effect: type[Effect], name: str) -> float:
-    strength = effect.strengths[name]
-    return max(abs(strength.range.low - strength.neutral), strength.range.high - strength.neutral)
-
-
 def _relative(effect: type[Effect], name: str, error: float) -> float:
-    return error / _plausible(effect, name) if error > 0 else math.inf
+    return error / effect.strengths[name].expected if error > 0 else math.inf
 
 
 def places(found: list[Curves], excess: float) -> list[Place]:

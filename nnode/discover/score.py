@@ -15,7 +15,7 @@ Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Westfall 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,8 @@ class Score:
         gain: share of the sum of squares that the trace explains beyond the model.
         amount: strengths that explain most, less their neutral values.
         error: standard errors of ``amount``.
+        probes: of an effect with a memory, whose trace is that of a finite strength: the strength
+            and its standard error at every probe.
     """
 
     effect: type[Effect]
@@ -74,6 +76,7 @@ class Score:
     gain: float
     amount: dict[str, float]
     error: dict[str, float]
+    probes: list[tuple[float, float]] = field(default_factory=list)
 
 
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
@@ -125,8 +128,10 @@ class Screen:
             for score in scores:
                 name, known = score.effect.name, best.get(score.effect.name)
                 largest[name] = max(largest.get(name, 0.0), score.statistic)
+                probes = score.probes + (known.probes if known else [])
                 if known is None or score.gain > known.gain:
                     best[name] = score
+                best[name].probes = probes
         if best:
             self._judge(best, largest)
         return sorted(best.values(), key=lambda score: -score.gain)
@@ -169,7 +174,10 @@ class Screen:
             if share < FORBIDDEN:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._by_chance(trace.effect.name, chance)
-        return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
+        found = Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
+        if trace.effect.memory:
+            found.probes = [(abs(s), errors[name]) for name, s in probe.steps.items()]
+        return found
 
     def _individual(self, found: Individuals) -> Score:
         """Only products of halves that agree speak for an effect."""

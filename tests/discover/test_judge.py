@@ -9,10 +9,12 @@ import pytest
 import torch
 
 from nnode.discover import judge
-from nnode.discover.result import Coefficient
-from nnode.discover.score import Screen
+from nnode.discover.judge import POWER, WIDE, _absence
+from nnode.discover.result import Absence, Coefficient
+from nnode.discover.score import Score, Screen
 from nnode.discover.variables import Curves, Variable
 from nnode.models.effects import CATALOGUE
+from nnode.models.effects.following import ReactionDelay, RelativeSpeed
 
 
 def curves(heights: list[float], errors: list[float], removed: float, name: str = "gap") -> Curves:
@@ -89,3 +91,33 @@ def test_scores_are_on_the_scale_of_a_standard_normal_variable() -> None:
     assert np.mean(found > 1.96) == pytest.approx(0.05, abs=0.006)
     # as little as the unit of the effect's coefficient matters
     assert standardised(10.0) == pytest.approx(found)
+
+
+@pytest.mark.parametrize(
+    ("probes", "testable", "detectable"),
+    [
+        # the long delay shakes the platoon: that says nothing of short ones
+        ([(0.3, 0.1), (0.8, 1e-4)], False, (3 + POWER) * 0.1),
+        ([(0.3, 0.3), (0.8, 1e-4)], False, 0.8),
+        ([(0.3, 0.01), (0.8, 1e-4)], True, 0.3),
+    ],
+)
+def test_a_delay_is_bounded_where_it_was_tried(
+    probes: list[tuple[float, float]], testable: bool, detectable: float
+) -> None:
+    score = Score(ReactionDelay, {}, 1.0, 0.5, 0.0, {"T": 1e-4}, {"T": 1e-4}, probes)
+    found = _absence(score, critical=3.0)
+    assert found.testable == testable
+    assert found.detectable == pytest.approx(detectable)
+    assert (found.bound is not None) == testable
+    assert ("0.3 s" in found.reason) != testable
+
+
+def test_an_effect_is_tested_where_one_of_usual_size_would_stand_out() -> None:
+    def of(error: float) -> Absence:
+        score = Score(RelativeSpeed, {}, 1.0, 0.5, 0.0, {"kappa": 0.01}, {"kappa": error})
+        return _absence(score, critical=3.0)
+
+    assert of(0.05).testable
+    assert of(0.05).bound == pytest.approx(0.01 + WIDE * 0.05)
+    assert not of(0.1).testable

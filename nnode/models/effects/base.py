@@ -40,12 +40,22 @@ class Strength:
         step: a small but visible amount.
         range: what is plausible; also the admissible set.
         unit: of the parameter.
+        usual: the least distance from the neutral value that one would expect. Data in which it
+            would not stand out do not test the effect; None takes the farthest end of the range.
     """
 
     neutral: float
     step: float
     range: Interval
     unit: str
+    usual: float | None = None
+
+    @property
+    def expected(self) -> float:
+        """A distance from the neutral value that an effect should have to be worth a test."""
+        if self.usual is not None:
+            return self.usual
+        return max(abs(self.range.low - self.neutral), self.range.high - self.neutral)
 
     def at(self, amount: float) -> float:
         """The value that differs from the neutral one by an amount, or the nearest plausible."""

@@ -54,7 +54,7 @@ class RelativeSpeed(_SpeedAhead):
     domain = "traffic"
     formula = "W + kappa (ẋ_{i+1} - W)"
     source = "full velocity difference: Jiang, Wu & Zhu 2001"
-    strengths = {"kappa": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1")}
+    strengths = {"kappa": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2)}
     rank = 50
     kin = _KIN
     separated_by = _EXCITATION
@@ -74,8 +74,8 @@ class AsymmetricResponse(_SpeedAhead):
     formula = "W + kappa_open (ẋ_{i+1} - W)+ - kappa_close (W - ẋ_{i+1})+"
     source = "Gong, Liu & Wang 2008"
     strengths = {
-        "kappa_open": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1"),
-        "kappa_close": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1"),
+        "kappa_open": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2),
+        "kappa_close": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2),
     }
     rank = 51
     contains = ("relative_speed",)
@@ -101,7 +101,7 @@ class ReactionDelay(Effect):
     domain = "traffic"
     formula = "W(gap(t - T))"
     source = "Newell 1961; Padé's approximation of the delay"
-    strengths = {"T": Strength(0.0, 0.3, Interval(0.2, 3.0), "s")}
+    strengths = {"T": Strength(0.0, 0.3, Interval(0.2, 3.0), "s", usual=0.3)}
     rank = 35
     memory = 2
     fast = {"T": 0.29}  # the filter's poles lie at 3.46 / T
@@ -141,7 +141,7 @@ class Inertia(Effect):
     domain = "traffic"
     formula = "tau_v dv/dt = W - v"
     source = "optimal velocity: Bando et al. 1995"
-    strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.2, 10.0), "s")}
+    strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.2, 10.0), "s", usual=0.3)}
     rank = 60
     memory = 1
     fast = {"tau_v": 1.0}

@@ -230,7 +230,7 @@ class MultiAnticipation(Effect):
     domain = "traffic"
     formula = "W + c (W(gap_{i+1}) - W(gap_i))"
     source = "Lenz, Wagner & Sollacher 1999"
-    strengths = {"c": Strength(0.0, 0.05, Interval(-1.0, 1.0), "1")}
+    strengths = {"c": Strength(0.0, 0.05, Interval(-1.0, 1.0), "1", usual=0.2)}
     rank = 30
     kin = "reaction to the vehicle ahead"
     separated_by = "leaders that brake and accelerate strongly, cameras that see longer platoons"
