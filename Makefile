@@ -28,8 +28,9 @@ demo: setup
 	@echo "checkpoints: $(DEMO)/traffic/checkpoints/best.pt $(DEMO)/crowd/checkpoints/best.pt"
 	@echo "force plots: $(DEMO)/traffic/forces/forces.png $(DEMO)/crowd/forces/nn_force_x.png"
 
+# Files of tests side by side, on at most four cores.
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # The neighbouring programs let run: what they write is read, calibrated and diagnosed. Where one of
 # them cannot be installed, that is said and its tests are skipped.
