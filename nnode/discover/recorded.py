@@ -67,16 +67,23 @@ def recorded(function: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Calla
         try:
             with _Tape() as tape:
                 output = function(*inputs)
-            graph = torch.jit.trace(
-                lambda *values: tape.replayed(inputs, output, values),
-                tuple(inputs),
-                check_trace=False,
-            )
+            graph = _graph(lambda *values: tape.replayed(inputs, output, values), tuple(inputs))
             found = [graph(*values) for values in trials]
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError):
             return function
     same = all(_same(a, b) for a, b in zip(found, known, strict=True))
     return graph if same else function
+
+
+def _graph(function: Callable[..., Tensor], inputs: tuple[Tensor, ...]) -> Callable[..., Tensor]:
+    """A function as TorchScript.
+
+    What ``torch.jit.trace`` makes of a function is never freed, with all the tensors in it; this
+    one is freed with its last user.
+    """
+    graph, _ = torch._C._create_graph_by_tracing(function, inputs, lambda value: "", True, False)
+    found: Callable[..., Tensor] = torch._C._create_function_from_graph("recorded", graph)
+    return found
 
 
 def _same(one: Tensor, other: Tensor) -> bool:

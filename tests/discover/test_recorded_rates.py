@@ -1,5 +1,9 @@
 """Recorded graphs do what the functions do that they were recorded from."""
 
+import gc
+import os
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
@@ -51,3 +55,26 @@ def test_numbers_that_are_none_do_not_matter():
     found = graph(torch.tensor([-2.0, 1.0, 0.0]))
     assert found.isnan().tolist() == [True, False, False]
     assert found[1:].tolist() == [0.0, -torch.inf]
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's count of pages")
+def test_a_graph_is_freed_with_its_last_user():
+    """What a graph holds is in memory as long as the graph, and no longer."""
+
+    def resident() -> float:
+        gc.collect()
+        return (
+            int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        )
+
+    x = torch.ones(500_000).double()
+
+    def once() -> None:
+        held = torch.rand(500_000).double()  # 4 MB
+        assert recorded(lambda y: (y * held).sin(), [x])(x).shape == x.shape
+
+    once()
+    before = resident()
+    for _ in range(50):
+        once()
+    assert resident() - before < 100  # of 200 MB
