@@ -194,7 +194,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
         removed = (square - square_of(engine, fit.system)) / found.square
         candidates.append(Candidate(score, fit, losses, compare(before, losses), removed, one))
     candidates.sort(key=lambda c: -c.gain.gain)
-    candidates = _sharpened(engine, candidates, before)
+    candidates = _to_the_end(engine, candidates, before)
     passing = [
         c for c in candidates
         if c.score.p_value <= alpha
@@ -218,7 +218,7 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     return Step(best, rivals)
 
 
-def _sharpened(engine: Engine, candidates: list[Candidate], before: np.ndarray) -> list[Candidate]:
+def _to_the_end(engine: Engine, candidates: list[Candidate], before: np.ndarray) -> list[Candidate]:
     """Candidates in their order, those near the best calibrated to the end: kin differ by less
     than a rough calibration leaves."""
     found = []
