@@ -33,6 +33,10 @@ APIECE = 1e-6
 ROUGH, FINE = 1e-3, 1e-6
 
 
+#: Shares ``(M,)`` of knowledge, directions ``(F, M)``, and where they are pulled.
+_Others = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 @dataclass
 class Fit:
     """A calibrated model in the residuals of an engine.
@@ -73,13 +77,9 @@ class Fit:
         One Gauss and Newton step from the full fit. A direction of the parameters stays where the
         other sequences know less than the share ``least`` of what all know of it.
         """
-        parts = self._others(sequence)
-        found = np.zeros((len(parts), self.tangents.shape[1]))
-        for s, (known, ways, pull) in enumerate(parts):
-            found[s] = ways @ np.where(known > least, pull / np.maximum(known, least), 0.0)
-        return found
+        return _moved(self._others(sequence), least)
 
-    def _others(self, sequence: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def _others(self, sequence: np.ndarray) -> list[_Others]:
         """What is known without each sequence: directions ``(F, M)`` of the free parameters, the
         share ``(M,)`` of the knowledge of each that the others have, and where they pull it."""
         columns = self.tangents
@@ -107,9 +107,9 @@ class Fit:
         found = np.full(len(self.row), np.nan)
         number = len(np.unique(sequence))
         if number >= 3 and self.free.any():
-            moved = self.left_out(sequence, UNKNOWN)
-            own = np.sqrt((number - 1) / number * (moved**2).sum(0))
-            for known, ways, _ in self._others(sequence):
+            parts = self._others(sequence)
+            own = np.sqrt((number - 1) / number * (_moved(parts, UNKNOWN) ** 2).sum(0))
+            for known, ways, _ in parts:
                 share = ways**2 / np.maximum((ways**2).sum(1, keepdims=True), 1e-300)
                 own[share[:, known <= UNKNOWN].sum(1) > APIECE] = np.nan
             found[self.free] = own
@@ -120,6 +120,16 @@ class Fit:
         number = len(np.unique(sequence))
         half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(sequence)
         return np.stack([self.row - half, self.row + half], 1)
+
+
+def _moved(parts: list[_Others], least: float) -> np.ndarray:
+    """``(S, F)``: see :meth:`Fit.left_out`."""
+    return np.stack(
+        [
+            ways @ np.where(known > least, pull / np.maximum(known, least), 0.0)
+            for known, ways, pull in parts
+        ]
+    )
 
 
 def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:
