@@ -194,4 +194,5 @@ def structure(found: list[Curves]) -> Structure:
         gain=best.removed,
         hint=symbolic(best.variable.name, at, best.heights, best.errors),
         curve={"at": at.tolist(), "deviation": best.heights.tolist()},
+        unit=best.variable.unit,
     )

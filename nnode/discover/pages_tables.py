@@ -212,8 +212,8 @@ def not_testable_table(d: Diagnosis) -> TableBlock:
     return _table(
         "not_testable",
         rows,
-        "Effects that these data could not show even at the largest plausible strength: nothing "
-        "is known about them.",
+        "Effects that would not stand out in these data with a probability of 80 % even at the "
+        "least usual strength: that they were not found says nothing about them.",
     )
 
 

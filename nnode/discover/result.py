@@ -75,7 +75,7 @@ class Absence:
 
     Attributes:
         name: of the effect.
-        testable: False where the data could not show even the largest plausible strength.
+        testable: False where not even the least usual strength would stand out in the data.
         coefficient: the strength that is limited; ``unit`` is its unit.
         detectable: smallest deviation from neutral found with 80 % power.
         bound: it is absent to within this deviation (95 %); None where not testable.
@@ -142,12 +142,14 @@ class Structure:
         gain: share of the squared errors of positions that are left that a flexible fit removes.
         hint: a symbolic form, as a hint only.
         curve: the flexible fit in the first variable: ``at``, ``deviation``.
+        unit: of the first variable.
     """
 
     variables: list[str]
     gain: float
     hint: str
     curve: dict[str, list[float]]
+    unit: str = ""
 
 
 @dataclass

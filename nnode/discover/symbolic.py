@@ -47,7 +47,8 @@ def symbolic(name: str, at: np.ndarray, heights: np.ndarray, errors: np.ndarray)
     numbers = dict(zip("ab", weights[1:], strict=False))
     if form == "constant":
         return f"{weights[0]:.3g}, whatever the {name}"
+    sign = "+" if at[0] < 0 else "-"
     return (
-        f"{weights[0]:.3g} {form.format(**numbers)} with z = ({name} - {at[0]:.4g}) / "
+        f"{weights[0]:.3g} {form.format(**numbers)} with z = ({name} {sign} {abs(at[0]):.4g}) / "
         f"{at[-1] - at[0]:.4g}"
     )

@@ -170,13 +170,13 @@ def start(*overrides: str) -> subprocess.Popen[str]:
     )
 
 
-def interrupted(raw: Path, folder: Path, stops: int) -> None:
+def interrupted(raw: Path, folder: Path, stops: int, epochs: int) -> None:
     """Break a run ``stops`` times, alternately by SIGTERM and SIGKILL; compare the end."""
     common = [
         "experiment=demo_traffic",
         "model=n2",
         "optimizer=adadelta",
-        "trainer.max_epochs=40",
+        f"trainer.max_epochs={epochs}",
         "trainer.save_every=0.1",
         f"data.source={raw}",
     ]
@@ -212,12 +212,12 @@ def interrupted(raw: Path, folder: Path, stops: int) -> None:
 
 
 def test_two_signals_at_random_moments_change_no_bit(raw: Path, tmp_path: Path) -> None:
-    interrupted(raw, tmp_path, 2)
+    interrupted(raw, tmp_path, 2, epochs=12)
 
 
 @pytest.mark.slow
 def test_ten_signals_at_random_moments_change_no_bit(raw: Path, tmp_path: Path) -> None:
-    interrupted(raw, tmp_path, 10)
+    interrupted(raw, tmp_path, 10, epochs=40)
 
 
 def test_resume_refuses_another_problem(script: Script, traffic: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from nnode.discover import judge
+from nnode.discover.figures.marks import flexible_curve
 from nnode.discover.judge import POWER, WIDE, _absence
 from nnode.discover.result import Absence, Coefficient
 from nnode.discover.score import Score, Screen
@@ -121,3 +122,11 @@ def test_an_effect_is_tested_where_one_of_usual_size_would_stand_out() -> None:
     assert of(0.05).testable
     assert of(0.05).bound == pytest.approx(0.01 + WIDE * 0.05)
     assert not of(0.1).testable
+
+
+def test_what_is_left_is_drawn_in_the_unit_of_its_variable() -> None:
+    left = judge.structure([curves([0.0, 1.0, 2.0], [0.1, 0.1, 0.1], removed=0.2)])
+    assert (left.variables, left.gain) == (["gap"], 0.2)
+    ax = flexible_curve(left, "m/s").axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("gap (m)", "missing (m/s)")
+    assert list(np.asarray(ax.lines[-1].get_ydata())) == [0.0, 1.0, 2.0]

@@ -48,3 +48,8 @@ def test_knots_of_small_error_decide() -> None:
     heights = np.append(at[:-1], 100.0)
     found = symbolic("gap", at, heights, np.append(np.full(7, 0.01), 1e6))
     assert "+7 z with z = (gap - 0) / 7" in found
+
+
+def test_a_negative_beginning_is_added() -> None:
+    found = symbolic("speed difference", np.arange(-4.0, 4.0), np.arange(8.0), np.full(8, 0.01))
+    assert "z = (speed difference + 4) / 7" in found

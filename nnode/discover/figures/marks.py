@@ -133,7 +133,7 @@ def flexible_curve(structure: Structure, unit: str) -> Figure:
     ax.axhline(0, color=GREY, linewidth=0.8)
     ax.plot(structure.curve["at"], structure.curve["deviation"], color=OKABE_ITO["blue"])
     variable = structure.variables[0] if structure.variables else "variable"
-    dress(ax, x=variable, y=f"missing ({unit})")
+    dress(ax, x=_with_unit(variable, structure.unit), y=f"missing ({unit})")
     return figure
 
 
