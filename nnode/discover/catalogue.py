@@ -69,7 +69,14 @@ def _range(given: Strength | Setting) -> str:
     if given.range == Interval():
         return f"any{unit and f', in{unit}'}"
     low, high = (_number(value) for value in (given.range.low, given.range.high))
-    return f"{low} to {high}{unit}"
+    return f"{low} to {high}{unit}{_usual(given)}"
+
+
+def _usual(given: Strength | Setting) -> str:
+    if not isinstance(given, Strength) or given.usual is None:
+        return ""
+    away = f" away from {_number(given.neutral)}" if given.neutral else ""
+    return f", usually {_number(given.usual)} or more{away}"
 
 
 def _number(value: float) -> str:

@@ -50,7 +50,7 @@ class FieldOfView(ForceEffect):
     name = "field_of_view"
     formula = "sum over j of (w_ij - 1) f_ij, w = lambda_ + (1 - lambda_) (1 + cos phi_ij)/2"
     source = "Helbing, Farkas, Molnár & Vicsek 2002"
-    strengths = {"lambda_": Strength(1.0, -0.1, Interval(-0.5, 1.5), "1")}
+    strengths = {"lambda_": Strength(1.0, -0.1, Interval(-0.5, 1.5), "1", usual=0.25)}
     separated_by = "people who follow others closely, so that some are behind and some ahead"
 
     lambda_: Tensor
@@ -69,7 +69,7 @@ class Anticipation(ForceEffect):
     name = "anticipation"
     formula = "sum over j of f(x_ij + T_a v_ij, v_ij) - f(x_ij, v_ij)"
     source = "Zanlungo, Ikeda & Kanda 2011 (positions at a later time)"
-    strengths = {"T_a": Strength(0.0, 0.1, Interval(-0.5, 2.0), "s")}
+    strengths = {"T_a": Strength(0.0, 0.1, Interval(-0.5, 2.0), "s", usual=0.2)}
     separated_by = "approaches at different speeds that come equally near"
 
     T_a: Tensor
@@ -98,7 +98,7 @@ class EvasiveRotation(ForceEffect):
     name = "evasive_rotation"
     formula = "sum over j of (R(theta (1 - e_i·e_j)/2) - 1) f_ij"
     source = "Totzeck 2020 (an angle proportional to gamma there)"
-    strengths = {"theta": Strength(0.0, 0.1, Interval(-1.6, 1.6), "rad")}
+    strengths = {"theta": Strength(0.0, 0.1, Interval(-1.6, 1.6), "rad", usual=0.3)}
     separated_by = "encounters passed on the left as well as on the right, head on and crossing"
 
     theta: Tensor

@@ -28,7 +28,7 @@ class WalkerHeterogeneity(IndividualEffect):
     domain = "crowd"
     formula = "eta_i (v_des - v) / tau, eta_i ~ N(0, sigma²)"
     source = "Campanella, Hoogendoorn & Daamen 2009 (heterogeneous walkers)"
-    strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 2.0), "1")}
+    strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 2.0), "1", usual=0.2)}
     separated_by = "people who are recorded for longer and turn more often"
 
     sigma: Tensor
@@ -64,7 +64,7 @@ class GaitSway(IndividualEffect):
     domain = "crowd"
     formula = "a sin(2 pi f t + phase_i) right_i"
     source = "Hoogendoorn & Daamen 2005; Liu, Song & Zhang 2009 (lateral sway)"
-    strengths = {"a": Strength(0.0, 0.05, Interval(0.0, 5.0), "m/s²")}
+    strengths = {"a": Strength(0.0, 0.05, Interval(0.0, 5.0), "m/s²", usual=0.3)}
     settings = {"f": Setting(0.95, Interval(0.5, 1.6), "Hz")}
     separated_by = "sampling of at least 5 Hz with a noise below the amplitude of the sway"
 

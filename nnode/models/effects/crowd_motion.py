@@ -31,7 +31,7 @@ class SidePreference(PairEffect):
         " D = 3 m, S = 0.3 m"
     )
     source = "Moussaïd et al. 2009 (side preference in avoidance)"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²", usual=0.1)}
     kin = "avoidance_side"
     separated_by = "encounters at different distances and angles, so that the force's shape shows"
 
@@ -58,7 +58,7 @@ class GroupCohesion(Effect):
     formula = "c (mean of x_j over the others of the group - x_i)"
     source = "Moussaïd et al. 2010"
     domain = "crowd"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s²")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s²", usual=0.1)}
     separated_by = "groups that are pulled apart"
 
     c: Tensor
@@ -84,7 +84,7 @@ class PreferredSpeed(Effect):
     formula = "c (v_pref - |v|) v/|v|"
     source = "Helbing & Molnár 1995 (relaxation to the desired speed)"
     domain = "crowd"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-0.02, 5.0), "1/s")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.02, 5.0), "1/s", usual=0.2)}
     settings = {"v_pref": Setting(1.3, Interval(0.0, 3.0), "m/s")}
     kin = "speed"
     separated_by = "people who walk faster and slower than preferred, in thin crowds"
@@ -113,8 +113,8 @@ class Drift(Effect):
     source = "a slope, a wind or a current; no specific source"
     domain = "crowd"
     strengths = {
-        "a_x": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²"),
-        "a_y": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²"),
+        "a_x": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²", usual=0.1),
+        "a_y": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²", usual=0.1),
     }
     separated_by = "people who walk in several directions at several places"
 

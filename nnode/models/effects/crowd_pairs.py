@@ -83,7 +83,7 @@ class PairRepulsion(PairEffect):
     name = "pair_repulsion"
     formula = "sum over j of A_2 exp((2r - d_ij)/B_2) n_ij"
     source = "Helbing, Buzna, Johansson & Werner 2005 (two ranges)"
-    strengths = {"A_2": Strength(0.0, 0.05, Interval(-0.2, 20.0), "m/s²")}
+    strengths = {"A_2": Strength(0.0, 0.05, Interval(-0.2, 20.0), "m/s²", usual=0.2)}
     settings = {"B_2": Setting(0.8, Interval(0.1, 3.0), "m")}
     kin = "pair_force"
     separated_by = (
@@ -116,7 +116,7 @@ class SlidingFriction(PairEffect):
     name = "sliding_friction"
     formula = "sum over j of c exp((2r - d_ij)/B) ((v_j - v_i)·t_ij) t_ij, B = 0.5 m"
     source = "Helbing, Farkas & Vicsek 2000, with a range beyond contact"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 10.0), "1/s")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 10.0), "1/s", usual=0.2)}
     kin = "velocity_of_others"
     separated_by = "people who pass at different distances, overtaking as well as head on"
 
@@ -139,7 +139,7 @@ class Alignment(PairEffect):
     name = "alignment"
     formula = "c sum_j w_ij (v_j - v_i) / sum_j w_ij, w_ij = exp(-d_ij/R), R = 2 m"
     source = "Vicsek et al. 1995; Cucker & Smale 2007"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s", usual=0.2)}
     kin = "velocity_of_others"
     separated_by = "people who walk side by side at different speeds, far apart as well as near"
 
@@ -162,7 +162,7 @@ class DensitySlowdown(PairEffect):
     name = "density_slowdown"
     formula = "-c rho_i v_i, rho_i = sum_j exp(-d_ij²/(2 h²)) / (2 pi h²), h = 1 m"
     source = "Weidmann 1993; density: Helbing, Johansson & Al-Abideen 2007"
-    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "m²/s")}
+    strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "m²/s", usual=0.1)}
     kin = "speed"
     separated_by = "the same people at different densities"
 

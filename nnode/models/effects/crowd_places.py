@@ -52,7 +52,7 @@ class WallRepulsion(Effect):
     formula = "sum over walls w of A_w exp((r - d_w)/B_w) n_w"
     source = "Helbing & Molnár 1995"
     domain = "crowd"
-    strengths = {"A_w": Strength(0.0, 0.05, Interval(-0.5, 20.0), "m/s²")}
+    strengths = {"A_w": Strength(0.0, 0.05, Interval(-0.5, 20.0), "m/s²", usual=0.2)}
     settings = {"B_w": Setting(0.4, Interval(0.05, 2.0), "m")}
     separated_by = "people at different distances from walls on both sides"
 
@@ -90,7 +90,7 @@ class PlaceEffect(Effect):
     """A force from or towards an unknown place."""
 
     domain = "crowd"
-    strengths = {"A_o": Strength(0.0, 0.05, Interval(0.0, 20.0), "m/s²")}
+    strengths = {"A_o": Strength(0.0, 0.05, Interval(0.0, 20.0), "m/s²", usual=0.2)}
     settings = {
         "B_o": Setting(0.8, Interval(0.1, 5.0), "m"),
         "x_o": Setting(0.0, Interval(), "m"),

@@ -67,7 +67,7 @@ def _cells(low: float, high: float) -> list[Probe]:
     return [Probe({"a": a, "b": b}, {"alpha": -0.1}) for a, b in pairwise(ends)]
 
 
-_FACTOR = Strength(1.0, -0.1, Interval(0.05, 3.0), "1")
+_FACTOR = Strength(1.0, -0.1, Interval(0.05, 3.0), "1", usual=0.1)
 
 
 @CATALOGUE.add
@@ -177,7 +177,7 @@ class LeaderLength(Effect):
     domain = "traffic"
     formula = "W(gap - beta (l_{i+1} - mean l))"
     source = "Ossen & Hoogendoorn 2011"
-    strengths = {"beta": Strength(0.0, 0.1, Interval(-2.0, 3.0), "1")}
+    strengths = {"beta": Strength(0.0, 0.1, Interval(-2.0, 3.0), "1", usual=0.5)}
     rank = 33
     kin = "who"
     separated_by = "vehicles of more different lengths"
@@ -256,7 +256,7 @@ class LeaderSpeed(Effect):
     domain = "traffic"
     formula = "v0 + weight (measured speed - v0) for the leader"
     source = "the model option leader=measured"
-    strengths = {"weight": Strength(0.0, 0.1, Interval(-0.5, 1.5), "1")}
+    strengths = {"weight": Strength(0.0, 0.1, Interval(-0.5, 1.5), "1", usual=0.5)}
     rank = 5
 
     def forward(self, state: State) -> Tensor:
@@ -282,7 +282,7 @@ class DriverHeterogeneity(IndividualEffect):
     domain = "traffic"
     formula = "W (1 + eta_i), eta_i ~ N(0, sigma²)"
     source = "Ossen & Hoogendoorn 2011"
-    strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 1.0), "1")}
+    strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 1.0), "1", usual=0.1)}
     rank = 13
     kin = "who"
     separated_by = "the same drivers for a longer time"
@@ -305,7 +305,7 @@ class TimeGap(Effect):
     domain = "traffic"
     formula = "W with L + h ẋ_{i+1} in place of L"
     source = "constant time headway: Pipes 1953; Treiber, Hennecke & Helbing 2000"
-    strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s")}
+    strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s", usual=0.2)}
     rank = 40
     kin = "reaction to the vehicle ahead"
     separated_by = "a wider range of speeds"
