@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := runs/demo
 
-.PHONY: setup demo test exchange coverage tutorials docs lint study clean
+.PHONY: setup demo test thorough exchange coverage tutorials docs lint study clean
 
 setup: $(VENV)/.installed
 
@@ -32,6 +32,10 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
+# What takes long beside it: runs that are stopped and gone on with, compiled twice, shared, tortured.
+thorough: setup
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 -m thorough
+
 # The neighbouring programs let run: what they write is read, calibrated and diagnosed. Where one of
 # them cannot be installed, that is said and its tests are skipped.
 exchange: setup
@@ -45,7 +49,7 @@ exchange: setup
 # Which lines of the package the tests run; below 90 % it fails.
 coverage: setup
 	rm -rf runs/coverage && mkdir -p runs/coverage
-	$(BIN)/coverage run -m pytest
+	$(BIN)/coverage run -m pytest -m "not slow and not tutorial"
 	$(BIN)/coverage combine --quiet
 	rm -f runs/coverage/data.*  # of processes that were killed while they wrote it
 	$(BIN)/coverage report

@@ -40,6 +40,7 @@ def options(**changes: object):  # type: ignore[no-untyped-def]
     return config
 
 
+@pytest.mark.thorough
 def test_all_engines(small, tmp_path) -> None:  # type: ignore[no-untyped-def]
     chosen = ["odeint_adjoint", "odeint", "loop", "fused_1", "fused_2"]
     benchmark.benchmark(options(engines=chosen), tmp_path)

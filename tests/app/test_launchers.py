@@ -93,6 +93,7 @@ def test_two_processes_train_as_one(alone: Path, prepared: str, tmp_path: Path) 
     assert not list(temporary.glob("nnode-*"))  # the second process has cleaned up
 
 
+@pytest.mark.thorough
 def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     last = run / "checkpoints" / "last.pt"
@@ -128,7 +129,9 @@ def test_an_error_is_said_once(prepared: str, tmp_path: Path, override: str, mes
     assert errors.count(message) == 1
 
 
-@pytest.mark.parametrize("launcher", ["cores", "submitit_local"])
+@pytest.mark.parametrize(
+    "launcher", ["cores", pytest.param("submitit_local", marks=pytest.mark.thorough)]
+)
 def test_runs_of_a_sweep_in_other_processes(
     script: Script, prepared: str, tmp_path: Path, launcher: str
 ) -> None:

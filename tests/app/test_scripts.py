@@ -211,6 +211,7 @@ def interrupted(raw: Path, folder: Path, stops: int, epochs: int) -> None:
         assert a.history == b.history
 
 
+@pytest.mark.thorough
 def test_two_signals_at_random_moments_change_no_bit(raw: Path, tmp_path: Path) -> None:
     interrupted(raw, tmp_path, 2, epochs=12)
 
@@ -273,6 +274,7 @@ def test_evaluation_tells_what_was_trained_on(
         assert metrics["sequences"] >= metrics["trained_on"]
 
 
+@pytest.mark.thorough
 def test_the_fused_solver_trains_to_the_same_numbers(
     script: Script, traffic: Path, raw: Path, tmp_path: Path
 ) -> None:

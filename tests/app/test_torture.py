@@ -25,6 +25,7 @@ def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.thorough
 def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
     found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=650")
     assert found["tried"]["kills"] == 6

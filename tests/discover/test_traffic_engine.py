@@ -198,7 +198,9 @@ def test_drivers_who_differ_are_recognised() -> None:
     assert errors[0] < errors[1]
 
 
-@pytest.mark.parametrize("what", ["the hour", "the place in the platoon"])
+@pytest.mark.parametrize(
+    "what", ["the hour", pytest.param("the place in the platoon", marks=pytest.mark.thorough)]
+)
 def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
     alarms = 0
     for seed in range(6, 12):

@@ -51,6 +51,7 @@ def test_every_link_leads_somewhere() -> None:
         assert (ROOT / link).exists(), link
 
 
+@pytest.mark.thorough
 def test_your_own_data_in_ten_lines(tmp_path: Path) -> None:
     (text,) = (t for lang, t in blocks(README) if lang == "python" and "mine.csv" in t)
     assert len([line for line in text.splitlines() if line.strip()]) <= 10

@@ -30,6 +30,7 @@ print(json.dumps({"hits": hits}))
 """
 
 
+@pytest.mark.thorough
 def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
     runs = []
     for _ in range(2):
