@@ -34,8 +34,9 @@ def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int) -> list[
         TableBlock(
             "criteria",
             tables.criteria(frame, coefficients),
-            "Shares of cases, or medians. *closure* is the share of what the truth itself closes "
-            "of the sealed gap.",
+            "Shares of cases, or medians, at the noise and the number of sequences that most cases "
+            "have; of medium strength where not said otherwise. *closure* is the share of what the "
+            "truth itself closes of the sealed gap.",
         ),
         Heading("By arm"),
         Text("\n".join(f"- `{name}`: {what}" for name, what in ARMS.items())),

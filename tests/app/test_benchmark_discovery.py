@@ -77,6 +77,22 @@ def test_named_effects_are_scored_and_summed_up(tmp_path):
     assert criteria.loc["one effect: right class", "met"]
 
 
+def test_weak_effects_and_other_noise_do_not_count_for_the_headline(tmp_path):
+    asked = {"domains": ["traffic"], "arms": ["single"], "effects": ["relative_speed", "inertia"]}
+    run(tmp_path, **asked, strengths=["medium"])
+    run(tmp_path, **asked, strengths=["weak"])
+    run(tmp_path, **{**asked, "effects": ["inertia"]}, strengths=["medium"], noises=[0.3])
+    found = pd.read_csv(tmp_path / "criteria.csv").set_index("measure")
+    for measure in ("one effect: exact name", "one weak effect: exact name"):
+        assert tuple(found.loc[measure, ["reached", "cases"]]) == (0.5, 2)
+    assert found.loc["one weak effect: any wrong name", "reached"] == 0.5
+    rows = pd.read_csv(tmp_path / "verdicts.csv")
+    assert len(rows) == 5
+    rows["named"] = "relative_speed"
+    shown = tables.confusion(rows.assign(hidden=rows["strength"]), "traffic")
+    assert list(shown.index) == ["medium"]
+
+
 def test_false_names_and_failures_are_counted(tmp_path):
     rows = run(tmp_path, domains=["traffic"], arms=["nothing", "fault"])
     jumped = rows.set_index("variant").loc["jump"]
