@@ -41,6 +41,11 @@ class WalkerHeterogeneity(IndividualEffect):
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         return super().probes(batch, system) if system.find(Relaxation) is not None else []
 
+    @classmethod
+    def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
+        """At least -1: below it a person would run away from his own destination."""
+        return max(float(numbers[0]), -1.0)
+
     def forward(self, state: State) -> Tensor:
         relaxation = None if state.system is None else state.system.find(Relaxation)
         if relaxation is None:

@@ -15,7 +15,7 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Relaxation, Scene, SocialForce, State
 from nnode.models.build import add_effects
-from nnode.models.effects import CATALOGUE, Effect
+from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 
 A, K, KAPPA, R, B = 3.0, 40.0, 9.0, 0.2, 0.3
 WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 3.0, 0.0, 3.0], [1.0, 1.0, 2.0, 1.5]])
@@ -343,6 +343,13 @@ def test_people_of_other_sequences_are_left_alone(name: str) -> None:
     found = again(state(model))
     torch.testing.assert_close(found[1:], before[1:])
     assert bool((found[0] == 0).all())
+
+
+def test_nobody_runs_away_from_his_destination() -> None:
+    walkers = CATALOGUE.effects["walker_heterogeneity"]
+    assert issubclass(walkers, IndividualEffect)
+    for fitted, eta in ((0.4, 0.4), (-0.9, -0.9), (-2.1, -1.0)):
+        assert walkers.person(np.array([fitted]), {}) == eta
 
 
 def test_a_misspelt_parameter_is_refused() -> None:
