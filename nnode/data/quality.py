@@ -68,6 +68,8 @@ class Limits:
             Beyond it a step back is a jump.
         noise: m, an error that a single position may have without being a fault: 0.5 for a
             vehicle in a road camera's image, 0.1 for a head seen from above.
+        scatter: what a displacement's error may be in standard deviations, as these are seen in
+            the sequence itself; 0 where paths are too short or too coarse to tell.
         spacing: m. Fronts of consecutive vehicles in one lane: 2, as no car is shorter.
             Centres of two people: 0.1, half the breadth of a head.
         reach: m within which a position continues a path extrapolated at constant velocity:
@@ -84,6 +86,7 @@ class Limits:
     min_agents: int
     min_samples: int = 3
     uneven: float = 0.01
+    scatter: float = 0.0
 
 
 #: Limits by domain.
@@ -92,7 +95,13 @@ LIMITS: dict[Domain, Limits] = {
         max_speed=60.0, max_reverse=10.0, noise=0.5, spacing=2.0, reach=5.0, min_agents=2
     ),
     "crowd": Limits(
-        max_speed=5.0, max_reverse=5.0, noise=0.1, spacing=0.1, reach=0.4, min_agents=1
+        max_speed=5.0,
+        max_reverse=5.0,
+        noise=0.1,
+        spacing=0.1,
+        reach=0.4,
+        min_agents=1,
+        scatter=4.0,
     ),
 }
 
@@ -219,7 +228,8 @@ def _displacements(view: _View) -> Iterator[Fault]:
     limits, x = view.limits, view.x
     step = np.diff(x, axis=0)
     size = np.linalg.norm(step, axis=2)
-    far = size > limits.max_speed * view.dt + limits.noise
+    error = max(limits.noise, limits.scatter * np.sqrt(2) * _scatter(x))
+    far = size > limits.max_speed * view.dt + error
     back = np.zeros_like(far)
     if view.domain == "traffic":
         far |= step[:, :, 0] < -(limits.max_reverse * view.dt + limits.noise)
@@ -243,6 +253,15 @@ def _displacements(view: _View) -> Iterator[Fault]:
                 )
                 kind = "jump" if far[k, i] else "backward"
                 yield view.fault(kind, (i,), k + 1, text)
+
+
+def _scatter(x: np.ndarray) -> float:
+    """Standard deviation of the errors of positions (m), by third differences: people's paths are
+    smooth, and some faults do not move a median."""
+    third = np.abs(np.diff(x, 3, axis=0))
+    third = third[np.isfinite(third)]
+    # 0.6745: median of a standard normal variable's size; 20: sum of 1, 3, 3, 1 squared
+    return float(np.median(third) / 0.6745 / np.sqrt(20)) if third.size else 0.0
 
 
 def _expected(sound: np.ndarray, k: int) -> np.ndarray:

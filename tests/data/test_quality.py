@@ -61,6 +61,17 @@ def test_clean_people_have_no_fault() -> None:
     assert kinds(people(), "crowd") == []
 
 
+@pytest.mark.parametrize("dt", [0.04, 0.1])
+def test_people_measured_badly_do_not_jump(dt: float) -> None:
+    for seed in range(20):
+        s = people(k=60, dt=dt)
+        noisy = s.x + np.random.default_rng(seed).normal(0.0, 0.1, s.x.shape)
+        assert kinds(replace(s, x=noisy), "crowd") == []
+        # somebody who does is still seen
+        noisy[30:, 2] += (1.0, 0.8)
+        assert kinds(replace(s, x=noisy), "crowd") == ["jump"]
+
+
 def test_zero_row() -> None:
     s = changed(platoon(), (slice(None), 1), 0.0)
     (fault,) = find_faults(s, "traffic")
