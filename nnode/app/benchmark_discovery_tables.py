@@ -127,8 +127,8 @@ def confusion(frame: pd.DataFrame, domain: str) -> pd.DataFrame:
 
     Nothing hidden is a row as well; a verdict of unknown without a name is a column.
     """
-    part = headline(frame[(frame["domain"] == domain) & ~frame["strength"].isin(_OTHER)])
-    part = part[part["arm"].isin(["single", "nothing", "outside"])]
+    part = headline(frame[frame["domain"] == domain])
+    part = part[part["arm"].isin(["single", "nothing", "outside"]) & ~part["strength"].isin(_OTHER)]
     first = part["named"].str.split("+").str[0]
     first = first.where(~((first == "nothing") & part["unknown"]), "unknown")
     hidden = part["hidden"].where(part["arm"] != "outside", "(" + part["hidden"] + ")")
@@ -141,10 +141,9 @@ def confusion(frame: pd.DataFrame, domain: str) -> pd.DataFrame:
 
 def headline(frame: pd.DataFrame) -> pd.DataFrame:
     """The cases with the noise and the number of sequences that most have."""
-    columns = ["noise", "n_sequences"]
     if frame.empty:
         return frame
-    noise, number = frame[columns].value_counts().index[0]
+    noise, number = frame[["noise", "n_sequences"]].value_counts().index[0]
     return frame[(frame["noise"] == noise) & (frame["n_sequences"] == number)]
 
 
