@@ -16,7 +16,8 @@ from omegaconf import OmegaConf
 from nnode.config import SCHEMAS
 from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
-from nnode.discover.diagnose import divide, engine_of
+from nnode.discover.confirm import engine_of
+from nnode.discover.division import divide
 from nnode.discover.engine import Engine, fill, row_of, square_of
 from nnode.discover.fit import Fit, refine
 from nnode.discover.inputs import read_inputs
@@ -78,14 +79,15 @@ def peers_on_table(
     )  # fmt: skip
     with TemporaryDirectory(prefix="nnode-peers-") as scratch:
         sequences = read_inputs(data, Path(scratch)).sequences
-    opened, sealed = divide(sequences, DiscoverOptions(seed=seed))
-    engine = engine_of(domain, [sequences[i] for i in opened])
+    division = divide(sequences, DiscoverOptions(seed=seed))
+    opened, sealed = division.open, division.sealed
+    engine = engine_of(domain, [sequences[i] for i in opened], division.label[opened])
     fit = settled(engine, copy.deepcopy(system).double())
     offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not e.individual]
     found = [trace for effect in offered for trace in traces(engine, fit, effect)]
     columns = [Column(trace, i) for trace in found for i in range(trace.columns.shape[1])]
     values = np.concatenate([trace.columns for trace in found], axis=1)
-    library = Library(values, -fit.residual, fit.tangents, engine.sequence)
+    library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
     whole = engine_of(domain, [sequences[i] for i in sealed], whole=True)
     whole.settle(fit.system, row_of(fit.system))

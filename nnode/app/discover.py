@@ -183,14 +183,9 @@ def _diagnose(job: Job, stages: Stages | None = None) -> Found:
     """Run the diagnosis, and add what only its caller knows."""
     set_threads(None, job.system.domain)
     inputs = job.inputs
-    found = diagnose(job.system, inputs.sequences, job.options, faults=inputs.faults, stages=stages)
+    found = diagnose(job.system, inputs.sequences, job.options, stages=stages)
     diagnosis = found.diagnosis
-    # the reader of the data knows the agents by name
-    known = {(fault.kind, fault.sequence, fault.time) for fault in inputs.data_faults}
-    others = [f for f in diagnosis.data_faults if (f.kind, f.sequence, f.time) not in known]
-    diagnosis.data_faults = [*inputs.data_faults, *others]
-    if diagnosis.verdict == "none" and diagnosis.data_faults:
-        diagnosis.verdict = "data_fault"
+    diagnosis.data_faults = inputs.data_faults
     diagnosis.model = str(job.model["name"])
     diagnosis.seconds = {"reading": job.seconds, **diagnosis.seconds}
     return found
@@ -263,7 +258,7 @@ def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:
     d = found.diagnosis
     print(f"verdict: {d.verdict}")
     print(sentence(d))
-    for effect in d.effects:
+    for effect in d.effects or d.leads:
         print(f"  {effect.name}: {interval(effect)}")
         print(f"    {effect.formula}; {effect.where}")
         for other in effect.alternatives:

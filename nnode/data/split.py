@@ -1,37 +1,26 @@
 """Which sequences are held out from training, so that no agent is on both sides.
 
-Sequences of one recording that share an agent are connected. Where the connected components are
-small, whole components are drawn at random. Where they are not - in a corridor everyone takes
-part in several successive sequences, which chains a whole recording together - one contiguous
-block of time is held out from each recording, and the sequences at its borders that share an
-agent with it are dropped from training.
-
-Without identifiers (ESIMAS), two sequences closer in time than ``gap`` count as sharing an agent.
-The default of 5 s comes from those recordings: at the end of a sequence its last vehicle has
-2 to 3 s (median) and mostly (82 to 95 %) at most 5 s to go until it leaves the camera's view, so
-that later sequences rarely hold it.
+Where clusters (:mod:`nnode.data.clusters`) are small, whole clusters are drawn at random. Where
+they are not - in a corridor everyone takes part in several successive sequences, which chains a
+whole recording together - one contiguous block of time is held out from each recording, and the
+sequences at its borders that share an agent with it are dropped from training.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from collections.abc import Sequence as ListLike
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from nnode.data.clusters import Index, by_recording, clusters, identified, relation
 from nnode.data.options import SplitMode, SplitOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
 #: Relative error of the held-out share up to which whole components do, in mode ``auto``.
 TOLERANCE = 0.25
-
-Index = ListLike[Mapping[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +82,7 @@ def split(sequences: Store | Index, options: SplitOptions) -> Split:
 
 
 def _by_component(index: Index, share: float, gap: float, rng: np.random.Generator) -> Split:
-    label = components(index, gap)
+    label = clusters(index, gap)
     size = np.bincount(label)
     target = share * len(index)
     held: list[int] = []
@@ -105,7 +94,7 @@ def _by_component(index: Index, share: float, gap: float, rng: np.random.Generat
     out = np.isin(label, held)
     note = (
         f"{got} of {len(index)} sequences held out ({len(held)} of {len(size)} groups of "
-        f"sequences that {_relation(index, gap)})"
+        f"sequences that {relation(index, gap)})"
     )
     return Split(
         train=np.flatnonzero(~out).tolist(),
@@ -119,7 +108,7 @@ def _by_component(index: Index, share: float, gap: float, rng: np.random.Generat
 def _by_block(index: Index, share: float, gap: float, rng: np.random.Generator) -> Split:
     held: list[int] = []
     dropped: list[int] = []
-    for members in _recordings(index).values():
+    for members in by_recording(index).values():
         count = round(share * len(members))
         if not count:
             continue
@@ -136,7 +125,7 @@ def _by_block(index: Index, share: float, gap: float, rng: np.random.Generator) 
         dropped=sorted(dropped),
         mode="block",
         note=f"{len(held)} of {len(index)} sequences held out, one block of time per recording; "
-        f"{len(dropped)} at the borders, which {_relation(index, gap)} with it, are not used",
+        f"{len(dropped)} at the borders, which {relation(index, gap)} with it, are not used",
     )
     return _checked(
         result,
@@ -158,34 +147,9 @@ def _checked(result: Split, share: float, hint: str) -> Split:
     )
 
 
-def components(index: Index, gap: float) -> np.ndarray:
-    """``(S,)`` label of the connected component of each of S sequences, counted from 0.
-
-    Args:
-        index: see :func:`split`.
-        gap: s; sequences of a recording without identifiers are connected where less time
-            passes between them. 0 connects none.
-    """
-    edges: list[tuple[int, int]] = []
-    for members in _recordings(index).values():
-        if _identified(index, members):
-            first: dict[str, int] = {}
-            edges += [(first.setdefault(a, i), i) for i in members for a in index[i]["agents"]]
-            continue
-        order = sorted(members, key=lambda i: (index[i]["start"], i))
-        end, last = index[order[0]]["end"], order[0]
-        for i in order[1:]:
-            if _apart(end, index[i]["start"]) < gap:
-                edges.append((last, i))
-            end, last = max(end, index[i]["end"]), i
-    row, column = np.array(edges, dtype=int).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(row)), (row, column)), shape=(len(index), len(index)))
-    return np.asarray(connected_components(graph, directed=False)[1])
-
-
 def _related(index: Index, rest: list[int], block: list[int], gap: float) -> list[int]:
     """Those of ``rest`` that may share an agent with ``block``; all of one recording."""
-    if _identified(index, rest + block):
+    if identified(index, rest + block):
         agents = {a for i in block for a in index[i]["agents"]}
         return [i for i in rest if not agents.isdisjoint(index[i]["agents"])]
     spans = [(index[i]["start"], index[i]["end"]) for i in block]
@@ -201,22 +165,3 @@ def _related(index: Index, rest: list[int], block: list[int], gap: float) -> lis
 
 def _apart(end: float, start: float) -> float:
     return max(0.0, start - end)
-
-
-def _recordings(index: Index) -> dict[str, list[int]]:
-    groups: dict[str, list[int]] = {}
-    for i, entry in enumerate(index):
-        groups.setdefault(entry["recording"], []).append(i)
-    return groups
-
-
-def _identified(index: Index, members: list[int]) -> bool:
-    return all(index[i]["agents"] for i in members)
-
-
-def _relation(index: Index, gap: float) -> str:
-    known = [bool(entry["agents"]) for entry in index]
-    if all(known):
-        return "share an agent"
-    near = f"are closer than {gap:g} s in time"
-    return f"share an agent or {near}" if any(known) else near

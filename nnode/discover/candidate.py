@@ -9,13 +9,11 @@ import numpy as np
 
 from nnode.discover.compare import Comparison
 from nnode.discover.engine import Engine
-from nnode.discover.fit import ROUGH, Fit, evaluated, refine
-from nnode.discover.individual import Individuals, individuals, sharpened
+from nnode.discover.fit import ROUGH, Fit, refine
 from nnode.discover.score import Score, Screen, traces
 from nnode.errors import SimulationError
-from nnode.models.effects import Effect, IndividualEffect
-from nnode.models.extend import effects_of, extended, place_of, without
-from nnode.models.system import System
+from nnode.models.effects import Effect
+from nnode.models.extend import extended, place_of
 
 #: An interval is moved at most so many times.
 SHIFTS = 3
@@ -28,10 +26,9 @@ class Candidate:
     Attributes:
         score: that it was chosen by.
         fit: of the extended model.
-        losses: ``(S,)`` held-out cost of each sequence.
+        losses: ``(G,)`` held-out cost of each cluster that tells of the effect.
         gain: over the model without it.
         removed: share of the first model's squared errors of positions that it removed.
-        individuals: of an individual effect.
     """
 
     score: Score
@@ -39,7 +36,6 @@ class Candidate:
     losses: np.ndarray
     gain: Comparison
     removed: float
-    individuals: Individuals | None = None
 
     @property
     def name(self) -> str:
@@ -55,11 +51,9 @@ class Candidate:
         first, last = (float(own.get_parameter(name).detach()) for name in ("a", "b"))
         return first < last
 
-    def strength_excludes_neutral(self, sequence: np.ndarray) -> bool:
+    def strength_excludes_neutral(self, cluster: np.ndarray) -> bool:
         """Whether the interval of any of its strengths excludes the neutral value."""
-        if self.individuals is not None and self.individuals.interval[0] <= 0:
-            return False
-        intervals = self.fit.intervals(sequence)
+        intervals = self.fit.intervals(cluster)
         place = place_of(self.fit.system, self.name)
         known = [
             (strength.neutral, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
@@ -69,14 +63,9 @@ class Candidate:
         return not known or any(low > neutral or high < neutral for neutral, low, high in known)
 
 
-def calibrated(
-    engine: Engine, before: Fit, score: Score, hopeless: float, one: Individuals | None
-) -> tuple[Fit, Individuals | None]:
-    """The model with one more effect, and the agents' numbers of an individual one."""
+def calibrated(engine: Engine, before: Fit, score: Score, hopeless: float) -> Fit:
+    """The model with one more effect."""
     system, place = extended(before.system, score.effect(**score.options))
-    if one is not None:
-        system, one = _peopled(engine, system, one)
-        return refine(engine, system, tolerance=ROUGH), one
     fit = refine(engine, system, tolerance=ROUGH, hopeless=hopeless)
     if score.effect.consecutive:
         # a strong effect bends the paths, so that the interval of a weak one would be off
@@ -85,7 +74,7 @@ def calibrated(
             if shifted is None:
                 break
             fit = shifted
-    return fit, None
+    return fit
 
 
 def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit | None:
@@ -93,7 +82,7 @@ def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit 
     own = fit.system.terms[place]
     assert isinstance(own, effect)
     now = own.options()
-    (score,) = Screen(fit, engine.block).scores(traces(engine, fit, effect))
+    (score,) = Screen(fit, engine.cluster).scores(traces(engine, fit, effect))
     if score.gain < ROUGH:
         return None
     low, high = score.options["a"], score.options["b"]
@@ -114,26 +103,3 @@ def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit 
         if found.cost < (1 - ROUGH) * (fit if best is None else best).cost:
             best = found
     return best
-
-
-def again(engine: Engine, fit: Fit, chosen: Candidate) -> Fit:
-    """Everybody's numbers once more, around the parameters that the model has with them."""
-    kind, one = chosen.score.effect, chosen.individuals
-    assert issubclass(kind, IndividualEffect)
-    assert one is not None
-    if len(engine.people[0]) == 1:
-        plain = evaluated(engine, without(fit.system, kind.name))
-        one = individuals(engine, plain, kind)
-        if one is None:
-            return fit
-    system, chosen.individuals = _peopled(engine, copy.deepcopy(fit.system), one)
-    return refine(engine, system)
-
-
-def _peopled(engine: Engine, system: System, one: Individuals) -> tuple[System, Individuals]:
-    """A model with an individual effect, and everybody's numbers in it."""
-    one = sharpened(engine, system, one)
-    for effect in effects_of(system):
-        if isinstance(effect, one.effect):
-            effect.people = one.people
-    return system, one

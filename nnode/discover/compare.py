@@ -1,4 +1,4 @@
-"""Held-out costs of calibrated models by sequence, and tests of their differences."""
+"""Held-out costs of calibrated models by cluster, and tests of their differences."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from scipy import stats
 
 from nnode.discover.fit import Fit, sums
 
-#: What the other sequences know less of than this share of what all know is not changed by
+#: What the other clusters know less of than this share of what all know is not changed by
 #: leaving one out: nothing follows from them.
 ALONE = 0.02
 
 
-def heldout(fit: Fit, sequence: np.ndarray) -> np.ndarray:
-    """``(S,)`` cost of each sequence under the parameters that the other sequences give.
+def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
+    """``(G,)`` cost of each cluster under the parameters that the other clusters give.
 
     See :meth:`Fit.left_out`.
     """
     columns, residual = fit.tangents, fit.residual
     if columns.shape[1]:
-        moved = fit.left_out(sequence, ALONE)
-        residual = residual + (columns * moved[sequence]).sum(1)
-    return sums(residual**2, sequence)
+        moved = fit.left_out(cluster, ALONE)
+        residual = residual + (columns * moved[cluster]).sum(1)
+    return sums(residual**2, cluster)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of two models on the same sequences.
+    """Of two models on the same clusters.
 
     Attributes:
-        gain: mean over the sequences of (first - second) / max(first, second).
+        gain: mean over the clusters of (first - second) / max(first, second).
         low, high: its interval of 95 %.
         p_value: that the second is not better, one-sided.
     """
@@ -42,15 +42,21 @@ class Comparison:
     p_value: float
 
 
+def gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """``(G,)`` (first - second) / max(first, second), 0 where both vanish."""
+    larger = np.maximum(first, second)
+    found: np.ndarray = np.where(larger > 0, first - second, 0.0) / np.where(larger > 0, larger, 1)
+    return found
+
+
 def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
-    """Paired by sequence; each one's difference is relative to its greater cost, so that no
-    sequence dominates.
+    """Paired by cluster; each one's difference is relative to its greater cost, so that no
+    cluster dominates.
 
     Args:
-        first, second: ``(S,)`` held-out costs.
+        first, second: ``(G,)`` held-out costs.
     """
-    larger = np.maximum(first, second)
-    share = np.where(larger > 0, (first - second) / np.where(larger > 0, larger, 1), 0.0)
+    share = gains(first, second)
     number = len(share)
     mean = float(share.mean())
     if number < 2:

@@ -18,7 +18,7 @@ from nnode.discover.crowd_variables import crowd_variables
 from nnode.discover.crowd_walk import Tables, Walk
 from nnode.discover.crowd_whitening import Whitening
 from nnode.discover.crowd_windows import Windows, WindowScene
-from nnode.discover.engine import Squares, fill
+from nnode.discover.engine import Squares, fill, of_residuals
 from nnode.discover.variables import Variable
 from nnode.models.effects.base import Effect, Probe
 from nnode.models.system import Crowd, System
@@ -55,25 +55,30 @@ class CrowdEngine:
     Args:
         sequences: of people, equally sampled.
         window: length of a window, s.
-        span: windows of a sequence that make one block, about this long together, s.
+        clusters: ``(S,)`` of the sequences; None: each is one.
 
     Attributes:
         batch: the sequences.
         sequence: ``(n,)`` position of each residual's sequence in the batch.
-        block: ``(n,)`` number of its block: everyone in neighbouring windows of a sequence.
+        clock: ``(n,)`` s, when its window begins.
         unit: ``(n,)`` number of its person, counted through all sequences.
         people: of each unit the sequence and the place of the person.
-        half: ``(n,)`` 0 or 1: windows of a person taken alternately.
 
     Raises:
         DataError: sequences too short for a window, or positions that are no numbers.
     """
 
-    def __init__(self, sequences: Many[Sequence], window: float = 1.5, span: float = 3.0) -> None:
+    def __init__(
+        self,
+        sequences: Many[Sequence],
+        window: float = 1.5,
+        clusters: np.ndarray | None = None,
+    ) -> None:
+        self.sequences = list(sequences)
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         which, who = self.windows.person.T
-        self._span = max(1, round(span / window))
+        self._clusters = clusters
         pairs, unit = np.unique(
             np.stack([self.windows.sequence[which], who], 1), axis=0, return_inverse=True
         )
@@ -103,11 +108,7 @@ class CrowdEngine:
         squares = found.reshape(len(which), -1, 2)
         squares = (squares**2).sum(-1)
         each = squares.shape[1]
-        return Squares(
-            squares.ravel(),
-            self.windows.sequence[which].repeat(each),
-            (self.windows.number[which] % 2).repeat(each),
-        )
+        return Squares(squares.ravel(), self.windows.sequence[which].repeat(each))
 
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""
@@ -151,12 +152,11 @@ class CrowdEngine:
     def _label(self, each: int) -> None:
         """Say whose ``each`` residuals of every person's window are."""
         which = self.windows.person[:, 0]
-        sequence, number = self.windows.sequence[which], self.windows.number[which]
-        block = np.stack([sequence, number // self._span], 1)
-        self.sequence = sequence.repeat(each)
-        self.block = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1).repeat(each)
+        self.sequence = self.windows.sequence[which].repeat(each)
+        self.cluster = of_residuals(self._clusters, self.sequence)
+        self.clock = self.windows.batch.start.numpy()[which].repeat(each)
+        self.component = np.tile(np.arange(each), len(which))
         self.unit = self._unit.repeat(each)
-        self.half = (number % 2).repeat(each)
 
     # -- what makes it fast ----------------------------------------------------------------
 

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 
-from nnode.data.options import SplitOptions
-from nnode.data.quality import Fault
+from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.data.split import split
-from nnode.discover.crowd import CrowdEngine
-from nnode.discover.engine import Engine, row_of, square_of
-from nnode.discover.fit import Fit, evaluated
+from nnode.discover.confirm import LEVEL, engine_of
+from nnode.discover.division import Division, divide
+from nnode.discover.engine import Engine, of_residuals, square_of
+from nnode.discover.fit import Fit
 from nnode.discover.found import Found
-from nnode.discover.individual import individuals, sharpened
-from nnode.discover.judge import absences, named, places, structure
+from nnode.discover.individual import individuals
+from nnode.discover.judge import absences, agents_absent, named, named_agents, places, structure
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.result import Diagnosis, Gap, Verdict
-from nnode.discover.search import Search, search, settled
+from nnode.discover.power import Way
+from nnode.discover.result import Clusters, Diagnosis, FirstScreen, Verdict
+from nnode.discover.sealed import Sealed
+from nnode.discover.search import BETTER, Search, search, settled
+from nnode.discover.simultaneous import Simultaneous, simultaneous
 from nnode.discover.traffic import TrafficEngine
-from nnode.discover.unbiased import unbiased
 from nnode.discover.variables import Curves, curves, weighed
-from nnode.errors import DataError
-from nnode.models.effects import CATALOGUE, IndividualEffect
-from nnode.models.extend import effects_of
+from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.system import System
 from nnode.progress import Stages
 
@@ -36,6 +35,8 @@ from nnode.progress import Stages
 LEFT, SURE = 0.02, 0.01
 #: Named effects do not explain the data where what is left is this share of what they removed.
 TOO_MUCH = 0.5
+#: Effects that are described where nothing can be tested.
+LEADS = 3
 
 
 #: Stages of a diagnosis, with the seconds that they take on the motorway recordings.
@@ -61,11 +62,14 @@ class _Clock:
         self.last = now
 
 
-def engine_of(domain: str, sequences: list[Sequence], whole: bool = False) -> Engine:
-    """The engine of a domain; ``whole`` compares whole sequences where that makes sense."""
-    if domain == "crowd":
-        return CrowdEngine(sequences)
-    return TrafficEngine(sequences, np.inf) if whole else TrafficEngine(sequences)
+@dataclass
+class _Start:
+    """The calibrated model in the residuals of the open sequences."""
+
+    division: Division
+    engine: Engine
+    base: Fit
+    tested: Simultaneous
 
 
 def diagnose(
@@ -73,7 +77,6 @@ def diagnose(
     sequences: list[Sequence],
     options: DiscoverOptions,
     *,
-    faults: dict[str, list[Fault]] | None = None,
     stages: Stages | None = None,
 ) -> Found:
     """Find out what a model lacks on some sequences.
@@ -82,7 +85,6 @@ def diagnose(
         system: the model; it is not changed.
         sequences: without faults, at least three of them.
         options: see :class:`~nnode.discover.options.DiscoverOptions`.
-        faults: that were found in other sequences, by name.
         stages: shows how far the work is.
 
     Raises:
@@ -95,10 +97,8 @@ def diagnose(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     stages.begin("calibrating")
-    opened, sealed = divide(sequences, options)
-    engine = engine_of(domain, [sequences[i] for i in opened])
-    start = copy.deepcopy(system).double()
-    base = settled(engine, engine.near(start) if isinstance(engine, TrafficEngine) else start)
+    start = _calibrated(system, sequences, options)
+    division, engine, base = start.division, start.engine, start.base
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     stages.begin("locating")
@@ -107,51 +107,144 @@ def diagnose(
     located = places(first, _excess(engine, base))
     clock.lap("locate")
     stages.begin("naming")
-    effects = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
+    wanted = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
+    effects = [effect for effect in wanted if not issubclass(effect, IndividualEffect)]
+    numbers = _clusters(start, options, len(effects))
+    enough = numbers.open >= numbers.least
     found = search(
-        engine, base, effects, alpha=options.alpha, most=options.max_effects, seed=options.seed,
-        variables=variables, within=stages.within,
+        engine, base, effects, alpha=options.alpha, most=options.max_effects if enough else 0,
+        seed=options.seed, variables=variables, levels=_levels(engine, effects),
+        within=stages.within,
     )  # fmt: skip
+    clock.lap("name")
+    stages.begin("comparing on sealed sequences")
+    sealed = Sealed(
+        domain, base_system, [sequences[i] for i in division.open],
+        [sequences[i] for i in division.sealed], division.label[division.sealed],
+        numbers.sealed, options.seed,
+    )  # fmt: skip
+    found, leads = sealed.confirmed(engine, found)
     last = first
     if found.fit is not base:
         last = weighed(engine, found.fit, curves(engine, found.fit, variables), SURE)
     left = [one for one in last if one.removed > LEFT]
-    clock.lap("name")
-    stages.begin("comparing on sealed sequences")
-    removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
-    verdict = _verdict(found, left, removed, bool(faults))
-    if found.steps and domain == "crowd":
-        found.fit = unbiased(found.fit, [sequences[i] for i in opened], options.seed)
-    gap, each = _gap(domain, base_system, found, [sequences[i] for i in sealed])
+    assert found.screen is not None
+    absent = absences(found, Way(found.screen, options.alpha, BETTER, numbers.sealed, LEVEL))
+    final = sealed.corrected(found)
+    kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
+    seen = [one for kind in kinds if (one := individuals(engine, found.fit, kind)) is not None]
+    agents = []
+    for one in seen:
+        one.p_value = min(1.0, one.p_value * len(seen))
+        agents.append(sealed.agents(one, final.system, options.alpha, bool(left), enough))
+    own = [one for one, agent in zip(seen, agents, strict=True) if agent.named]
+    absent += [
+        agents_absent(one, options.alpha / len(seen))
+        for one, agent in zip(seen, agents, strict=True) if not agent.named
+    ]  # fmt: skip
+    extended = sealed.with_numbers(engine, final, own)
+    gap, each = sealed.gap(extended, own)
     clock.lap("sealed")
-    absent = absences(found)
+    removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
+    effects_found = [
+        named(engine, final, step, one.p_value)
+        for step, one in zip(found.steps, sealed.tried, strict=False)
+    ]
+    effects_found += [
+        named_agents(one, agent.confirmed)
+        for one, agent in zip(seen, agents, strict=True) if agent.named
+    ]  # fmt: skip
     diagnosis = Diagnosis(
-        verdict=verdict,
+        verdict=_verdict(found, left, removed, bool(own), bool(leads), enough),
         domain=domain,
         model="",
-        effects=[named(engine, found, step) for step in found.steps],
+        clusters=numbers,
+        screen=_first(found, numbers),
+        confirmation=sealed.confirmation(),
+        effects=effects_found,
+        leads=sealed.leads(engine, leads),
+        agents=agents,
         data_faults=[],
         not_testable=[one.name for one in absent if not one.testable],
         absences=absent,
         places=located,
         unknown=structure(left) if left else None,
         gap=gap,
-        base=_shift(base_system, found.fit.system),
+        base=_shift(base_system, extended),
         split={
-            "open": [sequences[i].name for i in opened],
-            "sealed": [sequences[i].name for i in sealed],
+            "open": [sequences[i].name for i in division.open],
+            "sealed": [sequences[i].name for i in division.sealed],
         },
-        notes=_notes(found, gap),
+        notes=[division.note] if division.note else [],
         seconds=clock.seconds,
         sealed=each,
     )
     return Found(
         diagnosis=diagnosis,
         base=base_system,
-        extended=found.fit.system,
-        open=opened,
-        sealed=sealed,
+        extended=extended,
+        open=division.open,
+        sealed=division.sealed,
     )
+
+
+def _calibrated(system: System, sequences: list[Sequence], options: DiscoverOptions) -> _Start:
+    """The model calibrated on open sequences; where agents who are there at one time behave alike,
+    once more on open sequences that share no time with sealed ones."""
+    domain, tested = str(system.domain), Simultaneous(0, float("nan"), 1.0)
+    for together in (False, True):
+        division = divide(sequences, options, together=together)
+        chosen = [sequences[i] for i in division.open]
+        engine = engine_of(domain, chosen, division.label[division.open])
+        start = copy.deepcopy(system).double()
+        base = settled(engine, engine.near(start) if isinstance(engine, TrafficEngine) else start)
+        if not together:
+            tested = simultaneous(engine, base, options.seed)
+            if not tested.together:
+                break
+    return _Start(division, engine, base, tested)
+
+
+def _clusters(start: _Start, options: DiscoverOptions, effects: int) -> Clusters:
+    """How many there are, and how many it takes."""
+    division = start.division
+    least = least_number(options.alpha, hypotheses=max(effects, 1))
+    least_sealed = least_number(LEVEL, sided=1)
+    enough = max(least_sealed / options.sealed, least / (1 - options.sealed))
+    return Clusters(
+        open=int(start.engine.cluster.max()) + 1,
+        sealed=0 if division.note else division.number(division.sealed),
+        least=least,
+        least_sealed=least_sealed,
+        enough=int(np.ceil(enough - 0.5)),
+        why=division.why,
+        simultaneous=start.tested.plain(),
+        note=division.note,
+    )
+
+
+def _levels(engine: Engine, effects: list[type[Effect]]) -> dict[str, np.ndarray]:
+    """Of effects that act by something fixed within recordings: the recordings ``(n,)``."""
+    every = np.arange(len(engine.sequences))
+    found = {}
+    for effect in effects:
+        label = level(engine.sequences, every, effect.covariate)
+        if label is not every:
+            found[effect.name] = of_residuals(label, engine.sequence)
+    return found
+
+
+def _first(found: Search, numbers: Clusters) -> FirstScreen:
+    """What the first look said."""
+    best = min(found.first, key=lambda score: score.p_value, default=None)
+    leads = [
+        {"name": one.effect.name, "share": one.gain, "p_value": one.p_value, **one.amount}
+        for one in found.first[:LEADS]
+    ]
+    floor = 2.0 ** (1 - numbers.open)
+    if best is None:
+        return FirstScreen(None, "", numbers.open, floor)
+    return FirstScreen(best.p_value, best.effect.name, numbers.open, floor, leads)
 
 
 def _excess(engine: Engine, fit: Fit) -> float:
@@ -160,117 +253,22 @@ def _excess(engine: Engine, fit: Fit) -> float:
     return 1.0 if np.isnan(floor) else max(1 - floor / square_of(engine, fit.system), 1e-3)
 
 
-def divide(sequences: list[Sequence], options: DiscoverOptions) -> tuple[list[int], list[int]]:
-    """Positions of the open and of the sealed sequences; no agent is on both sides.
-
-    The open ones are not divided further: every judgement on them is made on sequences that a
-    calibration has left out in turn.
-
-    Raises:
-        DataError: fewer than three sequences, or none that could be sealed.
-    """
-    if len(sequences) < 3:
-        raise DataError(
-            f"a diagnosis needs at least 3 sequences without a fault, there are {len(sequences)}; "
-            "take more data, or cut them into shorter sequences"
-        )
-    index: list[dict[str, Any]] = [
-        {
-            "name": s.name,
-            "recording": s.recording,
-            "start": float(s.time[0]),
-            "end": float(s.time[-1]),
-            "agents": list(s.agents),
-        }
-        for s in sequences
-    ]
-    parts = split(index, SplitOptions(heldout=options.sealed, seed=options.seed))
-    return parts.train, parts.heldout
-
-
-def _verdict(found: Search, left: list[Curves], removed: float, faulty: bool) -> Verdict:
-    """Args: ``removed``: share of the squared errors that the named effects removed."""
+def _verdict(
+    found: Search, left: list[Curves], removed: float, own: bool, leads: bool, enough: bool
+) -> Verdict:
+    """Args: ``removed``: share of the squared errors that the named effects removed; ``own``:
+    whether agents' own numbers were confirmed; ``leads``: whether something was not."""
+    if not enough:
+        return "not_testable"
     if found.steps:
         if left and left[0].removed * (1 - removed) > TOO_MUCH * removed:
             return "unknown"
-        rivals = any(step.rivals for step in found.steps)
-        return "indistinguishable" if rivals else "named"
-    if left:
-        return "unknown"
-    return "data_fault" if faulty else "none"
-
-
-def _notes(found: Search, gap: Gap) -> list[str]:
-    """What a reader must know to take the verdict for no more than it is."""
-    if found.steps and not gap.after < gap.before:
-        return [
-            "The errors of positions on the sealed sequences did not become smaller: the effects "
-            "stand out in the open ones, but do not predict the sealed ones better. Take them as "
-            "a lead to follow, not as a finding."
-        ]
-    return []
-
-
-def _gap(
-    domain: str, base: System, found: Search, sequences: list[Sequence]
-) -> tuple[Gap, list[dict[str, Any]]]:
-    """The costs of the sealed sequences, and of each of them."""
-    engine = engine_of(domain, sequences, whole=True)
-    engine.settle(base, row_of(base))
-    before = _costs(engine, base)
-    after = before
-    if found.steps:
-        after = _costs(engine, found.fit.system)
-        own = [
-            type(effect) for effect in effects_of(found.fit.system)
-            if isinstance(effect, IndividualEffect)
-        ]  # fmt: skip
-        if own:
-            after = _crossed_costs(domain, engine, found.fit.system, sequences)
-    floor = engine.noise_floor()
-    first, last = float(before.mean()), float(after.mean())
-    closable = first - floor
-    closed = (first - last) / closable if closable > 0 else float("nan")
-    each = [
-        {"name": s.name, "before": float(a), "after": float(b)}
-        for s, a, b in zip(sequences, before, after, strict=True)
-    ]
-    return Gap(first, last, floor, closed), each
-
-
-def _costs(engine: Engine, system: System) -> np.ndarray:
-    """``(S,)`` mean square error of each sequence, m²."""
-    return engine.squares(system, row_of(system)).means()
-
-
-def _crossed_costs(
-    domain: str, whole: Engine, system: System, sequences: list[Sequence]
-) -> np.ndarray:
-    """Costs where each agent's number comes from the other half of his time."""
-    engine = engine_of(domain, sequences)
-    plain = copy.deepcopy(system)
-    for effect in effects_of(plain):
-        if isinstance(effect, IndividualEffect):
-            effect.people = {}
-    engine.settle(plain, row_of(plain))
-    numbers = {}
-    for effect in effects_of(plain):
-        if isinstance(effect, IndividualEffect):
-            kind = type(effect)
-            fit: Fit = evaluated(engine, plain)
-            # an agent's number means something at this setting only
-            own = {name: float(getattr(effect, name).detach()) for name in effect.settings}
-            one = individuals(engine, fit, kind, own)
-            if one is not None:
-                numbers[effect.name] = sharpened(engine, plain, one).halves
-    parts = []
-    for half in (0, 1):
-        for effect in effects_of(plain):
-            if isinstance(effect, IndividualEffect) and effect.name in numbers:
-                effect.people = numbers[effect.name][1 - half]
-        parts.append(whole.squares(plain, row_of(plain)))
-    value = np.where(parts[0].half == 0, parts[0].value, parts[1].value)
-    return replace(parts[0], value=value).means()
+        return "indistinguishable" if any(step.rivals for step in found.steps) else "named"
+    if own:
+        return "named"
+    if leads:
+        return "unconfirmed"
+    return "unknown" if left else "none"
 
 
 def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:

@@ -166,7 +166,7 @@ def _unit(engine: Engine, fit: Fit, name: str) -> float:
     variance = fit.cost / max(len(fit.residual) - columns.shape[1], 1)
     plain = np.full(len(fit.row), np.nan)
     plain[fit.free] = variance * np.diag(np.linalg.pinv(columns.T @ columns))
-    ratios = fit.errors(engine.sequence) ** 2 / plain
+    ratios = fit.errors(engine.cluster) ** 2 / plain
     effect = fit.system.terms[place]
     assert isinstance(effect, Effect)
     own = [ratios[fit.names.index(f"terms.{place}.{strength}")] for strength in effect.strengths]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from nnode.data.sequence import Batch
+from nnode.data.sequence import Batch, Sequence
 from nnode.discover.recorded import recorded
 from nnode.models.effects import Effect, Probe
 from nnode.models.scene import Scene
@@ -31,12 +31,11 @@ class Squares:
 
     Attributes:
         value: ``(m,)`` m².
-        sequence, half: ``(m,)`` as in :class:`Engine`, of each error.
+        sequence: ``(m,)`` as in :class:`Engine`, of each error.
     """
 
     value: np.ndarray
     sequence: np.ndarray
-    half: np.ndarray
 
     def means(self) -> np.ndarray:
         """``(S,)`` mean square error of each sequence; infinite where it blows up."""
@@ -55,22 +54,26 @@ class Engine(Protocol):
     Attributes:
         batch: the sequences, or windows of them that bear their names.
         names: of the sequences.
+        sequences: as they were given.
         sequence: ``(n,)`` position of each residual's sequence in ``names``.
-        block: ``(n,)`` number of each residual's block: a part of a sequence that is taken as
-            independent of the others.
+        cluster: ``(n,)`` number of its cluster: see :mod:`nnode.data.clusters`.
+        clock: ``(n,)`` its time in the recording, s.
+        component: ``(n,)`` residuals of one time and agent that have different numbers mean
+            different things.
         unit: ``(n,)`` number of the agents whose own numbers are estimated together.
         people: of each unit, per direction the sequence and the place of the agent it belongs
             to; one entry where all directions belong to one agent.
-        half: ``(n,)`` 0 or 1: the two halves of an agent's time; -1 in neither.
     """
 
     batch: Batch
     names: list[str]
+    sequences: list[Sequence]
     sequence: np.ndarray
-    block: np.ndarray
+    cluster: np.ndarray
+    clock: np.ndarray
+    component: np.ndarray
     unit: np.ndarray
     people: list[list[tuple[int, int]]]
-    half: np.ndarray
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` residuals of R runs of one model; NaN where a run blows up.
@@ -120,6 +123,18 @@ class Engine(Protocol):
     def variables(self) -> list[Variable]:
         """What deviations may depend on."""
         ...
+
+
+def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
+    """``(n,)`` labels of the residuals' clusters, counted from 0 without gaps.
+
+    Args:
+        label: ``(S,)`` of the sequences; None: every sequence is a cluster.
+        sequence: ``(n,)`` of the residuals.
+    """
+    own = sequence if label is None else np.asarray(label)[sequence]
+    found: np.ndarray = np.unique(own, return_inverse=True)[1].reshape(-1)
+    return found
 
 
 def trained(system: System) -> dict[str, nn.Parameter]:

@@ -71,16 +71,16 @@ class Fit:
         """``(n, F)`` derivatives with respect to the parameters that are free."""
         return self.jacobian[:, self.free]
 
-    def left_out(self, sequence: np.ndarray, least: float) -> np.ndarray:
-        """``(S, F)`` how the free parameters move when each sequence is left out of the fit.
+    def left_out(self, cluster: np.ndarray, least: float) -> np.ndarray:
+        """``(G, F)`` how the free parameters move when each cluster is left out of the fit.
 
         One Gauss and Newton step from the full fit. A direction of the parameters stays where the
-        other sequences know less than the share ``least`` of what all know of it.
+        other clusters know less than the share ``least`` of what all know of it.
         """
-        return _moved(self._others(sequence), least)
+        return _moved(self._others(cluster), least)
 
-    def _others(self, sequence: np.ndarray) -> list[_Others]:
-        """What is known without each sequence: directions ``(F, M)`` of the free parameters, the
+    def _others(self, cluster: np.ndarray) -> list[_Others]:
+        """What is known without each cluster: directions ``(F, M)`` of the free parameters, the
         share ``(M,)`` of the knowledge of each that the others have, and where they pull it."""
         columns = self.tangents
         scale = np.sqrt((columns**2).sum(0))
@@ -89,25 +89,25 @@ class Fit:
         kept = size > COLLINEAR * size[0]
         basis, back = basis[:, kept], (turn[kept] / size[kept, None] / scale).T
         found = []
-        for s in range(int(sequence.max()) + 1):
-            part, residual = basis[sequence == s], self.residual[sequence == s]
+        for s in range(int(cluster.max()) + 1):
+            part, residual = basis[cluster == s], self.residual[cluster == s]
             known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
-            # at the minimum the gradient of the others is minus that of this sequence
+            # at the minimum the gradient of the others is minus that of this cluster
             found.append((known, back @ vector, vector.T @ (part.T @ residual)))
         return found
 
-    def errors(self, sequence: np.ndarray) -> np.ndarray:
-        """``(K,)`` standard errors that allow for any dependence within a sequence.
+    def errors(self, cluster: np.ndarray) -> np.ndarray:
+        """``(K,)`` standard errors that allow for any dependence within a cluster.
 
-        By the jackknife over sequences. NaN for parameters at a bound, for those of which one
-        sequence alone tells, and where there are fewer than three sequences.
+        By the jackknife over clusters. NaN for parameters at a bound, for those of which one
+        cluster alone tells, and where there are fewer than three clusters.
 
         Source: MacKinnon, Nielsen & Webb 2023, Journal of Econometrics 232 (CV3).
         """
         found = np.full(len(self.row), np.nan)
-        number = len(np.unique(sequence))
+        number = len(np.unique(cluster))
         if number >= 3 and self.free.any():
-            parts = self._others(sequence)
+            parts = self._others(cluster)
             own = np.sqrt((number - 1) / number * (_moved(parts, UNKNOWN) ** 2).sum(0))
             for known, ways, _ in parts:
                 share = ways**2 / np.maximum((ways**2).sum(1, keepdims=True), 1e-300)
@@ -115,15 +115,15 @@ class Fit:
             found[self.free] = own
         return found if self.simulated is None else np.hypot(found, self.simulated)
 
-    def intervals(self, sequence: np.ndarray, level: float = 0.95) -> np.ndarray:
+    def intervals(self, cluster: np.ndarray, level: float = 0.95) -> np.ndarray:
         """``(K, 2)`` confidence intervals: :meth:`errors` with Student's quantile."""
-        number = len(np.unique(sequence))
-        half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(sequence)
+        number = len(np.unique(cluster))
+        half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(cluster)
         return np.stack([self.row - half, self.row + half], 1)
 
 
 def _moved(parts: list[_Others], least: float) -> np.ndarray:
-    """``(S, F)``: see :meth:`Fit.left_out`."""
+    """``(G, F)``: see :meth:`Fit.left_out`."""
     return np.stack(
         [
             ways @ np.where(known > least, pull / np.maximum(known, least), 0.0)
@@ -136,6 +136,16 @@ def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:
     """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1."""
     found = np.zeros((int(label.max()) + 1, *values.shape[1:]))
     np.add.at(found, label, values)
+    return found
+
+
+def grams(z: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """``(G, k, k)`` products of the columns ``(n, k)`` with each other over each label's rows."""
+    found = np.zeros((int(label.max()) + 1, z.shape[1], z.shape[1]))
+    order = np.argsort(label, kind="stable")
+    ends = np.flatnonzero(np.diff(label[order])) + 1
+    for rows in np.split(order, ends):
+        found[label[rows[0]]] = z[rows].T @ z[rows]
     return found
 
 

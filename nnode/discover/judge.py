@@ -7,10 +7,13 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from nnode.discover.edges import intervals as edge_intervals
 from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit
+from nnode.discover.individual import Individuals
+from nnode.discover.power import POWER, Way
 from nnode.discover.result import (
     Absence,
     Alternative,
@@ -19,23 +22,27 @@ from nnode.discover.result import (
     Place,
     Structure,
 )
-from nnode.discover.score import Score
+from nnode.discover.score import Evidence, Score
 from nnode.discover.search import Search, Step
 from nnode.discover.symbolic import symbolic
-from nnode.discover.variables import Curves, normal_tail
+from nnode.discover.variables import Curves, tail
 from nnode.models.effects import Effect
 from nnode.models.extend import place_of
 
-#: Normal quantiles: of an interval of 95 %, and of a power of 80 %.
-WIDE, POWER = 1.96, 0.84
+#: Normal quantile of an interval of 95 %.
+WIDE = 1.96
 #: A curve's knots count as a place where they stand out at this error probability.
 STANDS_OUT = 0.01
 
 
-def named(engine: Engine, search: Search, step: Step) -> NamedEffect:
-    """An accepted effect with its coefficients in the final fit."""
+def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect:
+    """An accepted effect with its coefficients in a fit.
+
+    Args:
+        confirmed: p-value of the sealed clusters.
+    """
     effect = step.chosen.score.effect
-    coefficients = _coefficients(engine, search.fit, step)
+    coefficients = _coefficients(engine, fit, step)
     return NamedEffect(
         name=effect.name,
         formula=effect.formula,
@@ -53,6 +60,28 @@ def named(engine: Engine, search: Search, step: Step) -> NamedEffect:
         ],
         p_value=step.chosen.score.p_value,
         gain=step.chosen.gain.gain,
+        confirmed=confirmed,
+    )
+
+
+def named_agents(one: Individuals, confirmed: float) -> NamedEffect:
+    """An individual effect that was confirmed."""
+    effect = one.effect
+    found = {}
+    for name, strength in effect.strengths.items():
+        found[name] = Coefficient(one.sigma, *one.interval(), strength.unit)
+    for name, setting in effect.settings.items():
+        value = float(one.options[name])
+        low, high = one.settings.get(name, (float("nan"), float("nan")))
+        found[name] = Coefficient(value, low, high, setting.unit)
+    return NamedEffect(
+        name=effect.name,
+        formula=effect.formula,
+        source=effect.source,
+        coefficients=found,
+        where="everybody, everywhere",
+        p_value=one.p_value,
+        confirmed=confirmed,
     )
 
 
@@ -60,7 +89,7 @@ def _coefficients(engine: Engine, fit: Fit, step: Step) -> dict[str, Coefficient
     effect = step.chosen.score.effect
     place = place_of(fit.system, effect.name)
     own = fit.system.terms[place]
-    intervals = fit.intervals(engine.sequence)
+    intervals = fit.intervals(engine.cluster)
     edges = edge_intervals(engine, fit, effect.name) if effect.consecutive else {}
     found = {}
     units = {name: strength.unit for name, strength in effect.strengths.items()}
@@ -71,12 +100,6 @@ def _coefficients(engine: Engine, fit: Fit, step: Step) -> dict[str, Coefficient
         low, high = value, value
         if full in fit.names:
             low, high = (float(end) for end in intervals[fit.names.index(full)])
-        if step.individuals is not None and name in effect.strengths and full not in fit.names:
-            value = step.individuals.sigma
-            low, high = step.individuals.interval
-        elif step.individuals is not None and name in step.individuals.settings:
-            value = float(step.individuals.options[name])
-            low, high = step.individuals.settings[name]
         low, high = edges.get(name, (low, high))
         found[name] = Coefficient(value, low, high, unit)
     return found
@@ -93,35 +116,38 @@ def _where(effect: type[Effect], found: dict[str, Coefficient], options: dict[st
     return "everybody, everywhere"
 
 
-def absences(search: Search) -> list[Absence]:
-    """What the final screening says of the effects that were not found."""
-    assert search.screen is not None
-    screen = search.screen
-    return [_absence(score, screen.critical(score.effect.name)) for score in search.scores]
+def absences(search: Search, way: Way) -> list[Absence]:
+    """What the final screening says of the effects that were not found, by the power of the whole
+    way."""
+    return [_absence(score, way) for score in search.scores]
 
 
-def _absence(score: Score, critical: float) -> Absence:
+def _absence(score: Score, way: Way) -> Absence:
     effect = score.effect
     if not effect.strengths:
-        name, setting = next(iter(effect.settings.items()))
-        return Absence(
-            effect.name, score.gain > 0, name, setting.unit, None, None,
-            "has no strength that could be limited",
-        )  # fmt: skip
+        return _without_strength(score, way)
     # the strength that is known best in units of what is plausible
     name = min(effect.strengths, key=lambda n: _relative(effect, n, score.error.get(n, 0.0)))
-    strength = effect.strengths[name]
+    strength, k = effect.strengths[name], list(effect.strengths).index(name)
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
-    known = error > 0 and math.isfinite(error)
-    detectable, bound = math.inf, math.inf
-    if known:
-        detectable, bound = (critical + POWER) * error, abs(amount) + WIDE * error
-    if score.probes:
+    known = error > 0 and math.isfinite(error) and bool(score.evidence)
+    expected, detectable, least = strength.expected, math.inf, 0.0
+    if known and effect.memory:
         # what was tried at a size says nothing of smaller ones
-        size, error = min(score.probes, key=lambda one: max(one[0], (critical + POWER) * one[1]))
-        detectable = max(size, (critical + POWER) * error)
-        bound = max(size, abs(amount) + WIDE * error)
-    testable = known and detectable <= strength.expected
+        found = [
+            max(one.size, way.detectable(score, one, max(one.size, expected)))
+            for one in score.evidence
+        ]
+        best = int(np.argmin(found))
+        detectable, least = found[best], score.evidence[best].size
+    elif known:
+        detectable = way.detectable(
+            score, score.evidence[min(k, len(score.evidence) - 1)], expected
+        )
+    degrees = max(len(way.screen.costs(effect.name)) - 1, 1)
+    bound = max(least, abs(amount) + float(stats.t.ppf(0.975, degrees)) * error)
+    testable = known and detectable <= expected
+    unit = "" if strength.unit == "1" else f" {strength.unit}"
     return Absence(
         name=effect.name,
         testable=testable,
@@ -130,8 +156,45 @@ def _absence(score: Score, critical: float) -> Absence:
         detectable=detectable if math.isfinite(detectable) else None,
         bound=bound if testable else None,
         reason="" if testable else (
-            f"{name} would not stand out in these data even if it were off by "
-            f"{strength.expected:.3g}{'' if strength.unit == '1' else f' {strength.unit}'}"
+            f"{name} would not be named with these data with a probability of {POWER:.0%} even if "
+            f"it were off by {expected:.3g}{unit}"
+        ),
+    )  # fmt: skip
+
+
+def _without_strength(score: Score, way: Way) -> Absence:
+    """Of an effect that is there or not: the weakest of its settings that would be named."""
+    effect = score.effect
+    name, setting = next(iter(effect.settings.items()))
+    found = [
+        one for one in score.evidence
+        if one.grams.sum() > 0 and way.power(score, one, 1.0) >= POWER
+    ]  # fmt: skip
+    weakest = min(found, key=_information, default=None)
+    value = None if weakest is None else float(weakest.options[name])
+    return Absence(
+        effect.name, value is not None, name, setting.unit, value, value,
+        "" if value is not None else "it acts too rarely in these data to be named",
+    )  # fmt: skip
+
+
+def _information(one: Evidence) -> float:
+    return float(one.grams.sum())
+
+
+def agents_absent(one: Individuals, alpha: float) -> Absence:
+    """What the open clusters say of numbers that nobody was found to have of his own."""
+    (name,) = one.effect.strengths
+    strength = one.effect.strengths[name]
+    detectable, (_, high) = one.detectable(alpha), one.interval()
+    testable = math.isfinite(detectable) and 0 < detectable <= strength.expected
+    return Absence(
+        one.effect.name, testable, name, strength.unit,
+        detectable if math.isfinite(detectable) else None,
+        high if testable else None,
+        "" if testable else (
+            f"{name} would not stand out with a probability of {POWER:.0%} even if it were "
+            f"{strength.expected:.3g}{'' if strength.unit == '1' else ' ' + strength.unit}"
         ),
     )  # fmt: skip
 
@@ -150,9 +213,9 @@ def places(found: list[Curves], excess: float) -> list[Place]:
     result = []
     number = sum(len(one.heights) for one in found)
     for one in found:
-        tail = normal_tail(one.statistic, number)
-        best = int(np.argmin(tail))
-        if tail[best] > STANDS_OUT or one.removed <= 0:
+        chance = tail(one, number)
+        best = int(np.argmin(chance))
+        if chance[best] > STANDS_OUT or one.removed <= 0:
             continue
         sign = np.sign(one.statistic)
         alike = (sign == sign[best]) & (np.abs(one.statistic) > WIDE)
@@ -174,7 +237,7 @@ def places(found: list[Curves], excess: float) -> list[Place]:
                 deviation=mean,
                 error=float(1 / math.sqrt(weight.sum())),
                 share=min(one.removed / excess, 1.0),
-                p_value=float(tail[best]),
+                p_value=float(chance[best]),
                 curve={
                     "at": list(knots),
                     "deviation": one.heights.tolist(),

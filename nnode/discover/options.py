@@ -17,7 +17,8 @@ from nnode.models.effects.own import VARIABLE
 class DiscoverOptions:
     """What is looked for, how carefully, and what is made of it."""
 
-    sealed: float = 0.2  # share of the sequences that nothing looks at before the last step
+    sealed: float = 0.3  # share of the clusters that nothing looks at before the last step
+    gap: float = 5.0  # s; sequences without identifiers that are closer in time are one cluster
     alpha: float = 0.05  # rate of false alarms over all effects together
     seed: int = 0  # of the split, of resampling and of a network's start weights
     effects: list[str] | None = None  # names of the catalogue to look for; null: all

@@ -81,6 +81,7 @@ def page_blocks(
     return [
         *_verdict(d, drawn, found),
         *_data(d, drawn),
+        *_agents(d),
         *_model(d),
         *_places(d, drawn, UNITS[inputs.domain]),
         *_rest(d, drawn, UNITS[inputs.domain]),
@@ -97,17 +98,35 @@ def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     if has_network(found.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
-        blocks += [tables.coefficients_table(d), *drawn.effects, tables.effects_table(d)]
+        blocks += [tables.coefficients_table(d.effects), *drawn.effects, tables.effects_table(d)]
     else:
         blocks.append(Text("No effect of the catalogue was added to the model."))
     if any(effect.alternatives for effect in d.effects):
         blocks.append(tables.alternatives_table(d))
+    if d.leads:
+        blocks += [
+            Heading("Found, not confirmed", 3),
+            Text(f"A lead to follow, not a finding: {d.confirmation.reason}."),
+            tables.coefficients_table(d.leads, "leads"),
+        ]
+    if d.verdict == "not_testable" and d.screen.leads:
+        blocks += [
+            Heading("What one would look at first", 3),
+            Text(
+                "A description of the open sequences, and no finding: with so few independent "
+                "clusters chance cannot be told from anything."
+            ),
+            tables.screen_table(d),
+        ]
     blocks += [
+        Heading("What is independent of what", 3),
+        Text(_independence(d)),
+        tables.clusters_table(d),
         Heading("What it changes on sealed sequences", 3),
         Text(
             f"{len(d.split.get('sealed', []))} of "
             f"{len(d.split.get('sealed', [])) + len(d.split.get('open', []))} sequences were "
-            f"sealed: nothing looked at them before this comparison. {_gap_words(d, found)}"
+            f"sealed: nothing looked at them before this comparison. {_gap_words(d)}"
         ),
         tables.gap_table(d),
         *drawn.gap,
@@ -115,16 +134,45 @@ def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     return blocks
 
 
-def _gap_words(d: Diagnosis, found: Found) -> str:
+def _independence(d: Diagnosis) -> str:
+    c = d.clusters
+    return (
+        f"One cluster are {c.why}; {c.simultaneous}. Every interval, test and fold goes by "
+        f"cluster. Of {c.open} open clusters no two-sided p-value can be below "
+        f"{amount(d.screen.floor, 2)}."
+    )
+
+
+def _gap_words(d: Diagnosis) -> str:
     if not d.effects:
         return "As nothing was added, the error is what the calibrated model leaves."
     words = f"The effects close {closed(d)} of the gap between the model and the noise."
-    for name in individual(found.extended):
-        words += (
-            f" {name} has a number for every agent: here it is estimated from one half of his "
-            "time and used in the other."
-        )
+    for one in d.agents:
+        if one.named:
+            words += (
+                f" {one.name} has a number for every agent: the errors are those of the last part "
+                "of each sequence, with numbers from its first part."
+            )
     return words
+
+
+def _agents(d: Diagnosis) -> list[Block]:
+    """What agents have numbers of their own for, beside the effects of the population."""
+    if not d.agents:
+        return []
+    words = [
+        f"- {one.name}: "
+        + ("named." if one.named else f"not named: {one.reason}.")
+        + f" What lasts longer than {amount(one.lasts, 2)} s cannot be told from a number of "
+        "one's own."
+        for one in d.agents
+    ]
+    blocks: list[Block] = [
+        Heading("Do agents differ?"), Text("\n".join(words)), tables.agents_table(d)
+    ]  # fmt: skip
+    if any(one.later for one in d.agents):
+        blocks.append(tables.later_table(d))
+    return blocks
 
 
 def _data(d: Diagnosis, drawn: Figures) -> list[Block]:

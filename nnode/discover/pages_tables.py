@@ -8,7 +8,7 @@ import pandas as pd
 
 from nnode.data.quality import KINDS
 from nnode.discover.report import amount, estimate, in_unit
-from nnode.discover.result import Diagnosis
+from nnode.discover.result import Diagnosis, NamedEffect
 from nnode.pages.page import TableBlock
 
 #: Faults that the page lists; its CSV has all.
@@ -25,20 +25,97 @@ def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> 
     return TableBlock(name, pd.DataFrame(rows), caption, **more)
 
 
-def coefficients_table(d: Diagnosis) -> TableBlock:
-    """The coefficients of the effects that were added."""
+def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -> TableBlock:
+    """The coefficients of some effects."""
     rows = [
         {
             "effect": effect.name,
-            "coefficient": name,
+            "coefficient": coefficient,
             **dict(zip(("value", "95 % from", "to"), estimate(c), strict=True)),
             "unit": _unit(c.unit),
             "where": effect.where,
+            "p on sealed clusters": amount(effect.confirmed, 2),
         }
-        for effect in d.effects
-        for name, c in effect.coefficients.items()
+        for effect in effects
+        for coefficient, c in effect.coefficients.items()
     ]
-    return _table("coefficients", rows, "What was added to the model, with 95 % intervals.")
+    return _table(
+        name, rows, "Coefficients with 95 % intervals; one-sided p on the sealed clusters."
+    )
+
+
+def clusters_table(d: Diagnosis) -> TableBlock:
+    """How many clusters there are, and how many it takes."""
+    c = d.clusters
+    rows = [
+        {"clusters": "open", "there are": c.open, "it takes": c.least, "to": "name any effect"},
+        {"clusters": "sealed", "there are": c.sealed, "it takes": c.least_sealed, "to": "confirm"},
+    ]
+    return _table("clusters", rows, "Clusters are what is taken as independent.")
+
+
+def screen_table(d: Diagnosis) -> TableBlock:
+    """What explains most in the open sequences."""
+    rows = [
+        {
+            "effect": one["name"],
+            "share of the squared residuals": _percent(one["share"]),
+            "p": amount(one["p_value"], 2),
+            "about": ", ".join(
+                f"{name} {amount(value)}" for name, value in one.items()
+                if name not in ("name", "share", "p_value")
+            ),
+        }
+        for one in d.screen.leads
+    ]  # fmt: skip
+    return _table(
+        "screen",
+        rows,
+        "What explains most of the open sequences, by linear response; *about*: by how much the "
+        "coefficient would differ from no effect. Where the floor allows no small p, a large one "
+        "says nothing.",
+    )
+
+
+def agents_table(d: Diagnosis) -> TableBlock:
+    """Numbers of agents, and what their variance belongs to."""
+    rows = [
+        {
+            "effect": one.name,
+            "strength": f"{amount(one.strength, 2)} [{amount(one.low, 2)}, {amount(one.high, 2)}]",
+            "unit": _unit(one.unit),
+            "p": amount(one.p_value, 2),
+            **{
+                who: "–" if share is None else _percent(share)
+                for who, share in one.share.items()
+            },
+            "p on sealed clusters": amount(one.confirmed, 2),
+        }
+        for one in d.agents
+    ]  # fmt: skip
+    return _table(
+        "agents",
+        rows,
+        "Numbers of agents, estimated in parts of their time. *strength*: what a number carries "
+        "over any time. The variance by what it belongs to: the recording, the sequence, the "
+        "agent, and moods that pass.",
+    )
+
+
+def later_table(d: Diagnosis) -> TableBlock:
+    """Who predicts the last part of sealed sequences."""
+    rows = [
+        {"effect": one.name, "who predicts": who, "mean square error (m²)": amount(error)}
+        for one in d.agents
+        for who, error in one.later.items()
+    ]
+    return _table(
+        "later",
+        rows,
+        "The last 40 % of each sealed sequence, simulated from the state in which they begin. "
+        "Numbers and mean velocities come from the first 40 %, their variance from open "
+        "sequences.",
+    )
 
 
 def effects_table(d: Diagnosis) -> TableBlock:
@@ -188,7 +265,7 @@ def absent_table(d: Diagnosis) -> TableBlock:
         rows,
         "Effects that were looked for and not found. *Absent to within*: a larger deviation from "
         "no effect is excluded with 95 % confidence. *Would be found from*: the smallest one that "
-        "is found with 80 % power.",
+        "is named with a probability of 80 %, confirmation on sealed clusters included.",
     )
 
 
@@ -212,8 +289,9 @@ def not_testable_table(d: Diagnosis) -> TableBlock:
     return _table(
         "not_testable",
         rows,
-        "Effects that would not stand out in these data with a probability of 80 % even at the "
-        "least usual strength: that they were not found says nothing about them.",
+        "Effects that would not be named with these data, confirmation on sealed clusters "
+        "included, with a probability of 80 % even at the least usual strength: that they were "
+        "not found says nothing about them.",
     )
 
 

@@ -98,8 +98,18 @@ def interval(effect: NamedEffect) -> str:
 
 
 def sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one sentence."""
-    d = diagnosis
+    """The verdict in one sentence, and one for the faults of the measurement."""
+    faults = diagnosis.data_faults
+    if not faults:
+        return _verdict(diagnosis)
+    where = len({fault.sequence for fault in faults})
+    return (
+        f"{_verdict(diagnosis)} Beside that the measurement holds {_count(len(faults), 'fault')} "
+        f"in {_count(where, 'sequence')}, which were left out."
+    )
+
+
+def _verdict(d: Diagnosis) -> str:
     names = _listed([effect.name for effect in d.effects])
     gain = (
         f"the error on sealed sequences goes from {amount(d.gap.before)} to "
@@ -107,17 +117,33 @@ def sentence(diagnosis: Diagnosis) -> str:
         f"{amount(d.gap.noise_floor)} m²)"
     )
     if any(_has_numbers(effect.name) for effect in d.effects):
-        gain += ", each agent's number being taken from the other half of his own time"
+        gain += (
+            ", in the last part of each sequence, each agent's number being taken from the first"
+        )
+    also = f" {_listed([one.name for one in d.leads])} was found too, but not confirmed."
     match d.verdict:
         case "named":
             them = "it" if len(d.effects) == 1 else "them"
-            return f"The model {d.model} lacks {names}: with {them}, {gain}."
+            return f"The model {d.model} lacks {names}: with {them}, {gain}." + also * bool(d.leads)
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
             beside = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
             return (
                 f"The model {d.model} lacks something, and these data cannot tell whether it is "
                 f"{names} or rather {beside}: with {names}, {gain}."
+            )
+        case "unconfirmed":
+            return (
+                f"Not confirmed: in the open data the model {d.model} seems to lack "
+                f"{_listed([one.name for one in d.leads])}, but {d.confirmation.reason}. It is not "
+                "added to the model."
+            )
+        case "not_testable":
+            c = d.clusters
+            return (
+                "Not testable with these data: what can be tested is independent clusters, and "
+                f"there are {c.open} open and {c.sealed} sealed ones ({c.why} are one); about "
+                f"{c.enough} in all would do. Nothing is named."
             )
         case "unknown":
             on = _listed(d.unknown.variables) if d.unknown else "variables that were not found"
@@ -126,20 +152,15 @@ def sentence(diagnosis: Diagnosis) -> str:
                 f"{first} model {d.model} lacks something that is not in the catalogue; it "
                 f"depends on {on}."
             )
-        case "data_fault":
-            where = len({fault.sequence for fault in d.data_faults})
-            number = len(d.data_faults)
-            return (
-                f"The measurement is at fault, not the model: {number} "
-                f"{'fault' if number == 1 else 'faults'} in {where} "
-                f"{'sequence' if where == 1 else 'sequences'}; in the others nothing is missing "
-                f"from {d.model} that these data could show."
-            )
         case "none":
             return (
                 f"Nothing is missing from the model {d.model} that these data could show: no "
                 "effect of the catalogue passes, and no structure is left."
             )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _has_numbers(name: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-Verdict = Literal["named", "none", "unknown", "indistinguishable", "data_fault"]
+Verdict = Literal["named", "none", "unknown", "indistinguishable", "unconfirmed", "not_testable"]
 
 
 @dataclass
@@ -46,6 +46,7 @@ class NamedEffect:
         alternatives: effects that the data cannot tell from it.
         p_value: of its score, with regard to all effects that were looked for.
         gain: held-out share of the whitened cost that it removed when it was added.
+        confirmed: one-sided p-value that sealed clusters are predicted better with it.
     """
 
     name: str
@@ -56,6 +57,7 @@ class NamedEffect:
     alternatives: list[Alternative] = field(default_factory=list)
     p_value: float = float("nan")
     gain: float = float("nan")
+    confirmed: float = float("nan")
 
 
 @dataclass
@@ -75,9 +77,11 @@ class Absence:
 
     Attributes:
         name: of the effect.
-        testable: False where not even the least usual strength would stand out in the data.
+        testable: False where not even the least usual strength would be named, sealed clusters
+            included, with a probability of 80 %.
         coefficient: the strength that is limited; ``unit`` is its unit.
-        detectable: smallest deviation from neutral found with 80 % power.
+        detectable: smallest deviation from neutral that is named with 80 % power; of an effect
+            without a strength its setting.
         bound: it is absent to within this deviation (95 %); None where not testable.
         reason: in words.
     """
@@ -120,6 +124,9 @@ class Place:
 class Gap:
     """Mean square error of positions on the sealed sequences, m².
 
+    Where agents' own numbers were named: on the last part of each sequence, with numbers from its
+    first part.
+
     Attributes:
         before: of the model as it was given, calibrated on the open sequences.
         after: of the extended model.
@@ -131,6 +138,103 @@ class Gap:
     after: float
     noise_floor: float
     closed: float
+
+
+@dataclass
+class Clusters:
+    """What is independent of what.
+
+    Attributes:
+        open, sealed: numbers of clusters.
+        least: open ones that sign flips need, so that any effect can reach the level.
+        least_sealed: sealed ones that a confirmation needs.
+        enough: about how many clusters in all would do.
+        why: what makes sequences one cluster.
+        simultaneous: what was found out of clusters that were there at one time.
+        note: what must be known of the sealed ones; empty: nothing.
+    """
+
+    open: int
+    sealed: int
+    least: int
+    least_sealed: int
+    enough: int
+    why: str
+    simultaneous: str
+    note: str = ""
+
+
+@dataclass
+class FirstScreen:
+    """The first look at all effects of the population.
+
+    Attributes:
+        p_value: the least one, with regard to all effects; None where there is none to look for.
+        effect: whose it is.
+        clusters: that the flips come from.
+        floor: no p-value can be below this.
+        leads: of the effects that explain most: name, share of the squared residuals explained,
+            p-value. A description where there are too few clusters.
+    """
+
+    p_value: float | None
+    effect: str
+    clusters: int
+    floor: float
+    leads: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass
+class Confirmation:
+    """What the sealed clusters say.
+
+    Attributes:
+        p_value: one-sided, of the last effect that was confirmed or the first that was not; None
+            where none was tried.
+        clusters: sealed ones.
+        confirmed: None where none was tried.
+        reason: why not, in words.
+    """
+
+    p_value: float | None
+    clusters: int
+    confirmed: bool | None
+    reason: str = ""
+
+
+@dataclass
+class Agents:
+    """What agents have numbers of their own for.
+
+    Attributes:
+        name: of the effect.
+        strength, low, high: standard deviation of the numbers, or what follows from it, with its
+            interval of 95 %; ``unit``.
+        p_value: that nobody differs, one-sided, by cluster, corrected for what was tried.
+        lasts: s; what lasts longer than this cannot be told from a number of one's own.
+        share: of the variance by what it belongs to: recording, sequence, agent, mood.
+        lags, common: s, and what parts of an agent's time at that lag have in common.
+        later: mean square errors in the last part of the sealed sequences by who predicts, m².
+        confirmed: one-sided p-value, by cluster, that own numbers predict the last part better
+            than none, and than one number per sequence (the larger of both).
+        named: whether it was.
+        reason: why not, in words.
+    """
+
+    name: str
+    strength: float
+    low: float
+    high: float
+    unit: str
+    p_value: float
+    lasts: float
+    share: dict[str, float | None]
+    lags: list[float]
+    common: list[float]
+    later: dict[str, float]
+    confirmed: float
+    named: bool
+    reason: str = ""
 
 
 @dataclass
@@ -159,7 +263,12 @@ class Diagnosis:
     verdict: Verdict
     domain: str
     model: str
+    clusters: Clusters
+    screen: FirstScreen
+    confirmation: Confirmation
     effects: list[NamedEffect]
+    leads: list[NamedEffect]  # found in open clusters, not confirmed by sealed ones
+    agents: list[Agents]
     data_faults: list[DataFault]
     not_testable: list[str]
     absences: list[Absence]

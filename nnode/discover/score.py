@@ -2,14 +2,14 @@
 
 The trace of an effect is the change of the residuals by a small strength of it. What
 recalibration of the model's own parameters can absorb is taken out of it, so that only the rest
-counts. Sums over blocks that are independent of each other may change their sign together
-without changing their distribution where nothing is hidden. Each effect's statistic is compared
-with its own distribution under such flips, and the least of these p-values over all effects with
-the distribution of the least: a search over many intervals, whose largest statistic is large by
-chance, does not raise the bar for the others.
+counts. Sums over clusters may change their sign without changing their distribution where nothing
+is hidden. Each effect's statistic is compared with its own distribution under such flips, and the
+least of these p-values over all effects with the distribution of the least: a search over many
+intervals, whose largest statistic is large by chance, does not raise the bar for the others.
 
-Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Westfall & Young 1993
-(least p-value over hypotheses).
+Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Hemerik, Goeman & Finos 2020
+(of scores that are free of nuisance parameters); Westfall & Young 1993 (least p-value over
+hypotheses).
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ import numpy as np
 import torch
 from scipy import stats
 
+from nnode.data.clusters import signs
 from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit, sums
-from nnode.discover.individual import Individuals
+from nnode.discover.fit import grams as grams_of
 from nnode.models.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
@@ -32,7 +33,7 @@ FLIPS = 1999
 #: A strength of which the plausible range allows less than this share speaks for something
 #: else; the linear estimate of a strong effect may overshoot.
 FORBIDDEN = 0.2
-#: So many usual blocks are added to the blocks that give an error.
+#: So many usual clusters are added to the clusters that give an error.
 PRIOR = 12.0
 #: Median of the square of a standard normal variable.
 MEDIAN = 0.4549
@@ -54,6 +55,22 @@ class Trace:
 
 
 @dataclass
+class Evidence:
+    """What the clusters tell of one direction.
+
+    Attributes:
+        options: of the probe.
+        size: of an effect with a memory, whose trace is that of a finite strength; otherwise 0.
+        parts, grams: ``(G,)`` scores and their information.
+    """
+
+    options: dict[str, Any]
+    size: float
+    parts: np.ndarray
+    grams: np.ndarray
+
+
+@dataclass
 class Score:
     """The best trace of an effect.
 
@@ -65,8 +82,8 @@ class Score:
         gain: share of the sum of squares that the trace explains beyond the model.
         amount: strengths that explain most, less their neutral values.
         error: standard errors of ``amount``.
-        probes: of an effect with a memory, whose trace is that of a finite strength: the strength
-            and its standard error at every probe.
+        evidence: of every strength; of an effect with a memory, or without a strength, of every
+            probe.
     """
 
     effect: type[Effect]
@@ -76,7 +93,7 @@ class Score:
     gain: float
     amount: dict[str, float]
     error: dict[str, float]
-    probes: list[tuple[float, float]] = field(default_factory=list)
+    evidence: list[Evidence] = field(default_factory=list)
 
 
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
@@ -94,20 +111,30 @@ class Screen:
 
     Args:
         fit: the calibrated model.
-        block: ``(n,)`` see :class:`~nnode.discover.engine.Engine`.
+        cluster: ``(n,)`` see :class:`~nnode.discover.engine.Engine`.
         seed: of the sign flips.
-        flips: their number.
+        flips: their number at most; with few clusters, all there are.
+        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser.
     """
 
-    def __init__(self, fit: Fit, block: np.ndarray, seed: int = 0, flips: int = FLIPS) -> None:
-        self.fit, self.block = fit, block
+    def __init__(
+        self,
+        fit: Fit,
+        cluster: np.ndarray,
+        seed: int = 0,
+        flips: int = FLIPS,
+        levels: dict[str, np.ndarray] | None = None,
+    ) -> None:
+        self.fit, self.cluster, self.levels = fit, cluster, levels or {}
         self.residual = fit.residual
         self.variance = fit.cost / len(fit.residual)
         self._basis = _orthonormal(fit.tangents)
-        self._flips = np.random.default_rng(seed).choice([-1.0, 1.0], (flips, int(block.max()) + 1))
+        self._rng = np.random.default_rng(seed)
+        #: ``(F, G)``, the data as they are first
+        self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
         #: of each effect's name the largest statistic of its probes under each flip
         self._chance: dict[str, np.ndarray] = {}
-        self._least = np.ones(flips + 1)
+        self._least = np.ones(len(self._signs))
 
     def beyond(self, columns: np.ndarray) -> np.ndarray:
         """``columns`` without what the model's own parameters can do."""
@@ -115,23 +142,28 @@ class Screen:
         return rest
 
     def flipped(self, parts: np.ndarray) -> np.ndarray:
-        """``(1 + F, C)`` sums of the blocks ``(blocks, C)``, as they are and with every flip."""
-        total: np.ndarray = self._flips @ parts
-        return np.concatenate([parts.sum(0)[None], total])
+        """``(F, C)`` sums of the clusters ``(G, C)``, as they are and with every flip."""
+        total: np.ndarray = self._signs @ parts
+        return total
 
-    def scores(self, found: Iterable[Trace], individual: Iterable[Individuals] = ()) -> list[Score]:
+    def label(self, name: str) -> np.ndarray:
+        """``(n,)`` the clusters that tell of an effect."""
+        return self.levels.get(name, self.cluster)
+
+    def scores(self, found: Iterable[Trace]) -> list[Score]:
         """The best trace of each effect, the one that explains most first."""
-        best = {one.effect.name: self._individual(one) for one in individual}
-        largest = {name: score.statistic for name, score in best.items()}
+        best: dict[str, Score] = {}
+        largest: dict[str, float] = {}
         for trace in found:
             scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
             for score in scores:
                 name, known = score.effect.name, best.get(score.effect.name)
                 largest[name] = max(largest.get(name, 0.0), score.statistic)
-                probes = score.probes + (known.probes if known else [])
+                every = (known.evidence if known else []) + score.evidence
                 if known is None or score.gain > known.gain:
                     best[name] = score
-                best[name].probes = probes
+                if trace.effect.memory or not trace.effect.strengths:
+                    best[name].evidence = every
         if best:
             self._judge(best, largest)
         return sorted(best.values(), key=lambda score: -score.gain)
@@ -139,9 +171,8 @@ class Screen:
     def _judge(self, best: dict[str, Score], largest: dict[str, float]) -> None:
         """P-values with regard to all effects."""
         # the data themselves are one of the flips
-        every = np.stack([np.append(largest[name], self._chance[name]) for name in best])
-        rank = FLIPS + 2 - stats.rankdata(every, method="min", axis=1)
-        share = rank / (FLIPS + 1)
+        every = np.stack([np.append(largest[name], self._chance[name][1:]) for name in best])
+        share = np.stack([at_least(row) for row in every])
         self._least = share.min(0)
         for score, own in zip(best.values(), share[:, 0], strict=True):
             score.p_value = float((self._least <= own + 1e-12).mean())
@@ -152,15 +183,35 @@ class Screen:
         share = float(np.quantile(self._least, alpha))
         return float(np.quantile(self._chance[name], 1 - share))
 
+    def statistic(self, one: Evidence, parts: np.ndarray) -> np.ndarray:
+        """``(R,)`` the statistic where the scores of a direction were ``parts`` ``(G, R)``."""
+        usual = self._usual(one.parts[:, None], one.grams[:, None])
+        sizes = np.repeat(one.grams[:, None], parts.shape[1], 1)
+        return self._standardised(parts, sizes, np.ones((1, len(parts))), usual)[0]
+
+    def costs(self, name: str) -> np.ndarray:
+        """``(G,)`` sums of squared residuals of the clusters that tell of an effect."""
+        return sums(self.residual**2, self.label(name))
+
     def _by_chance(self, name: str, statistics: np.ndarray) -> None:
         """Note an effect's statistics ``(F,)`` under the flips."""
         self._chance[name] = np.maximum(self._chance.get(name, 0.0), statistics)
 
+    def _flips(self, name: str) -> np.ndarray:
+        """``(F, G)`` signs of the clusters that tell of an effect, the data first."""
+        if name not in self.levels:
+            return self._signs
+        shape = len(self._signs), int(self.levels[name].max()) + 1
+        drawn: np.ndarray = self._rng.choice([-1.0, 1.0], shape)
+        drawn[0] = 1.0
+        return drawn
+
     def _single(self, trace: Trace) -> Score:
-        z = self.beyond(trace.columns)
-        parts = sums(z * self.residual[:, None], self.block)
-        grams = self._grams(z)
-        statistic, chance = self._joint(parts, grams)
+        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        parts = sums(z * self.residual[:, None], label)
+        grams = grams_of(z, label)
+        chance = self._joint(parts, grams, self._flips(trace.effect.name))
+        statistic = float(chance[0])
         amount, error, gain = self._estimate(parts, grams)
         (probe,) = trace.probes
         options, amounts, errors = dict(probe.options), {}, {}
@@ -174,35 +225,17 @@ class Screen:
             if share < FORBIDDEN:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._by_chance(trace.effect.name, chance)
-        found = Score(trace.effect, options, statistic, 1.0, gain, amounts, errors)
-        if trace.effect.memory:
-            found.probes = [(abs(s), errors[name]) for name, s in probe.steps.items()]
-        return found
-
-    def _individual(self, found: Individuals) -> Score:
-        """Only products of halves that agree speak for an effect."""
-        products = found.products
-        number = len(products)
-        rng = np.random.default_rng(number)
-        signs = np.concatenate([np.ones((1, number)), rng.choice([-1.0, 1.0], (FLIPS, number))])
-        total = signs @ products
-        # the products of independent scores have variance 1
-        rest = (products**2).sum() - total**2 / number + PRIOR
-        each = total / np.sqrt(rest * number / (number + PRIOR))
-        self._by_chance(found.effect.name, each[1:])
-        (name,) = found.effect.strengths
-        options = {**found.options, name: found.sigma, "people": found.people}
-        error = (found.interval[1] - found.interval[0]) / 4
-        return Score(
-            found.effect, options, float(each[0]), 1.0, found.gain,
-            {name: found.sigma}, {name: error},
-        )  # fmt: skip
+        size = max(map(abs, probe.steps.values())) if trace.effect.memory else 0.0
+        evidence = [
+            Evidence(probe.options, size, parts[:, i], grams[:, i, i]) for i in range(z.shape[1])
+        ]
+        return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors, evidence)
 
     def _interval(self, trace: Trace) -> list[Score]:
         """The best interval of neighbouring cells."""
-        z = self.beyond(trace.columns)
-        parts = sums(z * self.residual[:, None], self.block)
-        grams = self._grams(z)
+        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        parts = sums(z * self.residual[:, None], label)
+        grams = grams_of(z, label)
         cells = z.shape[1]
         first, last = np.triu_indices(cells)
         cumulative = np.concatenate([np.zeros((len(parts), 1)), parts.cumsum(1)], 1)
@@ -220,8 +253,7 @@ class Screen:
             return []
         first, last = first[usable], last[usable]
         usual = self._usual(parts, np.einsum("bii->bi", grams))
-        statistic = self._standardised(each, sizes, np.ones((1, len(each))), usual)
-        flipped = self._standardised(each, sizes, self._flips, usual)
+        flipped = self._standardised(each, sizes, self._flips(trace.effect.name), usual)
         self._by_chance(trace.effect.name, flipped.max(1))
         total = each.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
@@ -238,16 +270,17 @@ class Screen:
         options[name] = strength.at(amount)
         return [
             Score(
-                trace.effect, options, float(statistic.max()), 1.0, float(gain[i]),
+                trace.effect, options, float(flipped[0].max()), 1.0, float(gain[i]),
                 {name: float(amount)}, {name: float(error)},
+                [Evidence(options, 0.0, each[:, i], sizes[:, i])],
             )
         ]  # fmt: skip
 
     def _usual(self, parts: np.ndarray, sizes: np.ndarray) -> float:
-        """Variance of a block's score in units of its information.
+        """Variance of a cluster's score in units of its information.
 
         The residuals' own variance if they were independent; more where they last. The median
-        does not mind some blocks in which there is an effect.
+        does not mind some clusters in which there is an effect.
         """
         known = sizes > 1e-9 * max(float(sizes.max()), 1e-300)
         if not known.any():
@@ -261,12 +294,12 @@ class Screen:
         """``(F, C)`` absolute sums on the scale of a standard normal variable.
 
         What the effect itself explains is no part of the error; otherwise no statistic could
-        exceed the root of the number of blocks. Where few blocks carry the information, the
+        exceed the root of the number of clusters. Where few of them carry the information, the
         error is drawn towards the usual one.
 
         Args:
-            parts, sizes: ``(blocks, C)`` scores and their information.
-            signs: ``(F, blocks)``.
+            parts, sizes: ``(G, C)`` scores and their information.
+            signs: ``(F, G)``.
             usual: see :meth:`_usual`.
         """
         total, squares, size = signs @ parts, (parts**2).sum(0), sizes.sum(0)
@@ -280,25 +313,12 @@ class Screen:
         variance = (blocks * np.maximum(rest, 0) + PRIOR * usual * size) / (blocks + PRIOR)
         return _wallace(total**2 / variance, blocks + PRIOR - 1)
 
-    def _grams(self, z: np.ndarray) -> np.ndarray:
-        """``(blocks, k, k)`` information of the directions in each block."""
-        found = np.zeros((int(self.block.max()) + 1, z.shape[1], z.shape[1]))
-        order = np.argsort(self.block, kind="stable")
-        ends = np.flatnonzero(np.diff(self.block[order])) + 1
-        for rows in np.split(order, ends):
-            found[self.block[rows[0]]] = z[rows].T @ z[rows]
-        return found
-
-    def _joint(self, parts: np.ndarray, grams: np.ndarray) -> tuple[float, np.ndarray]:
-        """A statistic of the k sums ``(blocks, k)`` together, and its values under flips."""
+    def _joint(self, parts: np.ndarray, grams: np.ndarray, signs: np.ndarray) -> np.ndarray:
+        """``(F,)`` a statistic of the k sums ``(G, k)`` together under flips."""
         k = parts.shape[1]
         if k == 1:
             sizes = grams[:, :, 0]
-            usual = self._usual(parts, sizes)
-            flipped = self._standardised(parts, sizes, self._flips, usual)
-            own = self._standardised(parts, sizes, np.ones((1, len(parts))), usual)
-            return float(own[0, 0]), flipped[:, 0]
-        signs = np.concatenate([np.ones((1, len(parts))), self._flips])
+            return self._standardised(parts, sizes, signs, self._usual(parts, sizes))[:, 0]
         total = signs @ parts
         amount = total @ np.linalg.pinv(grams.sum(0), rcond=1e-10)
         rest = signs[:, :, None] * parts - np.einsum("bij,fj->fbi", grams, amount)
@@ -311,8 +331,7 @@ class Screen:
         spread += 1e-12 * np.trace(whole) * np.eye(k)
         squares = np.einsum("fi,fi->f", total, np.linalg.solve(spread, total[..., None])[..., 0])
         degrees = np.array(blocks + PRIOR - 1)
-        found = _normal(_wallace(squares, degrees) ** 2, k)
-        return float(found[0]), found[1:]
+        return _normal(_wallace(squares, degrees) ** 2, k)
 
     def _estimate(
         self, parts: np.ndarray, grams: np.ndarray
@@ -324,6 +343,13 @@ class Screen:
         cov = inverse @ (rest.T @ rest) @ inverse
         gain = float(total @ inverse @ total / (self.residual @ self.residual))
         return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
+
+
+def at_least(values: np.ndarray) -> np.ndarray:
+    """``(F,)`` share of the values that are at least as large as each, but for rounding."""
+    order = np.sort(values)
+    below = np.searchsorted(order, values * (1 - 1e-12), side="left")
+    return 1 - below / len(values)
 
 
 def _wallace(squares: np.ndarray, degrees: np.ndarray) -> np.ndarray:

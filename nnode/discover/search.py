@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from nnode.discover.candidate import Candidate, again, calibrated
+from nnode.discover.candidate import Candidate, calibrated
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.edges import moved
 from nnode.discover.engine import Engine, row_of, square_of
-from nnode.discover.fit import FINE, Fit, refine, sums
-from nnode.discover.individual import Individuals, individuals
-from nnode.discover.score import Score, Screen, Trace, traces
+from nnode.discover.fit import FINE, Fit, refine
+from nnode.discover.score import Score, Screen, traces
 from nnode.discover.variables import Variable, curves
 from nnode.errors import SimulationError
-from nnode.models.effects import Effect, IndividualEffect
+from nnode.models.effects import Effect
 from nnode.models.extend import effects_of, without
 from nnode.models.system import System
 
@@ -41,8 +40,8 @@ CLOSE = 0.8
 #: probability: an interval that was looked for is flattered, and no name is better than a wrong
 #: one.
 MARGIN, RATHER = 0.1, 0.35
-#: An effect must predict sequences that a calibration left out better, at this error probability.
-#: False alarms are held by its score; an effect that acts in few sequences helps few of them.
+#: An effect must predict clusters that a calibration left out better, at this error probability.
+#: False alarms are held by its score; an effect that acts in few clusters helps few of them.
 BETTER = 0.05
 #: Further effects are held to this share of the error probability: a model that has one more
 #: effect is nearer to the data, but what is left of them is not all chance.
@@ -63,11 +62,6 @@ class Step:
     chosen: Candidate
     rivals: list[tuple[Candidate, Comparison]]
 
-    @property
-    def individuals(self) -> Individuals | None:
-        """The agents' numbers, of an individual effect."""
-        return self.chosen.individuals
-
 
 @dataclass
 class Search:
@@ -78,6 +72,7 @@ class Search:
         steps: in order of acceptance.
         scores: of all effects that are left, against ``fit``.
         screen: that they come from.
+        first: the scores of all effects against the model as it was given.
         square: mean square error of positions of the model without any effect, m²; 0 until it
             is known.
     """
@@ -86,6 +81,7 @@ class Search:
     steps: list[Step] = field(default_factory=list)
     scores: list[Score] = field(default_factory=list)
     screen: Screen | None = None
+    first: list[Score] = field(default_factory=list)
     square: float = 0.0
 
 
@@ -107,6 +103,7 @@ def search(
     most: int = 4,
     seed: int = 0,
     variables: list[Variable] | None = None,
+    levels: dict[str, np.ndarray] | None = None,
     within: Callable[[float], None] = lambda part: None,
 ) -> Search:
     """Forwards until no effect passes, then backwards.
@@ -120,61 +117,41 @@ def search(
         seed: of the sign flips.
         variables: no effect is accepted where a curve of one of these predicts better: it is a
             sign of something that the catalogue lacks.
+        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser
+            than the engine's.
         within: is told, now and then, about which part of the search is done.
     """
-    found = Search(fit)
+    found, levels = Search(fit), levels or {}
     while True:
         own = {effect.name for effect in effects_of(found.fit.system)}
         left = [effect for effect in effects if effect.name not in own]
         begun = len(found.steps)
         within(begun / (begun + 2))  # of most searches, the last but one round finds nothing more
-        look = _look(engine, found.fit, left)
+        look = [trace for effect in left for trace in traces(engine, found.fit, effect)]
         within((begun + 0.5) / (begun + 2))
-        found.screen = Screen(found.fit, engine.block, seed + len(found.steps))
-        found.scores = found.screen.scores(look.traces, look.individuals)
+        found.screen = Screen(found.fit, engine.cluster, seed + len(found.steps), levels=levels)
+        found.scores = found.screen.scores(look)
+        found.first = found.first or found.scores
         if len(found.steps) >= most:
             break
-        step = _round(engine, found, look, alpha if not found.steps else LATER * alpha)
+        step = _round(engine, found, alpha if not found.steps else LATER * alpha)
         if step is None or _outdone(engine, found.fit, step.chosen, variables or []):
             break
         found.steps.append(step)
         found.fit = settled(engine, step.chosen.fit.system, rounds=1)
         if step.chosen.score.effect.consecutive:
             found.fit = moved(engine, found.fit, step.chosen.name)
-        if step.individuals is not None:
-            found.fit = again(engine, found.fit, step.chosen)
         log.info("added %s", step.chosen.name)
     return _pruned(engine, found)
 
 
-@dataclass
-class _Look:
-    """The traces of all effects that are left."""
-
-    traces: list[Trace]
-    individuals: list[Individuals]
-
-    def of(self, name: str) -> Individuals | None:
-        return next((one for one in self.individuals if one.effect.name == name), None)
-
-
-def _look(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> _Look:
-    found = _Look([], [])
-    for effect in effects:
-        if not issubclass(effect, IndividualEffect):
-            found.traces += traces(engine, fit, effect)
-        elif (one := individuals(engine, fit, effect)) is not None:
-            found.individuals.append(one)
-    return found
-
-
-def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | None:
-    scores = found.scores
+def _round(engine: Engine, found: Search, alpha: float) -> Step | None:
+    scores, screen = found.scores, found.screen
+    assert screen is not None
     if not scores or min(score.p_value for score in scores) > alpha:
         return None
     most = max(score.gain for score in scores)
     tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
-    before = heldout(found.fit, engine.sequence)
     square = square_of(engine, found.fit.system)
     found.square = found.square or square
     if square < EXACT:
@@ -182,35 +159,29 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     candidates: list[Candidate] = []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
-        one = look.of(score.effect.name)
         try:
-            fit, one = calibrated(engine, found.fit, score, least, one)
+            fit = calibrated(engine, found.fit, score, least)
         except SimulationError:
             continue
-        losses = heldout(fit, engine.sequence)
-        if one is not None:
-            # numbers from one half of the time, tried on the other
-            losses = before * one.losses / sums(found.fit.residual**2, engine.sequence)
         removed = (square - square_of(engine, fit.system)) / found.square
-        candidates.append(Candidate(score, fit, losses, compare(before, losses), removed, one))
-    candidates.sort(key=lambda c: -c.gain.gain)
-    candidates = _to_the_end(engine, candidates, before)
+        candidates.append(_candidate(score, fit, found.fit, screen, removed))
+    candidates = _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
     passing = [
         c for c in candidates
         if c.score.p_value <= alpha
         and c.removed >= FLOOR
         and c.gain.p_value < BETTER
-        and c.strength_excludes_neutral(engine.sequence)
+        and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]  # fmt: skip
     if not passing:
         return None
-    best = _simplest(passing)
+    best = _simplest(passing, screen)
     rivals = []
     for other in candidates:
         if other is best or other.gain.gain < CLOSE * best.gain.gain:
             continue
-        test = compare(other.losses, best.losses)
+        test = _between(other, best, screen)
         kin = best.score.effect.kin
         alike = bool(kin) and kin == other.score.effect.kin
         if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
@@ -218,17 +189,32 @@ def _round(engine: Engine, found: Search, look: _Look, alpha: float) -> Step | N
     return Step(best, rivals)
 
 
-def _to_the_end(engine: Engine, candidates: list[Candidate], before: np.ndarray) -> list[Candidate]:
+def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:
+    """Compared with the model without it, on the clusters that tell of the effect."""
+    label = screen.label(score.effect.name)
+    losses = heldout(fit, label)
+    return Candidate(score, fit, losses, compare(heldout(before, label), losses), removed)
+
+
+def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
+    """Whether the second candidate predicts better, on the coarser clusters of the two."""
+    label = min(
+        (screen.label(one.name) for one in (first, second)), key=lambda label: int(label.max())
+    )
+    return compare(heldout(first.fit, label), heldout(second.fit, label))
+
+
+def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> list[Candidate]:
     """Candidates in their order, those near the best calibrated to the end: kin differ by less
     than a rough calibration leaves."""
-    found = []
+    assert found.screen is not None
+    ended = []
     for one in candidates:
-        if one.individuals is None and one.gain.gain >= CLOSE * candidates[0].gain.gain > 0:
+        if one.gain.gain >= CLOSE * candidates[0].gain.gain > 0:
             fit = refine(engine, one.fit.system, tolerance=FINE)
-            losses = heldout(fit, engine.sequence)
-            one = replace(one, fit=fit, losses=losses, gain=compare(before, losses))
-        found.append(one)
-    return sorted(found, key=lambda c: -c.gain.gain)
+            one = _candidate(one.score, fit, found.fit, found.screen, one.removed)
+        ended.append(one)
+    return sorted(ended, key=lambda c: -c.gain.gain)
 
 
 def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
@@ -236,23 +222,22 @@ def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable
     for curve in curves(engine, fit, variables) if variables else []:
         better = curve.gain.gain > (1 + MARGIN) * best.gain.gain
         if better and curve.p_value < APART:
-            test = compare(best.losses, curve.losses)
+            test = compare(heldout(best.fit, engine.cluster), curve.losses)
             if test.p_value < RATHER:
                 return True
     return False
 
 
-def _simplest(candidates: list[Candidate]) -> Candidate:
+def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
     """The best candidate, or one that is as good and has fewer parameters, or as many and a
     greater likelihood."""
     best = candidates[0]
     for other in candidates[1:]:
         number = len(other.fit.row), len(best.fit.row)
         likelier = number[0] == number[1] and other.fit.cost < best.fit.cost
-        plain = other.individuals is None and best.individuals is None
-        preferred = number[0] < number[1] or (likelier and plain)
         near = other.gain.gain >= NEAR * best.gain.gain
-        if preferred and near and compare(other.losses, best.losses).p_value > APART:
+        apart = _between(other, best, screen).p_value <= APART
+        if (number[0] < number[1] or likelier) and near and not apart:
             best = other
     return best
 
@@ -266,11 +251,11 @@ def _pruned(engine: Engine, found: Search) -> Search:
     """Take back effects that the later ones have made needless; who was a rival of one effect
     and was added later is none."""
     while len(found.steps) > 1:
-        losses = heldout(found.fit, engine.sequence)
+        losses = heldout(found.fit, engine.cluster)
         worst: tuple[float, Step, Fit] | None = None
         for step in found.steps:
             fit = refine(engine, without(found.fit.system, step.chosen.name))
-            test = compare(heldout(fit, engine.sequence), losses)
+            test = compare(heldout(fit, engine.cluster), losses)
             if test.p_value > BETTER and (worst is None or test.gain < worst[0]):
                 worst = test.gain, step, fit
         if worst is None:

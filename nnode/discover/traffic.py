@@ -15,7 +15,15 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.engine import Ensemble, Squares, fill, names_of, row_of, runge_kutta
+from nnode.discover.engine import (
+    Ensemble,
+    Squares,
+    fill,
+    names_of,
+    of_residuals,
+    row_of,
+    runge_kutta,
+)
 from nnode.discover.fit import limits
 from nnode.discover.response import Response
 from nnode.discover.smooth import noise_variance, smooth, velocity
@@ -33,9 +41,6 @@ STEP = 0.4
 #: Sequences are compared in windows of about this length, s, each simulated from so much
 #: before (at most a share of the sequence) that its start is forgotten.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
-#: The halves of a sequence's time are so much of it each: drivers' moods last some seconds, and
-#: neighbouring halves would share the one between them.
-HALF = 0.36
 #: Whitened residuals beyond this count less.
 LARGE = 6.0
 #: Most past samples that a filter looks at.
@@ -53,14 +58,19 @@ class TrafficEngine:
     Args:
         sequences: at least one, of the same sampling interval.
         window: length of a window, s; infinite simulates whole sequences.
+        clusters: ``(S,)`` of the sequences; None: each is one.
 
     Attributes:
         unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
         people: of each unit, per direction the sequence and the place of its agent.
-        half: ``(n,)`` 0 or 1: the two halves of a sequence's time; -1 between them.
     """
 
-    def __init__(self, sequences: list[Sequence], window: float = WINDOW) -> None:
+    def __init__(
+        self,
+        sequences: list[Sequence],
+        window: float = WINDOW,
+        clusters: np.ndarray | None = None,
+    ) -> None:
         self.sequences = sequences
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
@@ -80,9 +90,10 @@ class TrafficEngine:
         self._last: tuple[System, Tensor, Tensor] | None = None
         self._response: tuple[System, Tensor, Response] | None = None
         k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
-        self.block, self.sequence = b, owner[b]
-        clock = self.batch.start.numpy()[b] + k * self.batch.dt
-        self.half = _parts(clock, self.sequence)
+        self.sequence = owner[b]
+        self.cluster = of_residuals(clusters, self.sequence)
+        self.clock = self.batch.start.numpy()[b] + k * self.batch.dt
+        self.component = np.zeros(len(b), dtype=int)
         self.unit = self.sequence
         self.people = [
             [(i, n) for n in range(self.batch.agent.shape[1])] for i in range(len(sequences))
@@ -234,7 +245,7 @@ class TrafficEngine:
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
         away = self.deviations(system, row[None])[0][self.seen].numpy()
-        return Squares(away**2, self.sequence, self.half)
+        return Squares(away**2, self.sequence)
 
     def variables(self) -> list[Variable]:
         """What deviations of vehicles may depend on."""
@@ -261,16 +272,6 @@ class TrafficEngine:
         order = min(ORDER, max(0, (shortest - 2) // 3))
         away = self.deviations(system, row[None])[0]
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
-
-
-def _parts(clock: np.ndarray, sequence: np.ndarray) -> np.ndarray:
-    """0 early, 1 late, -1 in the middle of each sequence's time."""
-    number = int(sequence.max()) + 1
-    first, last = np.full(number, np.inf), np.full(number, -np.inf)
-    np.minimum.at(first, sequence, clock)
-    np.maximum.at(last, sequence, clock)
-    at = (clock - first[sequence]) / np.maximum(last - first, 1e-9)[sequence]
-    return np.where(at < HALF, 0, np.where(at > 1 - HALF, 1, -1))
 
 
 def drawn_in(residual: Tensor) -> Tensor:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from nnode.discover.compare import Comparison, compare, heldout
 from nnode.discover.engine import Engine, fill, square_of
-from nnode.discover.fit import ROUGH, Fit, limits, refine, sums
-from nnode.discover.score import Screen
+from nnode.discover.fit import ROUGH, Fit, grams, limits, refine, sums
+from nnode.discover.score import Screen, at_least
 from nnode.errors import SimulationError
 from nnode.models.system import System
 from nnode.models.term import Interval, State, Term
@@ -27,6 +27,8 @@ RIDGE = 1e-3
 FLIPS = 7999
 #: At most so many curves are calibrated with the model, those that predict best.
 MOST = 6
+#: A share of the knowledge of a height that is none, but for rounding.
+UNKNOWN = 1e-9
 #: Columns that are computed at once.
 CHUNK = 128
 #: Knots over which a wave is reported, and its lengths that they span.
@@ -164,7 +166,7 @@ class Curves:
         variable: see :class:`Variable`; the best wave of several.
         amounts: ``(M,)`` of the variable's weights, beyond what the model can do.
         heights, errors: at the knots, m/s or m/s².
-        losses: ``(S,)`` held-out costs with the curve.
+        losses: ``(G,)`` held-out costs with the curve.
         gain: over the model without it.
         p_value: that there is nothing, with regard to all variables.
         shift: ``(K,)`` of the model's own parameters beside the curve.
@@ -181,6 +183,11 @@ class Curves:
     p_value: float
     shift: np.ndarray
     removed: float = float("nan")
+
+    @property
+    def clusters(self) -> int:
+        """That the curve was compared on."""
+        return len(self.losses)
 
     @property
     def statistic(self) -> np.ndarray:
@@ -237,12 +244,11 @@ def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -
 
 
 def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> list[Curves]:
-    screen = Screen(fit, engine.block, seed, FLIPS)
-    before = heldout(fit, engine.sequence)
+    screen = Screen(fit, engine.cluster, seed, FLIPS)
+    before = heldout(fit, engine.cluster)
     looks = [_Look(engine, fit, screen, variable) for variable in variables]
     every = np.stack([squares for look in looks for squares in look.squares])
-    rank = every.shape[1] + 1 - stats.rankdata(every, method="min", axis=1)
-    share = rank / every.shape[1]
+    share = np.stack([at_least(row) for row in every])
     least = share.min(0)
     found, first = [], 0
     for look in looks:
@@ -256,15 +262,15 @@ class _Look:
     """All curves of one variable.
 
     Attributes:
-        squares: per kind of curve what it explains in the data and ``(1 + F,)`` under sign
-            flips: of a curve one per strength of smoothing, of waves the largest of all.
+        squares: per kind of curve ``(F,)`` what it explains in the data and under sign flips:
+            of a curve one per strength of smoothing, of waves the largest of all.
     """
 
     def __init__(self, engine: Engine, fit: Fit, screen: Screen, variable: Variable) -> None:
         self.engine, self.fit, self.variable = engine, fit, variable
         columns = columns_of(engine, fit, variable)
         self.z = screen.beyond(columns)
-        self.parts = sums(self.z * fit.residual[:, None], engine.block)
+        self.parts = sums(self.z * fit.residual[:, None], engine.cluster)
         self.total = screen.flipped(self.parts)
         self.absorbed = np.linalg.lstsq(fit.jacobian, columns, rcond=1e-9)[0]
         self.squares: list[np.ndarray] = []
@@ -304,19 +310,18 @@ class _Look:
         """With the smoothing that predicts best.
 
         Args:
-            before: ``(S,)`` held-out costs without a curve.
+            before: ``(G,)`` held-out costs without a curve.
             p_value: with regard to all variables.
         """
-        sequence = self.engine.sequence
-        plain = sums(self.fit.residual**2, sequence)
+        label = self.engine.cluster
+        plain = sums(self.fit.residual**2, label)
         count, number = len(plain), self.z.shape[1]
-        gram, score = np.zeros((count, number, number)), np.zeros((count, number))
-        for s in range(count):
-            own = sequence == s
-            gram[s], score[s] = self.z[own].T @ self.z[own], -self.z[own].T @ self.fit.residual[own]
+        gram, score = grams(self.z, label), -self.parts
         whole, total = gram.sum(0), score.sum(0)
         change, penalty = np.full(count, np.inf), self.penalties[0]
         for tried in self.penalties:
+            # what one cluster alone knows of cannot be predicted by the others
+            tried = tried + UNKNOWN * np.trace(whole) * np.eye(number)
             heights = np.linalg.solve(whole - gram + tried, (total - score)[..., None])[..., 0]
             new = np.einsum("sm,smn,sn->s", heights, gram, heights) - 2 * (heights * score).sum(1)
             if new.sum() < change.sum():
@@ -369,7 +374,8 @@ def weighed(engine: Engine, fit: Fit, found: list[Curves], alpha: float) -> list
     return sorted(sure, key=lambda one: -one.removed)
 
 
-def normal_tail(statistic: np.ndarray, number: int) -> np.ndarray:
-    """Two-sided p-values of standardised heights, corrected for ``number`` of them."""
-    found: np.ndarray = np.minimum(1.0, 2 * stats.norm.sf(np.abs(statistic)) * number)
+def tail(one: Curves, number: int) -> np.ndarray:
+    """Two-sided p-values of a curve's heights by Student's t, corrected for ``number`` of them."""
+    degrees = max(one.clusters - 1, 1)
+    found: np.ndarray = np.minimum(1.0, 2 * stats.t.sf(np.abs(one.statistic), degrees) * number)
     return found

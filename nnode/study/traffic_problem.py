@@ -11,8 +11,8 @@ from torch import Tensor
 
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.quasi_newton import Minima, minimise
+from nnode.data.clusters import GAP, clusters
 from nnode.data.sequence import Sequence, collate
-from nnode.data.split import components
 from nnode.data.store import Store
 from nnode.models.build import build_model
 from nnode.models.system import System
@@ -53,7 +53,7 @@ def recording(folder: str, name: str) -> list[Sequence]:
 def groups(folder: str, name: str) -> np.ndarray:
     """``(B,)`` group of each sequence of a recording: those that may share vehicles."""
     index = [entry for entry in Store(folder).index if entry["recording"] == name]
-    return components(index, gap=5.0)
+    return clusters(index, GAP)
 
 
 class Problem:

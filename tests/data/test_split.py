@@ -12,9 +12,10 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nnode.data.clusters import clusters
 from nnode.data.options import SplitMode, SplitOptions
 from nnode.data.sequence import Sequence
-from nnode.data.split import Split, components, split
+from nnode.data.split import Split, split
 from nnode.data.store import write_store
 from nnode.errors import ConfigError, DataError
 
@@ -84,7 +85,7 @@ def test_sequences_that_share_an_agent_stay_together() -> None:
 
 def test_the_same_identifier_in_two_recordings_is_two_agents() -> None:
     index = [entry(0.0, 1.0, ["1"], f"rec{i}") for i in range(4)]
-    assert len(set(components(index, 5.0).tolist())) == 4
+    assert len(set(clusters(index, 5.0).tolist())) == 4
 
 
 def test_a_chain_is_cut_by_a_block_of_time() -> None:
@@ -117,11 +118,11 @@ def test_every_recording_gives_its_block() -> None:
 def test_without_identifiers_time_decides() -> None:
     starts = [0.0, 4.0, 20.0, 23.0, 26.0, 60.0]
     index = [entry(t, t + 2) for t in starts]
-    assert components(index, 5.0).tolist() == [0, 0, 1, 1, 1, 2]
-    assert len(set(components(index, 0.0).tolist())) == 6
+    assert clusters(index, 5.0).tolist() == [0, 0, 1, 1, 1, 2]
+    assert len(set(clusters(index, 0.0).tolist())) == 6
     # a long sequence reaches over a short one that ends before it
     index = [entry(0.0, 30.0), entry(1.0, 2.0), entry(32.0, 33.0)]
-    assert components(index, 5.0).tolist() == [0, 0, 0]
+    assert clusters(index, 5.0).tolist() == [0, 0, 0]
 
 
 def test_without_identifiers_a_block_drops_its_neighbours_in_time() -> None:

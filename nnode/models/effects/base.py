@@ -93,6 +93,8 @@ class Effect(Term):
         contains: names of effects that are special cases of this one.
         consecutive: the probes are neighbouring intervals of one quantity, and an effect on
             several of them is the sum of their traces. ``a`` and ``b`` are the interval's ends.
+        covariate: ``kind``, ``group`` or ``length``: what of an agent it acts by. Where that is
+            fixed within every recording, recordings are what tells of it.
         individual: every agent has a strength of its own, with mean zero over the agents; the
             reported strength is their standard deviation.
     """
@@ -105,6 +107,7 @@ class Effect(Term):
     separated_by: ClassVar[str] = ""
     contains: ClassVar[tuple[str, ...]] = ()
     consecutive: ClassVar[bool] = False
+    covariate: ClassVar[str | None] = None
     individual: ClassVar[bool] = False
 
     def __init__(self, **values: float) -> None:

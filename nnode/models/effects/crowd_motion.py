@@ -55,6 +55,7 @@ class GroupCohesion(Effect):
     """Members of a social group are drawn to the middle of the others of their group."""
 
     name = "group_cohesion"
+    covariate = "group"
     formula = "c (mean of x_j over the others of the group - x_i)"
     source = "Moussaïd et al. 2010"
     domain = "crowd"

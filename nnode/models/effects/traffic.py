@@ -136,6 +136,7 @@ class VehicleClass(Effect):
 
     phi: Tensor
     name = "vehicle_class"
+    covariate = "kind"
     domain = "traffic"
     formula = "W phi for vehicles of one class"
     source = "Ossen & Hoogendoorn 2011"
@@ -174,6 +175,7 @@ class LeaderLength(Effect):
 
     beta: Tensor
     name = "leader_length"
+    covariate = "length"
     domain = "traffic"
     formula = "W(gap - beta (l_{i+1} - mean l))"
     source = "Ossen & Hoogendoorn 2011"

@@ -1,0 +1,260 @@
+"""The sealed clusters: opened once, when everything else is decided."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from nnode.data.sequence import Sequence
+from nnode.discover.confirm import LEVEL, Costs, by_cluster, engine_of, improvement, too_few
+from nnode.discover.engine import Engine, row_of
+from nnode.discover.fit import Fit, refine, sums
+from nnode.discover.individual import Individuals, numbers, with_people
+from nnode.discover.judge import named
+from nnode.discover.later import MODELS, Later, later
+from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
+from nnode.discover.search import Search, Step, settled
+from nnode.discover.unbiased import unbiased
+from nnode.errors import SimulationError
+from nnode.models.extend import without
+from nnode.models.system import System
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """An effect on the sealed clusters.
+
+    Attributes:
+        p_value: one-sided, that their predictive likelihood rises.
+        before, after: mean square errors of positions, m².
+    """
+
+    p_value: float
+    before: float
+    after: float
+
+    @property
+    def good(self) -> bool:
+        return self.p_value <= LEVEL and self.after < self.before
+
+    @property
+    def reason(self) -> str:
+        if self.p_value > LEVEL:
+            return (
+                "the sealed clusters are not predicted better with it "
+                f"(one-sided p = {self.p_value:.3f}, asked for {LEVEL:g})"
+            )
+        if not self.good:
+            return (
+                "the errors of positions on the sealed sequences do not become smaller with it "
+                f"({self.before:.3g} and {self.after:.3g} m²)"
+            )
+        return ""
+
+
+class Sealed:
+    """Compares models on the sealed sequences.
+
+    Args:
+        base: the model as it was given, calibrated.
+        opened, sealed: sequences.
+        label: ``(S,)`` clusters of the sealed ones.
+        clusters: how many of them are independent of the open ones.
+        seed: of simulations.
+
+    Attributes:
+        tried: the effects in the order in which they were found, until one failed.
+        whole: the fit with all effects that were found.
+    """
+
+    def __init__(
+        self,
+        domain: str,
+        base: System,
+        opened: list[Sequence],
+        sealed: list[Sequence],
+        label: np.ndarray,
+        clusters: int,
+        seed: int,
+    ) -> None:
+        self.domain, self.base, self.opened, self.sealed = domain, base, opened, sealed
+        self.label, self.clusters, self.seed = label, clusters, seed
+        self.costs = Costs(engine_of(domain, sealed, whole=True), label)
+        self.costs.engine.settle(base, row_of(base))
+        self.before = self.costs.of(base)
+        self.windows = engine_of(domain, sealed, label)
+        self.windows.settle(base, row_of(base))
+        self.tried: list[_Tried] = []
+        self.whole: Fit | None = None
+        self._corrected: Fit | None = None
+        self._later: dict[str, Later] = {}
+
+    def confirmed(self, engine: Engine, found: Search) -> tuple[Search, list[Step]]:
+        """A search with the effects that sealed clusters confirm, one after the other, and those
+        that they do not."""
+        if not found.steps:
+            return found, []
+        self.whole = self._corrected = self._unbiased(found.fit)
+        path = self._path(engine, found)
+        before, square, passed = self._scores(self.base), self.before.mean(), 0
+        for fit in path:
+            after, error = self._scores(fit.system), self.costs.of(fit.system).mean()
+            p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
+            self.tried.append(_Tried(p_value, float(square), float(error)))
+            if not self.tried[-1].good:
+                break
+            before, square, passed = after, error, passed + 1
+        if passed == len(found.steps):
+            return found, []
+        leads = found.steps[passed:]
+        system = self._without(engine, found.fit, leads).system if passed else self.base
+        kept = settled(engine, copy.deepcopy(system), rounds=1)
+        self._corrected = path[passed - 1] if passed else kept
+        return replace(found, fit=kept, steps=found.steps[:passed]), leads
+
+    def _scores(self, system: System) -> np.ndarray:
+        """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the
+        negative logarithm of the predictive likelihood, large residuals drawn in."""
+        found = self.windows.residuals(system, row_of(system)[None])[0].numpy()
+        return sums(np.nan_to_num(found, nan=np.inf) ** 2, self.windows.cluster)
+
+    def _path(self, engine: Engine, found: Search) -> list[Fit]:
+        """The models with the first, the first two, ... effects; all of them corrected."""
+        path = []
+        for number in range(1, len(found.steps)):
+            fit = self._without(engine, found.fit, found.steps[number:])
+            path.append(self._unbiased(fit))
+        assert self.whole is not None
+        return [*path, self.whole]
+
+    def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
+        system = fit.system
+        for step in steps:
+            system = without(system, step.chosen.name)
+        return refine(engine, copy.deepcopy(system))
+
+    def _unbiased(self, fit: Fit) -> Fit:
+        return unbiased(fit, self.opened, self.seed) if self.domain == "crowd" else fit
+
+    def corrected(self, found: Search) -> Fit:
+        """The fit with the confirmed effects, without what simulations of it are off by."""
+        return found.fit if self._corrected is None or not found.steps else self._corrected
+
+    def leads(self, engine: Engine, steps: list[Step]) -> list[NamedEffect]:
+        """Effects that were not confirmed, as they are in the model with all that were found."""
+        rest = [one.p_value for one in self.tried[-1:]] + [float("nan")] * len(steps)
+        assert self.whole is not None or not steps
+        return [
+            named(engine, self.whole, step, p)
+            for step, p in zip(steps, rest, strict=False)
+            if self.whole is not None
+        ]
+
+    def confirmation(self) -> Confirmation:
+        """What is said of the population's effects."""
+        few = too_few(self.clusters)
+        if not self.tried:
+            return Confirmation(None, self.clusters, None, few)
+        last = self.tried[-1]
+        return Confirmation(last.p_value, self.clusters, last.good, few or last.reason)
+
+    def agents(
+        self, one: Individuals, system: System, alpha: float, structure: bool, enough: bool
+    ) -> Agents:
+        """What agents' own numbers are worth on the last part of the sealed sequences.
+
+        Args:
+            structure: whether something without a name is left, which numbers would absorb.
+            enough: whether there are clusters enough to name anything.
+        """
+        (name,) = one.effect.strengths
+        low, high = one.interval()
+        found = later(self.domain, self.base, system, one, self.sealed) if one.spread else None
+        p_value, means = 1.0, {}
+        if found is not None:
+            self._later[one.effect.name] = found
+            label = self.label[found.used]
+            own, *others = (
+                by_cluster(found.costs[model], label) for model in (MODELS[1], MODELS[0], MODELS[2])
+            )
+            means = {model: float(costs.mean()) for model, costs in found.costs.items()}
+            # below what one sequence in the middle would have, all clusters count alike
+            if not too_few(len(own)) and self.clusters:
+                p_value = max(improvement(other, own) for other in others)
+        reason = _why_not(one, alpha, low, p_value, found, structure, enough, self.clusters)
+        return Agents(
+            name=one.effect.name,
+            strength=one.sigma,
+            low=low,
+            high=high,
+            unit=one.effect.strengths[name].unit,
+            p_value=one.p_value,
+            lasts=one.lasts,
+            share=one.share,
+            lags=one.lags,
+            common=one.common,
+            later=means,
+            confirmed=p_value,
+            named=not reason,
+            reason=reason,
+        )
+
+    def with_numbers(self, engine: Engine, fit: Fit, own: list[Individuals]) -> System:
+        """The model with everybody's numbers in the open sequences, calibrated with them."""
+        system = fit.system
+        for one in own:
+            system = with_people(system, one, numbers(engine, system, one))
+        if not own:
+            return system
+        try:
+            return refine(engine, system).system
+        except SimulationError:
+            return fit.system
+
+    def gap(self, extended: System, own: list[Individuals]) -> tuple[Gap, list[dict[str, Any]]]:
+        """The errors before and after, and those of each sequence."""
+        if own:
+            known = self._later[own[0].effect.name]
+            used, floor = known.used, known.floor
+            before, after = known.costs["base"], known.costs[MODELS[1]]
+        else:
+            used, floor = list(range(len(self.sealed))), self.costs.engine.noise_floor()
+            before = self.before
+            after = before if extended is self.base else self.costs.of(extended)
+        first, last = float(before.mean()), float(after.mean())
+        closed = (first - last) / (first - floor) if first > floor else float("nan")
+        each = [
+            {"name": self.sealed[i].name, "before": float(a), "after": float(b)}
+            for i, a, b in zip(used, before, after, strict=True)
+        ]
+        return Gap(first, last, floor, closed), each
+
+
+def _why_not(
+    one: Individuals,
+    alpha: float,
+    low: float,
+    p_value: float,
+    found: Later | None,
+    structure: bool,
+    enough: bool,
+    clusters: int,
+) -> str:
+    """Why agents' own numbers are not named; empty where they are."""
+    if not enough:
+        return "there are too few clusters to test it"
+    if one.p_value > alpha or low <= 0:
+        return "what an agent's numbers have in common over time does not stand out"
+    if structure:
+        return "something without a name is left, which numbers of agents would absorb"
+    if found is None:
+        return "the sealed sequences are too short to be divided"
+    if p_value > LEVEL:
+        return too_few(clusters) or (
+            "the last part of the sealed sequences is not predicted better by own numbers than "
+            f"without, or by one number per sequence (one-sided p = {p_value:.3f})"
+        )
+    return ""
