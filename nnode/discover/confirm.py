@@ -11,8 +11,6 @@ Source: Maurer, Hothorn & Lehmacher 1995 (fixed sequences of tests).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from nnode.data.clusters import better, least_number
@@ -20,6 +18,7 @@ from nnode.data.sequence import Sequence
 from nnode.discover.compare import gains
 from nnode.discover.crowd import CrowdEngine
 from nnode.discover.engine import Engine, row_of
+from nnode.discover.fit import sums
 from nnode.discover.traffic import TrafficEngine
 from nnode.models.system import System
 
@@ -41,33 +40,36 @@ def engine_of(
     return TrafficEngine(sequences, clusters=clusters)
 
 
-@dataclass
-class Costs:
-    """Mean square errors of positions on some sequences, m².
+class Comparing:
+    """Models on some sequences.
 
     Args:
-        engine: of them, settled.
-        label: ``(S,)`` their clusters.
+        base: the model around which residuals are whitened and weighted.
+        label: ``(S,)`` clusters of the sequences.
     """
 
-    engine: Engine
-    label: np.ndarray
+    def __init__(
+        self, domain: str, sequences: list[Sequence], base: System, label: np.ndarray
+    ) -> None:
+        self._whole = engine_of(domain, sequences, whole=True)
+        self._windows = engine_of(domain, sequences, label)
+        for engine in (self._whole, self._windows):
+            engine.settle(base, row_of(base))
 
-    def of(self, system: System) -> np.ndarray:
-        """``(S,)`` of each sequence."""
-        return self.engine.squares(system, row_of(system)).means()
+    @property
+    def floor(self) -> float:
+        """Mean square error of positions that is noise of the measurement, m²."""
+        return self._whole.noise_floor()
 
-    def clustered(self, costs: np.ndarray) -> np.ndarray:
-        """``(G,)`` means of costs ``(S,)`` over the sequences of each cluster."""
-        return by_cluster(costs, self.label)
+    def squares(self, system: System) -> np.ndarray:
+        """``(S,)`` mean square errors of positions, m²."""
+        return self._whole.squares(system, row_of(system)).means()
 
-
-def by_cluster(costs: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """``(G,)`` means of costs ``(S,)`` over clusters; sequences without a number are left out."""
-    known = np.isfinite(costs) | np.isposinf(costs)
-    own = np.unique(label[known], return_inverse=True)[1].reshape(-1)
-    found: np.ndarray = np.bincount(own, costs[known]) / np.bincount(own)
-    return found
+    def scores(self, system: System) -> np.ndarray:
+        """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the
+        negative logarithm of the predictive likelihood, large residuals drawn in."""
+        found = self._windows.residuals(system, row_of(system)[None])[0].numpy()
+        return sums(np.nan_to_num(found, nan=np.inf) ** 2, self._windows.cluster)
 
 
 def improvement(before: np.ndarray, after: np.ndarray) -> float:

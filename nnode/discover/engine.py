@@ -144,7 +144,8 @@ def trained(system: System) -> dict[str, nn.Parameter]:
 
 def row_of(system: System) -> Tensor:
     """``(K,)`` all parameters that are calibrated, one after the other, float64."""
-    return torch.cat([p.detach().double().flatten() for p in trained(system).values()])
+    own = [p.detach().double().flatten() for p in trained(system).values()]
+    return torch.cat(own) if own else torch.zeros(0, dtype=torch.float64)
 
 
 def names_of(system: System) -> list[str]:

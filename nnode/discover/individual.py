@@ -43,6 +43,8 @@ class Individuals:
             is one only), ``sequence``, ``agent`` and ``mood``.
         lags: s; ``common``: what parts at that lag have in common, per lag.
         lasts: s, the longest mood that can be told from a number of one's own.
+        mood: variance of what passes, and its time constant in s.
+        shared: variance of what the agents of a sequence have in common.
         settings: intervals of 95 % of settings that were chosen among neighbouring ones.
     """
 
@@ -55,6 +57,8 @@ class Individuals:
     lags: list[float]
     common: list[float]
     lasts: float
+    mood: tuple[float, float]
+    shared: float
     settings: dict[str, tuple[float, float]] = field(default_factory=dict)
     left_out: np.ndarray = field(default_factory=lambda: np.empty(0))
 
@@ -100,7 +104,8 @@ def numbers(
     """Sequence name to its agents' numbers, from all the time that the engine holds.
 
     Linearised around the motion that they lead to: who is much slower than the others is not
-    where a linear response expects him. Drawn to zero as the variance of the numbers says.
+    where a linear response expects him. Drawn to zero as the variance of the numbers says, and
+    that of the moods, which are noise to them.
 
     Args:
         engine: settled.
@@ -120,13 +125,34 @@ def numbers(
         if common and len(engine.people[0]) > 1:
             z = z.sum(1, keepdims=True)
         gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
-        ridge = np.eye(z.shape[1]) / max(one.spread, 1e-6) ** 2
+        gram, score = _among_moods(gram, score, _passing(engine, one))
+        ridge = np.eye(z.shape[1]) / max(one.shared if common else one.variance, 1e-12)
         start = np.zeros(score.shape) if amounts is None else amounts
         change = np.linalg.solve(gram + ridge, (score - start @ ridge)[..., None])[..., 0]
         # a change acts on the pace that is there already
         amounts = change if amounts is None else start + np.clip((1 + start) * change, -LEAP, LEAP)
         own.people = _people(engine, one, amounts, common)
     return own.people
+
+
+def _passing(engine: Engine, one: Individuals) -> float:
+    """Variance of the mean mood over the time that sequences last."""
+    height, tau = one.mood
+    last = np.array([s.time[-1] - s.time[0] for s in engine.sequences]).mean()
+    x = max(float(last) / max(tau, 1e-9), 1e-9)
+    return height * 2 / x * (1 + np.expm1(-x) / x)
+
+
+def _among_moods(gram: np.ndarray, score: np.ndarray, mood: float) -> tuple[np.ndarray, np.ndarray]:
+    """Information and scores of numbers that moods of a variance are added to."""
+    if mood <= 0:
+        return gram, score
+    number = gram.shape[1]
+    size = np.trace(gram, axis1=1, axis2=2)[:, None, None] / number
+    known = gram + (1e-9 * size + 1e-12) * np.eye(number)
+    # (gram^-1 + mood)^-1 = (1 + gram mood)^-1 gram
+    less = np.linalg.inv(np.eye(number) + mood * known)
+    return less @ known, np.einsum("uij,uj->ui", less, score)
 
 
 def with_people(system: System, one: Individuals, people: dict[str, list[float]]) -> System:
@@ -151,7 +177,7 @@ def _at(
     curve = Curve.of(seen)
     if curve is None:
         return None
-    own, mood, _ = curve.fitted(curve.same, curve.between)
+    own, *mood = curve.fitted(curve.same, curve.between)
     count = curve.same.shape[1]
     left_out = np.array(
         [
@@ -167,10 +193,12 @@ def _at(
         variance=own,
         error=error,
         p_value=p_value,
-        share=shares(seen, curve, own, mood),
+        share=shares(seen, curve, own, mood[0]),
         lags=curve.lags.tolist(),
         common=(ratio(curve.same) - ratio(curve.between)).tolist(),
         lasts=float(LONGEST * curve.lags[-1]),
+        mood=(mood[0], mood[1]),
+        shared=max(curve.plateau(ratio(curve.between), curve.between[1].sum(0))[0], 0.0),
         left_out=left_out,
     )
 

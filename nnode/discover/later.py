@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from nnode.data.sequence import Sequence
-from nnode.discover.confirm import Costs, engine_of
+from nnode.discover.confirm import Comparing, engine_of
 from nnode.discover.engine import row_of
 from nnode.discover.individual import Individuals, numbers, with_people
 from nnode.errors import DataError, SimulationError
@@ -37,23 +36,30 @@ class Later:
         used: positions of the sequences that are long enough.
         costs: ``(U,)`` mean square errors, m², by who predicts: :data:`MODELS` and
             ``base`` (the model as it was given), ``own mean velocity``, ``constant velocity``.
+        scores: ``(G,)`` of the models by cluster, see :class:`~nnode.discover.confirm.Comparing`.
         floor: of the measurement, m².
     """
 
     used: list[int]
     costs: dict[str, np.ndarray]
+    scores: dict[str, np.ndarray]
     floor: float
 
 
 def later(
-    domain: str, base: System, system: System, one: Individuals, sequences: list[Sequence]
+    domain: str,
+    base: System,
+    system: System,
+    one: Individuals,
+    sequences: list[Sequence],
+    label: np.ndarray,
 ) -> Later | None:
     """None where no sequence is long enough.
 
     Args:
         base: the model as it was given. system: with the population's effects.
         one: an individual effect, of the open clusters.
-        sequences: sealed.
+        sequences: sealed. label: ``(S,)`` their clusters.
     """
     used = [i for i, s in enumerate(sequences) if FIRST * (s.n_samples - 1) >= LEAST - 1]
     if not used:
@@ -61,26 +67,27 @@ def later(
     early = [_part(sequences[i], 0.0, FIRST) for i in used]
     last = [_part(sequences[i], LAST, 1.0) for i in used]
     try:
-        engine, whole = engine_of(domain, early), engine_of(domain, last, whole=True)
+        engine = engine_of(domain, early)
         engine.settle(system, row_of(system))
         people = numbers(engine, system, one)
         shared = numbers(engine, system, one, common=True)
-        whole.settle(base, row_of(base))
-        costs = Costs(whole, np.arange(len(used)))
-        found = {
-            "base": costs.of(base),
-            MODELS[0]: costs.of(system),
-            MODELS[1]: costs.of(with_people(system, one, people)),
-            MODELS[2]: costs.of(with_people(system, one, shared)),
+        comparing = Comparing(domain, last, system, label[used])
+        each = {
+            MODELS[0]: system,
+            MODELS[1]: with_people(system, one, people),
+            MODELS[2]: with_people(system, one, shared),
         }
+        found = {name: comparing.squares(model) for name, model in each.items()}
+        scores = {name: comparing.scores(model) for name, model in each.items()}
+        found["base"] = comparing.squares(base)
     except (DataError, SimulationError):
         return None
     if domain == "crowd":
         # an engine of people takes out what start states explain: to go straight on is no force
-        found["constant velocity"] = whole.squares(Crowd([]), torch.zeros(0).double()).means()
+        found["constant velocity"] = comparing.squares(Crowd([]))
     else:
         found |= _straight(early, last)
-    return Later(used, found, whole.noise_floor())
+    return Later(used, found, scores, comparing.floor)
 
 
 def _part(sequence: Sequence, start: float, end: float) -> Sequence:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from nnode.data.sequence import Sequence
-from nnode.discover.confirm import LEVEL, Costs, by_cluster, engine_of, improvement, too_few
-from nnode.discover.engine import Engine, row_of
-from nnode.discover.fit import Fit, refine, sums
+from nnode.discover.confirm import LEVEL, Comparing, improvement, too_few
+from nnode.discover.engine import Engine
+from nnode.discover.fit import Fit, refine
 from nnode.discover.individual import Individuals, numbers, with_people
 from nnode.discover.judge import named
 from nnode.discover.later import MODELS, Later, later
@@ -82,11 +82,8 @@ class Sealed:
     ) -> None:
         self.domain, self.base, self.opened, self.sealed = domain, base, opened, sealed
         self.label, self.clusters, self.seed = label, clusters, seed
-        self.costs = Costs(engine_of(domain, sealed, whole=True), label)
-        self.costs.engine.settle(base, row_of(base))
-        self.before = self.costs.of(base)
-        self.windows = engine_of(domain, sealed, label)
-        self.windows.settle(base, row_of(base))
+        self.comparing = Comparing(domain, sealed, base, label)
+        self.before = self.comparing.squares(base)
         self.tried: list[_Tried] = []
         self.whole: Fit | None = None
         self._corrected: Fit | None = None
@@ -99,9 +96,10 @@ class Sealed:
             return found, []
         self.whole = self._corrected = self._unbiased(found.fit)
         path = self._path(engine, found)
-        before, square, passed = self._scores(self.base), self.before.mean(), 0
+        scores, passed = self.comparing.scores, 0
+        before, square = scores(self.base), self.before.mean()
         for fit in path:
-            after, error = self._scores(fit.system), self.costs.of(fit.system).mean()
+            after, error = scores(fit.system), self.comparing.squares(fit.system).mean()
             p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
             self.tried.append(_Tried(p_value, float(square), float(error)))
             if not self.tried[-1].good:
@@ -114,12 +112,6 @@ class Sealed:
         kept = settled(engine, copy.deepcopy(system), rounds=1)
         self._corrected = path[passed - 1] if passed else kept
         return replace(found, fit=kept, steps=found.steps[:passed]), leads
-
-    def _scores(self, system: System) -> np.ndarray:
-        """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the
-        negative logarithm of the predictive likelihood, large residuals drawn in."""
-        found = self.windows.residuals(system, row_of(system)[None])[0].numpy()
-        return sums(np.nan_to_num(found, nan=np.inf) ** 2, self.windows.cluster)
 
     def _path(self, engine: Engine, found: Search) -> list[Fit]:
         """The models with the first, the first two, ... effects; all of them corrected."""
@@ -172,18 +164,18 @@ class Sealed:
         """
         (name,) = one.effect.strengths
         low, high = one.interval()
-        found = later(self.domain, self.base, system, one, self.sealed) if one.spread else None
+        found = None
+        if one.spread and (one.p_value <= alpha or not enough):
+            found = later(self.domain, self.base, system, one, self.sealed, self.label)
         p_value, means = 1.0, {}
         if found is not None:
             self._later[one.effect.name] = found
-            label = self.label[found.used]
-            own, *others = (
-                by_cluster(found.costs[model], label) for model in (MODELS[1], MODELS[0], MODELS[2])
-            )
             means = {model: float(costs.mean()) for model, costs in found.costs.items()}
-            # below what one sequence in the middle would have, all clusters count alike
-            if not too_few(len(own)) and self.clusters:
+            own, *others = (found.scores[model] for model in (MODELS[1], MODELS[0], MODELS[2]))
+            if not too_few(min(len(own), self.clusters)):
                 p_value = max(improvement(other, own) for other in others)
+            if means[MODELS[1]] >= means[MODELS[0]]:
+                p_value = 1.0
         reason = _why_not(one, alpha, low, p_value, found, structure, enough, self.clusters)
         return Agents(
             name=one.effect.name,
@@ -221,9 +213,9 @@ class Sealed:
             used, floor = known.used, known.floor
             before, after = known.costs["base"], known.costs[MODELS[1]]
         else:
-            used, floor = list(range(len(self.sealed))), self.costs.engine.noise_floor()
+            used, floor = list(range(len(self.sealed))), self.comparing.floor
             before = self.before
-            after = before if extended is self.base else self.costs.of(extended)
+            after = before if extended is self.base else self.comparing.squares(extended)
         first, last = float(before.mean()), float(after.mean())
         closed = (first - last) / (first - floor) if first > floor else float("nan")
         each = [
