@@ -191,8 +191,7 @@ def sharpened(engine: Engine, system: System, one: Individuals) -> Individuals:
             ridge = np.eye(z.shape[1]) / one.spread**2
             change = np.linalg.solve(gram + ridge, (score - amounts / one.spread**2)[..., None])
             change = change[..., 0]
-            # a change acts on the pace that is there already
-            amounts = amounts + np.clip((1 + amounts) * change, -LEAP, LEAP)
+            amounts = amounts + np.clip(change, -LEAP, LEAP)
         found.append(amounts)
     full, *halves = (_people(engine, one.effect, one.options, each) for each in found)
     # what the linear response over- or underestimates, it does with the spread as well
