@@ -313,7 +313,12 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
         "best checkpoint": str(trainer.best_path),
         "last checkpoint": str(trainer.last_path),
     }
-    write_json(folder / RESULT, {"summary": summary, "paths": paths, "history": history})
+    solver = {
+        "name": config["solver"]["name"],
+        "uncompiled": getattr(trainer.solver, "uncompiled", "") or None,
+    }
+    result = {"summary": summary, "solver": solver, "paths": paths, "history": history}
+    write_json(folder / RESULT, result)
     print(
         f"cost of a training sequence: {first['cost/train']:.4g} -> {best['cost/train']:.4g} {unit}"
     )

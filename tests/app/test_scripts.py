@@ -299,3 +299,27 @@ def test_the_fused_solver_trains_to_the_same_numbers(
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "e" / "metrics.json").read_text())
     assert metrics["J"] == pytest.approx(found["fused"]["cost_heldout"], rel=1e-9)
+
+
+@pytest.mark.parametrize("effects", ["[]", "[{name: relative_speed}]"])
+def test_a_run_without_compiled_code_says_so(
+    script: Script, raw: Path, tmp_path: Path, effects: str
+) -> None:
+    done = script(
+        "train",
+        "experiment=demo_traffic",
+        "solver=fused",
+        f"model.effects={effects}",
+        "trainer.max_epochs=0",
+        f"data.source={raw}",
+        f"hydra.run.dir={tmp_path}",
+    )
+    assert done.returncode == 0, done.stderr
+    shown = done.stdout + done.stderr
+    solver = json.loads((tmp_path / "result.json").read_text())["solver"]
+    if effects == "[]":
+        assert solver == {"name": "fused", "uncompiled": None}
+        assert "batched PyTorch" not in shown
+    else:
+        assert solver == {"name": "fused", "uncompiled": "it does not cover relative_speed"}
+        assert shown.count("batched PyTorch and not in compiled code") == 1
