@@ -23,6 +23,7 @@ from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
+from nnode.discover.able import check_model
 from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
@@ -172,6 +173,7 @@ def _job(
             f"{data.domain} data; choose both of one domain"
         )
     check_options(options, system.domain)  # type: ignore[arg-type]
+    check_model(system)
     inputs = read_inputs(data, folder / "data")
     # what the extended model is trained and tested on are the sequences without a fault
     plain_data = {**plain_data, "faults": Faults.drop.value}

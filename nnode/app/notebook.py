@@ -23,6 +23,7 @@ from nnode.calibrate.checkpoint import load
 from nnode.calibrate.optimizers import LbfgsOptions
 from nnode.calibrate.options import FusedOptions, TrainerOptions
 from nnode.models import System
+from nnode.models.term import short_names
 from nnode.plots import force_figure
 
 
@@ -43,8 +44,10 @@ class Calibration:
     summary: dict[str, Any]
 
     def __repr__(self) -> str:
+        short = short_names(map(str, self.parameters.index))
         rows = [
-            f"  {name} = {row.value:.5g} {row.unit}" for name, row in self.parameters.iterrows()
+            f"  {short[str(name)]} = {row.value:.5g} {row.unit}"
+            for name, row in self.parameters.iterrows()
         ]
         train, heldout = self.summary["cost_train"], self.summary.get("cost_heldout")
         cost = f"cost of a training sequence {train:.4g} m² s"
@@ -59,7 +62,7 @@ class Calibration:
 
     @property
     def parameters(self) -> pd.DataFrame:
-        """Value and unit of every physical parameter."""
+        """Value and unit of every physical parameter, by its address such as ``lin.v0``."""
         rows = {name: (float(value), unit) for name, (value, unit) in self.model.physical().items()}
         return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "unit"])
 

@@ -37,6 +37,7 @@ from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.files import write_json
 from nnode.models import System, build_model
+from nnode.models.term import short_names
 from nnode.plots import force_figure
 from nnode.solvers import Solver, TorchdiffeqSolver, substeps
 
@@ -289,7 +290,12 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
     first = history[0]
     best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
     unit = "m² s" if config["trainer"]["cost"] == "integral" else "m²"
-    physical = trainer.model.physical()
+    # an epoch of an older checkpoint that was resumed may know its parameters by other names
+    physical = {
+        name: (best[f"parameters/{name}"], unit)
+        for name, (_, unit) in trainer.model.physical().items()
+        if f"parameters/{name}" in best
+    }
     summary: dict[str, Any] = {
         "model": config["model"]["name"],
         "data": config["data"]["name"],
@@ -299,7 +305,7 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
         "cost_train": best["cost/train"],
         "cost_heldout": best.get("cost/heldout"),
         "epoch": trainer.best_epoch,
-        **{name: best[f"parameters/{name}"] for name in physical},
+        **{name: value for name, (value, _) in physical.items()},
         "seconds": round(seconds, 1),
     }
     paths = {
@@ -307,15 +313,21 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
         "best checkpoint": str(trainer.best_path),
         "last checkpoint": str(trainer.last_path),
     }
-    write_json(folder / RESULT, {"summary": summary, "paths": paths, "history": history})
+    solver = {
+        "name": config["solver"]["name"],
+        "uncompiled": getattr(trainer.solver, "uncompiled", "") or None,
+    }
+    result = {"summary": summary, "solver": solver, "paths": paths, "history": history}
+    write_json(folder / RESULT, result)
     print(
         f"cost of a training sequence: {first['cost/train']:.4g} -> {best['cost/train']:.4g} {unit}"
     )
     if "cost/heldout" in best:
         before, after = first["cost/heldout"], best["cost/heldout"]
         print(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
-    for name, (_, unit) in physical.items():
-        print(f"{name} = {best[f'parameters/{name}']:.4g} {unit}")
+    short = short_names(physical)
+    for name, (value, unit) in physical.items():
+        print(f"{short[name]} = {value:.4g} {unit}")
     for what, path in paths.items():
         if Path(path).exists():
             print(f"{what}: {path}")

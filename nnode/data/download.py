@@ -216,6 +216,8 @@ def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
 def _fetch(dataset: str, name: str, url: str, folder: Path) -> Path:
     origin = _origin(dataset, name)
     expected = origin.files.get(name) if origin else None
+    pooch.get_logger().setLevel(logging.WARNING)  # it would say the whole address
+    log.info("fetching %s", name)
     try:
         path = pooch.retrieve(
             url,
@@ -224,20 +226,38 @@ def _fetch(dataset: str, name: str, url: str, folder: Path) -> Path:
             path=str(folder),
             downloader=pooch.HTTPDownloader(timeout=TIMEOUT),
         )
-    except ValueError as error:  # pooch's answer to a wrong hash
-        reason = f"it is not the published file (expected SHA-256 {expected}): {error}"
+    except ValueError:  # pooch's answer to a wrong hash
+        reason = f"what came is not the published file (SHA-256 {str(expected)[:12]}…)"
     except OSError as error:  # every failure of the connection, the server or the disk
-        reason = f"{type(error).__name__}: {error}"
+        reason = _reason(error)
     else:
         return Path(path)
-    provenance = ""
+    address, asked = url, ""
     if origin and expected:
-        provenance = f" It is published at {origin.url(name)} ({origin.licence})."
+        address = f"{origin.url(name)} ({origin.licence})"
+        asked = "" if url == origin.url(name) else f" from data.source={url.rpartition('/')[0]}"
     raise DownloadError(
-        f"{name} could not be fetched from {url}: {reason}.{provenance} Try again, or get the "
-        f"file by other means and set data.source=FOLDER, or the environment variable "
-        f"{FOLDER_VARIABLE}, to the folder that holds it."
+        f"{name} could not be fetched{asked}: {reason}; try again, or get it by other means from "
+        f"{address} and set data.source=FOLDER or {FOLDER_VARIABLE} to the folder that holds it"
     )
+
+
+#: What classes of errors of the connection mean; their own words repeat the address.
+_REASONS = {
+    "Timeout": f"no answer within {TIMEOUT:g} s",
+    "ChunkedEncodingError": "the connection broke off",
+    "ConnectionError": "the server cannot be reached",
+}
+
+
+def _reason(error: OSError) -> str:
+    """Why a download failed, in one line without the address."""
+    answer = getattr(error, "response", None)
+    if answer is not None:
+        return f"the server answered {answer.status_code} {answer.reason}"
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    known = (words for kind, words in _REASONS.items() if kind in kinds)
+    return next(known, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def _find(dataset: str, name: str, source: Path) -> Path:

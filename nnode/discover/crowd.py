@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Sequence, collate
+from nnode.discover.able import check_model
 from nnode.discover.crowd_response import Frames, propagate
 from nnode.discover.crowd_variables import crowd_variables
 from nnode.discover.crowd_walk import Tables, Walk
@@ -20,7 +21,7 @@ from nnode.discover.crowd_whitening import Whitening
 from nnode.discover.crowd_windows import Windows, WindowScene
 from nnode.discover.engine import Squares, fill, of_residuals
 from nnode.discover.variables import Variable
-from nnode.models.effects.base import Effect, Probe
+from nnode.models.effects.base import Effect, IndividualEffect, Probe
 from nnode.models.system import Crowd, System
 from nnode.models.term import State
 
@@ -193,10 +194,12 @@ class CrowdEngine:
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
     ) -> Tensor:
         """``(S, n)``: derivatives of the residuals with respect to the strengths of a probe, in
-        the order of its ``steps``."""
+        the order of its ``steps``; the change by the effect as a whole where it has no strength."""
 
         def rates(state: State) -> list[Tensor]:
             without, found = effect(**probe.options)(state), []
+            if not probe.steps:
+                return [without]
             for name, step in probe.steps.items():
                 changed = effect(**probe.options)
                 getattr(changed, name).add_(step)
@@ -206,29 +209,25 @@ class CrowdEngine:
         return self.response(system, row, rates)
 
     def individual(
-        self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
+        self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
     ) -> Tensor:
-        """``(M, n)``: derivatives of everyone's residuals with respect to M numbers of his own.
+        """``(M, n)``: derivatives of everyone's residuals with respect to M amounts of his own,
+        see :meth:`~nnode.models.effects.IndividualEffect.directions`.
 
-        As people walk alone, the derivative with respect to one person's number is the same
-        column, restricted to the residuals of this unit. ``walker_heterogeneity``: M
-        = 1, eta_i. ``gait_sway`` at ``options["f"]``: M = 2, amplitudes (m/s²) of sine and
-        cosine of the clock.
+        As people walk alone, the derivative with respect to one person's amount is the same
+        column, restricted to the residuals of this unit.
         """
         frames = self.linearised(system, row).frames
         state = frames.state()
         names = set(frames.scene.names)
         most = state.x.shape[1]
 
-        def column(value: float, **values: float) -> Tensor:
-            chosen: dict[str, Any] = {**values, "people": {name: [value] * most for name in names}}
-            with torch.no_grad():
-                return self._respond(effect(**chosen)(state), frames)
+        def column(values: dict[str, Any], number: float) -> Tensor:
+            people = {name: [number] * most for name in names}
+            return self._respond(effect(people=people, **values)(state), frames)
 
-        if effect.name == "gait_sway":
-            sway = {**options, "a": 1.0}
-            return torch.stack([column(0.0, **sway), column(float(np.pi / 2), **sway)])
-        return column(1.0, **options)[None]
+        with torch.no_grad():
+            return torch.stack([column(*one) for one in effect.directions(options)])
 
     # -- parts -----------------------------------------------------------------------------
 
@@ -257,6 +256,7 @@ class CrowdEngine:
     def _walk(self, system: System) -> Walk:
         # the systems of one diagnosis share walls, radii and masses: the first stands for all
         if self._scene is None:
+            check_model(system)
             self._scene = self.windows.scene(system)
         walk = Walk(self.windows, self._scene, system, self._tables)
         if walk.compiled:

@@ -11,6 +11,7 @@ import numpy as np
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
+from nnode.discover.able import check_model
 from nnode.discover.confirm import LEVEL, engine_of
 from nnode.discover.division import Division, divide
 from nnode.discover.engine import Engine, of_residuals, square_of
@@ -94,6 +95,7 @@ def diagnose(
     """
     domain = cast(Domain, system.domain)
     names = check_options(options, domain)
+    check_model(system)
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     stages.begin("calibrating")

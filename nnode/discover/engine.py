@@ -13,7 +13,7 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch, Sequence
 from nnode.discover.recorded import recorded
-from nnode.models.effects import Effect, Probe
+from nnode.models.effects import Effect, IndividualEffect, Probe
 from nnode.models.scene import Scene
 from nnode.models.system import System
 from nnode.models.term import State
@@ -103,9 +103,9 @@ class Engine(Protocol):
         ...
 
     def individual(
-        self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
+        self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
     ) -> Tensor:
-        """``(M, n)`` derivatives of the residuals with respect to M numbers of every unit."""
+        """``(M, n)`` derivatives of the residuals with respect to M amounts of every unit."""
         ...
 
     def settle(self, system: System, row: Tensor) -> None:

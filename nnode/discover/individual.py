@@ -129,8 +129,7 @@ def numbers(
         ridge = np.eye(z.shape[1]) / max(one.shared if common else one.variance, 1e-12)
         start = np.zeros(score.shape) if amounts is None else amounts
         change = np.linalg.solve(gram + ridge, (score - start @ ridge)[..., None])[..., 0]
-        # a change acts on the pace that is there already
-        amounts = change if amounts is None else start + np.clip((1 + start) * change, -LEAP, LEAP)
+        amounts = change if amounts is None else start + np.clip(change, -LEAP, LEAP)
         own.people = _people(engine, one, amounts, common)
     return own.people
 

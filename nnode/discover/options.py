@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 
 from nnode.data.sequence import Domain
+from nnode.discover.able import check_effect
 from nnode.errors import ConfigError
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import VARIABLE
@@ -36,8 +37,8 @@ def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
         The names of the effects to look for, in the catalogue's order.
 
     Raises:
-        ConfigError: a number outside its range, or an effect that the domain's catalogue does
-            not have; names the nearest.
+        ConfigError: a number outside its range, an effect that the domain's catalogue does
+            not have (names the nearest), or one that no engine can look for.
     """
     for name, value in (("sealed", options.sealed), ("alpha", options.alpha)):
         if not 0 < value < 1:
@@ -52,7 +53,10 @@ def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
     if options.effects is not None:
         _known("discover.effects", options.effects, known, domain)
         chosen = [name for name in known if name in options.effects]
-    return [name for name in chosen if name not in options.exclude]
+    names = [name for name in chosen if name not in options.exclude]
+    for name in names:
+        check_effect(CATALOGUE.effects[name])
+    return names
 
 
 def _known(option: str, names: Iterable[str], known: list[str], domain: Domain) -> None:

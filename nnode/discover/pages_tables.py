@@ -9,6 +9,7 @@ import pandas as pd
 from nnode.data.quality import KINDS
 from nnode.discover.report import amount, estimate, in_unit
 from nnode.discover.result import Diagnosis, NamedEffect
+from nnode.models.term import short_names
 from nnode.pages.page import TableBlock
 
 #: Faults that the page lists; its CSV has all.
@@ -180,9 +181,10 @@ def gap_table(d: Diagnosis) -> TableBlock:
 
 def base_table(d: Diagnosis) -> TableBlock:
     """How the model's own parameters move when effects join them."""
+    short = short_names(d.base)
     rows = [
         {
-            "parameter": name,
+            "parameter": short[name],
             "alone": amount(values.get("before"), 4),
             "with the effects": amount(values.get("after"), 4),
             "unit": _unit(values.get("unit", "")),

@@ -26,6 +26,10 @@ REPORT = "report.json"
 MODEL = "model.yaml"
 CHECKPOINT = Path("checkpoints", "best.pt")
 
+#: Of ``report.json``, raised when a key changes its name or meaning. 2: the base model's parameters
+#: are told by term and name, ``lin.v0``.
+SCHEMA = 2
+
 #: The counters of a training that has not begun.
 UNTRAINED: dict[str, float] = {
     "epoch": 0,
@@ -44,7 +48,7 @@ def plain_report(diagnosis: Diagnosis) -> dict[str, Any]:
     """The content of ``report.json``: plain types, None for what is no number."""
     found = _finite(diagnosis.plain())
     assert isinstance(found, dict)
-    return found
+    return {"schema": SCHEMA, **found}
 
 
 def _finite(value: Any) -> Any:

@@ -275,7 +275,7 @@ class Diagnosis:
     places: list[Place]
     unknown: Structure | None
     gap: Gap
-    base: dict[str, dict[str, Any]]  # parameter: before, after, unit
+    base: dict[str, dict[str, Any]]  # term.parameter: before, after, unit
     split: dict[str, list[str]]  # open and sealed sequences, by name
     notes: list[str]
     seconds: dict[str, float]

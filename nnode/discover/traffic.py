@@ -30,8 +30,8 @@ from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.traffic_variables import traffic_variables
 from nnode.discover.variables import Variable
 from nnode.discover.whiten import PlatoonFilter
-from nnode.models.effects import Effect, Probe
-from nnode.models.extend import extended
+from nnode.models.effects import Effect, IndividualEffect, Probe
+from nnode.models.extend import effects_of, extended, without
 from nnode.models.system import System
 from nnode.models.term import State, Term
 
@@ -185,7 +185,12 @@ class TrafficEngine:
             rates: of a state M speeds ``(B, N, 1)``, m/s.
         """
         linear = self.linear(system, row)
-        system = linear.system
+        return self._respond(linear, linear.system, rates)
+
+    def _respond(
+        self, linear: Response, system: System, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """:meth:`response` to speeds that see a model's rates along a run."""
         scene, lead = linear.scene, linear.scene.leader[..., None]
 
         def one(t: Tensor, y: Tensor, rate: Tensor) -> Tensor:
@@ -252,19 +257,21 @@ class TrafficEngine:
         return traffic_variables(self.smoothed)
 
     def individual(
-        self, system: System, row: Tensor, effect: type[Effect], options: dict[str, Any]
+        self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
     ) -> Tensor:
-        """``(N, n)``: derivatives of the residuals with respect to the pace of the vehicle at
+        """``(N, n)``: derivatives of the residuals with respect to the number of the vehicle at
         each place of the platoon, in all sequences at once."""
-        response = self.linear(system, row)
-        followers = response.scene.follower
-        places = followers.shape[1]
-        rate = response.rates(response.system)
-        # the law's own rate is what a driver's pace multiplies
-        source = torch.zeros(places, *rate.shape, dtype=torch.float64)
-        for n in range(places):
-            source[n, :, :, n, 0] = rate[:, :, n, 0] * followers[:, n]
-        return self._columns(response, response.moved(source))
+        linear = self.linear(system, row)
+        plain = linear.system
+        if effect.name in {one.name for one in effects_of(plain)}:
+            plain = without(plain, effect.name)  # its own numbers are no part of what it acts on
+        ((values, number),) = effect.directions(options)
+        places = np.eye(self.batch.agent.shape[1])
+        each = [
+            effect(people=dict.fromkeys(self.names, (number * own).tolist()), **values)
+            for own in places
+        ]
+        return self._respond(linear, plain, lambda state: [own(state) for own in each])
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""

@@ -16,6 +16,8 @@ from nnode.groundtruth.crowd_replay import Windows, cost_by_sequence
 
 #: Effects with a number for every person: a report holds only their spread.
 INDIVIDUAL = ("walker_heterogeneity", "gait_sway")
+#: Parameters of the base law, and where a report tells them.
+BASE = {name: f"social_force.{name}" for name in ("A", "k", "kappa")}
 
 
 def crowd_costs(
@@ -34,9 +36,10 @@ def crowd_costs(
     hidden = {item["name"] for item in truth["effects"]}
     if set(INDIVIDUAL) & (set(named) | hidden) or not set(named) <= set(EFFECTS):
         return None
-    parameters = report.get("base") or {}
+    base_of = report.get("base") or {}
+    parameters = {name: base_of[at] for name, at in BASE.items() if at in base_of}
     told = all(set(EFFECTS[name].fields.values()) <= set(values) for name, values in named.items())
-    if not told or not {"A", "k", "kappa"} <= set(parameters):
+    if not told or len(parameters) < len(BASE):
         return None
     case = Case.from_dict(truth["case"])
     effects = {
@@ -51,7 +54,7 @@ def crowd_costs(
 
     def base(which: str) -> Base:
         return scene.base._replace(
-            **{name: float(parameters[name][which]) for name in ("A", "k", "kappa")}
+            **{name: float(values[which]) for name, values in parameters.items()}
         )
 
     found = {

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.models.scene import Scene
-from nnode.models.term import Interval, State, Term, physical_parameters
+from nnode.models.term import Interval, State, Term, physical_parameters, short_names
 
 T = TypeVar("T", bound=Term)
 
@@ -100,11 +100,12 @@ class System(nn.Module):
 
     def extra_repr(self) -> str:
         """The parameters that have a physical meaning, for those who print a model."""
-        values = self.physical().items()
-        return ", ".join(f"{name}={float(value):.5g} {unit}" for name, (value, unit) in values)
+        values = self.physical()
+        short = short_names(values)
+        return ", ".join(f"{short[name]}={float(x):.5g} {u}" for name, (x, u) in values.items())
 
     def physical(self) -> dict[str, tuple[Tensor, str]]:
-        """Name to (value, unit) of the parameters that have a physical meaning."""
+        """Address, as ``lin.v0``, to (value, unit) of the parameters with a physical meaning."""
         return physical_parameters(self)
 
     def bounds(self) -> dict[str, Interval]:

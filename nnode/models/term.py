@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -130,11 +132,24 @@ class Term(nn.Module):
 
 
 def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
-    """Name to (value, unit) of every declared scalar parameter of the terms in ``module``."""
+    """Address to (value, unit) of every declared scalar parameter of the terms in ``module``.
+
+    The address is the term's name and the parameter's, ``lin.v0``: whatever other terms there are,
+    it stays the same. Of terms of one name the second is numbered, ``speed_zone_2.alpha``.
+    """
     found: dict[str, tuple[Tensor, str]] = {}
+    seen: Counter[str] = Counter()
     for term in module.modules():
-        if isinstance(term, Term):
+        if isinstance(term, Term) and term.units:
+            seen[term.name] += 1
+            owner = term.name if seen[term.name] == 1 else f"{term.name}_{seen[term.name]}"
             for name, unit in term.units.items():
-                key = name if name not in found else f"{term.name}.{name}"
-                found[key] = (getattr(term, name).detach(), unit)
+                found[f"{owner}.{name}"] = (getattr(term, name).detach(), unit)
     return found
+
+
+def short_names(addresses: Iterable[str]) -> dict[str, str]:
+    """Addresses of parameters to what is printed: the parameter's name where it is alone."""
+    bare = {address: address.rpartition(".")[2] for address in addresses}
+    count = Counter(bare.values())
+    return {address: name if count[name] == 1 else address for address, name in bare.items()}

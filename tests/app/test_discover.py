@@ -154,7 +154,7 @@ def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:
     assert metrics["part"] == "heldout"
     assert metrics["trained_on"] == 0
     assert sorted(metrics["costs"]) == sorted(report["split"]["sealed"])
-    assert metrics["parameters"]["alpha"] == pytest.approx(0.65)
+    assert metrics["parameters"]["speed_zone.alpha"] == pytest.approx(0.65)
     # the mean square error over all vehicles, of a simulation with another step
     assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
 
@@ -168,10 +168,10 @@ def test_force_plots_take_the_checkpoint(run: Path) -> None:
 def test_the_configuration_trains_from_the_estimates(run: Path) -> None:
     result = json.loads((run.parent / "train" / "result.json").read_text())
     first = result["history"][0]
-    assert first["parameters/alpha"] == pytest.approx(0.65)
-    assert first["parameters/a"] == pytest.approx(ZONE[0])
+    assert first["parameters/speed_zone.alpha"] == pytest.approx(0.65)
+    assert first["parameters/speed_zone.a"] == pytest.approx(ZONE[0])
     checkpoint = load_checkpoint(run.parent / "train" / "checkpoints" / "last.pt")
-    assert checkpoint.history[-1]["parameters/alpha"] != 0.65  # it is calibrated
+    assert checkpoint.history[-1]["parameters/speed_zone.alpha"] != 0.65  # it is calibrated
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_training_goes_on_with_the_open_sequences(
     report = json.loads((run / "report.json").read_text())
     assert after.split["heldout"] == before.split["heldout"] == report["split"]["sealed"]
     assert after.split["train"] == report["split"]["open"]
-    assert after.history[0]["parameters/alpha"] == pytest.approx(0.65)
+    assert after.history[0]["parameters/speed_zone.alpha"] == pytest.approx(0.65)
 
 
 def test_a_signal_leaves_no_half_report(run: Path, tmp_path: Path) -> None:

@@ -61,10 +61,10 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
     known = {name: float(value) for name, (value, _) in model.physical().items()}
     table = pd.read_csv(tmp_path / "csv" / "parameters.csv").set_index("parameter")
     assert table["value"].to_dict() == pytest.approx(known, rel=1e-15)
-    assert table["unit"].to_dict() == {"v0": "m/s", "L": "m"}
+    assert table["unit"].to_dict() == {"lin.v0": "m/s", "lin.L": "m"}
     (kind,) = ElementTree.parse(tmp_path / "vtype.add.xml").iter("vType")
     room = float(kind.attrib["length"]) + float(kind.attrib["minGap"])
-    assert room == pytest.approx(known["L"], rel=1e-5)
+    assert room == pytest.approx(known["lin.L"], rel=1e-5)
 
     measured, simulated = (
         read_table(path, TableOptions(domain="traffic", path=str(path)))
@@ -81,7 +81,7 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
     expected = [np.sqrt(np.mean(errors[k])) for k in sorted(errors)]
     np.testing.assert_allclose(horizons["rmse_m"], expected, rtol=1e-9)
     history = pd.read_csv(tmp_path / "csv" / "history.csv")
-    assert {"cost/train", "cost/heldout", "parameters/v0"} <= set(history["quantity"])
+    assert {"cost/train", "cost/heldout", "parameters/lin.v0"} <= set(history["quantity"])
 
 
 @pytest.mark.slow
@@ -107,8 +107,10 @@ def test_crowd_held_out_and_simulated(script: Script, crowd: Path, tmp_path: Pat
     content = json.loads((tmp_path / "jupedsim.json").read_text())
     model = nnode.load(checkpoint_of(str(crowd)))
     known = {name: float(value) for name, (value, _) in model.physical().items()}
-    assert content["agent"]["agent_scale"] == pytest.approx(known["A"])
-    assert content["model"] == pytest.approx({"body_force": known["k"], "friction": known["kappa"]})
+    assert content["agent"]["agent_scale"] == pytest.approx(known["social_force.A"])
+    assert content["model"] == pytest.approx(
+        {"body_force": known["social_force.k"], "friction": known["social_force.kappa"]}
+    )
     assert content["agent"]["obstacle_scale"] > 0
 
 

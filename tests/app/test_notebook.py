@@ -27,9 +27,9 @@ def table() -> pd.DataFrame:
 
 def test_three_lines_find_the_law(table: pd.DataFrame, tmp_path: Path) -> None:
     run = nnode.fit(table, "traffic", model="lin", leader="measured", folder=tmp_path / "run")
-    assert run.parameters.value["v0"] == pytest.approx(V0, rel=0.01)
-    assert run.parameters.value["L"] == pytest.approx(LENGTH, rel=0.02)
-    assert run.parameters.unit.to_dict() == {"v0": "m/s", "L": "m"}
+    assert run.parameters.value["lin.v0"] == pytest.approx(V0, rel=0.01)
+    assert run.parameters.value["lin.L"] == pytest.approx(LENGTH, rel=0.02)
+    assert run.parameters.unit.to_dict() == {"lin.v0": "m/s", "lin.L": "m"}
     assert run.history["cost/train"].iloc[-1] < 1e-3 * run.history["cost/train"].iloc[0]
     # the folder is one of scripts/train.py
     again = nnode.load(run.folder / "checkpoints" / "best.pt")

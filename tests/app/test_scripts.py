@@ -50,8 +50,8 @@ def traffic(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory)
 def test_training_recovers_the_generator_s_parameters(traffic: Path) -> None:
     result = json.loads((traffic / "result.json").read_text())["summary"]
     # the generator's: v0 = 25 m/s, L = 6 m, noise 0.05 m; Euler with 0.02 s
-    assert result["v0"] == pytest.approx(25, abs=0.1)
-    assert result["L"] == pytest.approx(6, abs=0.1)
+    assert result["lin.v0"] == pytest.approx(25, abs=0.1)
+    assert result["lin.L"] == pytest.approx(6, abs=0.1)
     assert result["cost_train"] < 0.01 * result["cost_start"]
     assert result["cost_heldout"] < 0.01 * result["cost_start"]
 
@@ -60,7 +60,7 @@ def test_load_gives_the_model_of_the_best_checkpoint(traffic: Path) -> None:
     model = nnode.load(traffic / "checkpoints" / "best.pt")
     result = json.loads((traffic / "result.json").read_text())["summary"]
     assert {k: float(v) for k, (v, _) in model.physical().items()} == {
-        k: result[k] for k in ("v0", "L")
+        k: result[k] for k in ("lin.v0", "lin.L")
     }
 
 
@@ -292,10 +292,34 @@ def test_the_fused_solver_trains_to_the_same_numbers(
         )
         assert done.returncode == 0, done.stderr
         found[name] = json.loads((tmp_path / name / "result.json").read_text())["summary"]
-    for key in ("cost_train", "cost_heldout", "v0", "L"):
+    for key in ("cost_train", "cost_heldout", "lin.v0", "lin.L"):
         assert found["fused"][key] == pytest.approx(found["torchdiffeq"][key], rel=1e-6)
     best = tmp_path / "fused" / "checkpoints" / "best.pt"
     done = script("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path / 'e'}")
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "e" / "metrics.json").read_text())
     assert metrics["J"] == pytest.approx(found["fused"]["cost_heldout"], rel=1e-9)
+
+
+@pytest.mark.parametrize("effects", ["[]", "[{name: relative_speed}]"])
+def test_a_run_without_compiled_code_says_so(
+    script: Script, raw: Path, tmp_path: Path, effects: str
+) -> None:
+    done = script(
+        "train",
+        "experiment=demo_traffic",
+        "solver=fused",
+        f"model.effects={effects}",
+        "trainer.max_epochs=0",
+        f"data.source={raw}",
+        f"hydra.run.dir={tmp_path}",
+    )
+    assert done.returncode == 0, done.stderr
+    shown = done.stdout + done.stderr
+    solver = json.loads((tmp_path / "result.json").read_text())["solver"]
+    if effects == "[]":
+        assert solver == {"name": "fused", "uncompiled": None}
+        assert "batched PyTorch" not in shown
+    else:
+        assert solver == {"name": "fused", "uncompiled": "it does not cover relative_speed"}
+        assert shown.count("batched PyTorch and not in compiled code") == 1

@@ -29,7 +29,7 @@ def saved(make_trainer: Make, tmp_path: Path) -> Path:
 def test_load_rebuilds_the_model_alone(saved: Path) -> None:
     model = nnode.load(saved)
     checkpoint = load_checkpoint(saved)
-    assert float(model.physical()["v0"][0]) == checkpoint.history[-1]["parameters/v0"]
+    assert float(model.physical()["lin.v0"][0]) == checkpoint.history[-1]["parameters/lin.v0"]
     assert checkpoint.manifest["dt"] == 0.2
     assert checkpoint.config["model"]["term"] == "lin"
 

@@ -67,14 +67,14 @@ def test_training_lowers_both_costs_and_recovers_the_law(
     assert last["cost/train"] < 1e-3 * first["cost/train"]
     assert last["cost/heldout"] < 1e-2 * first["cost/heldout"]
     # the data step 0.002 s, the model 0.02 s: equal up to the scheme's error
-    assert last["parameters/v0"] == pytest.approx(22, abs=0.1)
-    assert last["parameters/L"] == pytest.approx(4, abs=0.1)
+    assert last["parameters/lin.v0"] == pytest.approx(22, abs=0.1)
+    assert last["parameters/lin.L"] == pytest.approx(4, abs=0.1)
 
 
 def test_parameters_stay_in_their_admissible_set(make_trainer: Make, tmp_path: Path) -> None:
     trainer = make_trainer(tmp_path, AdamOptions(lr=3.0), max_epochs=8)
     trainer.fit()
-    lengths = [row["parameters/L"] for row in trainer.history]
+    lengths = [row["parameters/lin.L"] for row in trainer.history]
     assert min(lengths) >= 2.0
     assert 2.0 in lengths  # the bound was met, so the projection did something
 
@@ -87,8 +87,8 @@ def test_best_checkpoint_holds_the_least_cost(make_trainer: Make, tmp_path: Path
     best = load_checkpoint(trainer.best_path)
     assert best.history[-1]["cost/train"] == min(costs)
     model = best.build()
-    expected = best.history[-1]["parameters/v0"]
-    assert float(model.physical()["v0"][0]) == expected
+    expected = best.history[-1]["parameters/lin.v0"]
+    assert float(model.physical()["lin.v0"][0]) == expected
     assert costs[-1] > min(costs)  # otherwise best and last would be the same thing
 
 
@@ -246,7 +246,7 @@ def test_tensorboard_holds_every_scalar_of_the_history(make_trainer: Make, tmp_p
     again.restore(again.last_path)
     again.fit()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    for name in ("cost/train", "cost/heldout", "gradient_norm", "noise", "parameters/v0"):
+    for name in ("cost/train", "cost/heldout", "gradient_norm", "noise", "parameters/lin.v0"):
         written = {event.step: event.value for event in events.Scalars(name)}
         expected = {int(row["step"]): row[name] for row in again.history if name in row}
         assert written == pytest.approx(expected)

@@ -113,9 +113,9 @@ def test_a_file_of_unknown_name_may_come_from_an_address(tmp_path: Path, base: s
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("missing.txt", "404"),
+        ("missing.txt", "the server answered 404 Not Found"),
         ("altered.txt", "not the published file"),
-        ("cut.txt", "could not be fetched"),
+        ("cut.txt", "the connection broke off"),
     ],
 )
 def test_what_goes_wrong_leaves_no_file_and_says_what_to_do(
@@ -127,8 +127,37 @@ def test_what_goes_wrong_leaves_no_file_and_says_what_to_do(
     assert "data.source=FOLDER" in text
     assert "NNODE_DATA" in text
     assert "attribute DOI 10.0/example" in text
-    assert f"owner/name/c0ffee/some%20folder/data/{name}" in text
+    assert text.count(base) == text.count(f"data.source={base}: ") == 1
+    assert text.count(f"owner/name/c0ffee/some%20folder/data/{name}") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["missing.txt", "altered.txt", "cut.txt", "unreachable"])
+def test_a_failure_is_one_line_with_the_address_once(
+    tmp_path: Path,
+    base: str,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(download, "HOST", base)
+    if name == "unreachable":
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            monkeypatch.setattr(download, "HOST", f"http://127.0.0.1:{probe.getsockname()[1]}")
+        name = "good.txt"
+    with pytest.raises(DownloadError) as caught:
+        download.locate("demo", [name], source=None, folder=tmp_path)
+    text = str(caught.value)
+    assert "\n" not in text
+    address = f"{download.HOST}/owner/name/c0ffee/some%20folder/data/{name}"
+    assert text.count(address) == 1
+    # and nowhere else a part of it
+    rest = text.replace(address, "") + capfd.readouterr().err
+    assert "c0ffee" not in rest
+    assert "127.0.0.1" not in rest
+    assert f"{name} could not be fetched: " in text
+    assert "set data.source=FOLDER or NNODE_DATA to the folder that holds it" in text
 
 
 def test_a_broken_connection_is_noticed_without_a_known_hash(

@@ -133,7 +133,7 @@ def diagnose(
                 ["position", "gap"], 0.07, "0.02 x", {"at": list(at), "deviation": list(near)}
             ),
             gap=Gap(before, after, floor, (before - after) / (before - floor)),
-            base={"v0": {"before": 24.0, "after": V0, "unit": "m/s"}} if traffic else {},
+            base={"lin.v0": {"before": 24.0, "after": V0, "unit": "m/s"}} if traffic else {},
             split={
                 "open": [s.name for i, s in enumerate(sequences) if i not in sealed],
                 "sealed": [sequences[i].name for i in sealed],

@@ -60,8 +60,8 @@ def test_nothing_is_named_where_the_law_is_right() -> None:
     assert kappa.testable
     assert kappa.bound is not None
     assert kappa.bound < 0.4
-    assert d.base["v0"]["after"] == pytest.approx(V0, rel=0.05)
-    assert d.base["L"]["after"] == pytest.approx(LENGTH, rel=0.05)
+    assert d.base["lin.v0"]["after"] == pytest.approx(V0, rel=0.05)
+    assert d.base["lin.L"]["after"] == pytest.approx(LENGTH, rel=0.05)
     assert d.gap.after == d.gap.before
 
 

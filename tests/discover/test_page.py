@@ -101,7 +101,7 @@ def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> Non
     events = EventAccumulator(str(written / "tensorboard")).Reload()
     gap = traffic.found.diagnosis.gap
     assert [e.value for e in events.Scalars("gap/sealed")] == pytest.approx([gap.before, gap.after])
-    assert [e.value for e in events.Scalars("parameters/v0")] == [24.0, 27.0]
+    assert [e.value for e in events.Scalars("parameters/lin.v0")] == [24.0, 27.0]
     assert [e.value for e in events.Scalars("effects/speed_zone/alpha")] == pytest.approx([0.65])
     assert "diagnosis/map" in events.Tags()["images"]
 

@@ -13,7 +13,9 @@ import yaml
 
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TrainerOptions
+from nnode.discover.diagnose import _shift
 from nnode.discover.report import (
+    SCHEMA,
     amount,
     checkpoint_of,
     estimate,
@@ -29,7 +31,8 @@ from nnode.discover.report import (
 from nnode.discover.result import Alternative, Coefficient, DataFault, Gap, Verdict
 from nnode.models import build_model
 from nnode.models.build import add_effects
-from nnode.models.extend import effects_of
+from nnode.models.effects.traffic import SpeedZone
+from nnode.models.extend import effects_of, extended
 from tests.discover.conftest import Case
 
 
@@ -175,3 +178,21 @@ def test_the_checkpoint_has_the_diagnosis_own_parts(traffic: Case) -> None:
     assert {k: float(v) for k, (v, _) in built.items()} == {
         k: float(v) for k, (v, _) in traffic.found.extended.physical().items()
     }
+
+
+def test_a_parameter_is_compared_with_itself_whatever_joins_the_model(traffic: Case) -> None:
+    before = build_model(traffic.model)
+    add_effects(before, [{"name": "speed_period", "alpha": 0.7}])
+    # the zone stands before the period in the sum, and its parameters have the same names
+    after, _ = extended(before, SpeedZone(alpha=0.9))
+    shift = _shift(before, after)
+    period = {"before": 0.7, "after": 0.7, "unit": "1"}
+    assert shift["speed_period.alpha"] == period
+    assert [name for name in shift if name.endswith("alpha")] == ["speed_period.alpha"]
+
+
+def test_the_report_says_first_which_schema_it_follows(traffic: Case) -> None:
+    report = plain_report(traffic.found.diagnosis)
+    assert next(iter(report.items())) == ("schema", 2)
+    page = (Path(__file__).parents[2] / "docs" / "discovery.md").read_text(encoding="utf-8")
+    assert f"now {SCHEMA};" in page

@@ -119,7 +119,10 @@ def test_all_arms_have_cases():
 
 def test_a_diagnosis_that_reports_the_truth_closes_the_whole_gap(tmp_path):
     truth = generate(small("alignment", strength="strong", n_sequences=4), tmp_path)
-    base = {name: {"before": value, "after": value} for name, value in truth["base"].items()}
+    base = {
+        f"social_force.{name}": {"before": value, "after": value}
+        for name, value in truth["base"].items()
+    }
     told = {"name": "alignment", "coefficients": truth["effects"][0]["coefficients"]}
     report = {
         "effects": [told],

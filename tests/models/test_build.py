@@ -41,14 +41,14 @@ def test_laws_start_where_the_paper_starts(term: str) -> None:
     model = build_model(options(LawOptions, term))
     assert isinstance(model, Traffic)
     physical = {name: (value.item(), unit) for name, (value, unit) in model.physical().items()}
-    assert physical == {"v0": (30.0, "m/s"), "L": (5.0, "m")}
+    assert physical == {f"{term}.v0": (30.0, "m/s"), f"{term}.L": (5.0, "m")}
     assert model.leader == "constant"
 
 
 @pytest.mark.parametrize(("hidden", "weights"), [(2, 7), (4, 13), (10, 31)])
 def test_networks_start_at_30_metres_per_second(hidden: int, weights: int) -> None:
     model = build_model(options(NetworkSpeedOptions, "network_speed", hidden=hidden))
-    assert model.physical()["v0"][0].item() == 30.0
+    assert model.physical()["network_speed.v0"][0].item() == 30.0
     assert flat(model).numel() == 1 + weights
 
 
@@ -61,16 +61,16 @@ def test_two_networks_of_30_weights_move_the_crowd() -> None:
 def test_social_force_starts_uniform_on_0_to_50() -> None:
     drawn = [build_model(options(SocialForceOptions, "social_force"), seed=s) for s in range(300)]
     for name in ("A", "k", "kappa"):
-        sample = [model.physical()[name][0].item() for model in drawn]
+        sample = [model.physical()[f"social_force.{name}"][0].item() for model in drawn]
         assert stats.kstest(sample, stats.uniform(0, 50).cdf).pvalue > 1e-3
 
 
 def test_given_start_values_leave_the_others_draws_alone() -> None:
     free = build_model(options(SocialForceOptions, "social_force"), seed=4).physical()
     given = build_model(options(SocialForceOptions, "social_force", A=0.0044), seed=4).physical()
-    assert given["A"][0].item() == 0.0044
-    assert torch.equal(given["k"][0], free["k"][0])
-    assert torch.equal(given["kappa"][0], free["kappa"][0])
+    assert given["social_force.A"][0].item() == 0.0044
+    assert torch.equal(given["social_force.k"][0], free["social_force.k"][0])
+    assert torch.equal(given["social_force.kappa"][0], free["social_force.kappa"][0])
 
 
 @pytest.mark.parametrize("choice", ALL, ids=lambda o: o["term"])
@@ -89,12 +89,12 @@ def test_another_seed_means_another_start(choice: dict[str, Any]) -> None:
 
 def test_start_values_keep_all_their_digits() -> None:
     model = build_model(options(LawOptions, "lin", L=4.7))
-    assert model.physical()["L"][0].item() == 4.7
+    assert model.physical()["lin.L"][0].item() == 4.7
 
 
 def test_a_built_model_is_admissible() -> None:
     law = build_model(options(LawOptions, "log", L=1.0))
-    assert law.physical()["L"][0].item() == 2.0
+    assert law.physical()["log.L"][0].item() == 2.0
     boxed = build_model(options(NetworkSpeedOptions, "network_speed", box=0.1))
     assert flat(boxed)[1:].abs().max().item() == 0.1
 
@@ -125,7 +125,7 @@ def test_v0_of_a_network_with_a_measured_leader_is_idle() -> None:
     options = {"term": "network_speed", "v0": 30.0, "hidden": 2, "box": None}
     free = build_model({**options, "leader": "constant"})
     idle = build_model({**options, "leader": "measured"})
-    assert list(free.physical()) == ["v0"]
+    assert list(free.physical()) == ["network_speed.v0"]
     assert list(idle.physical()) == []
     trained = [name for name, p in idle.named_parameters() if p.requires_grad]
     assert trained

@@ -160,6 +160,19 @@ class IndividualEffect(Effect):
         return {**super().options(), "people": self.people}
 
     @classmethod
+    def directions(cls, options: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
+        """The amounts that are fitted to an agent, which :meth:`person` makes his number of.
+
+        Args:
+            options: settings.
+
+        Returns:
+            Per amount the values of an effect, and an agent's number in it, with which the effect
+            on him is that of one unit of the amount. By default the number is the one amount.
+        """
+        return [(options, 1.0)]
+
+    @classmethod
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
         """An agent's number, from the amounts of the directions that were fitted to him."""
         return float(numbers[0])

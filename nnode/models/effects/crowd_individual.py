@@ -83,6 +83,12 @@ class GaitSway(IndividualEffect):
         return [Probe({"f": 0.6 + 0.05 * i}, {"a": 0.05}) for i in range(17)]
 
     @classmethod
+    def directions(cls, options: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
+        """Sine and cosine of the clock, at 1 m/s²."""
+        unit = {**options, "a": 1.0}
+        return [(unit, 0.0), (unit, math.pi / 2)]
+
+    @classmethod
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
         """The phase, from the amplitudes of the sine and the cosine of the clock."""
         return float(np.arctan2(numbers[1], numbers[0]))

@@ -7,10 +7,9 @@ from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
-from nnode.models.effects.traffic import for_followers, gaps, law_of, rate_of
+from nnode.models.effects.traffic import for_followers, gaps, has_law, law_in, law_of, rate_of
 from nnode.models.system import System
 from nnode.models.term import Interval, State
-from nnode.models.traffic import FollowTheLeader
 
 _KIN = "reaction to the vehicle ahead"
 _EXCITATION = "leaders that brake and accelerate strongly, measured often and precisely"
@@ -22,9 +21,7 @@ def speeds_of_law(x: Tensor, v: Tensor, system: System) -> Tensor:
     Measured speeds of followers would tell of disturbances that go on for a while, and a memory
     that starts with them would be taken for inertia.
     """
-    law = system.find(FollowTheLeader)
-    assert law is not None
-    gap = gaps(x)
+    law, gap = law_in(system), gaps(x)
     # nobody, or a vehicle of the padding, is ahead of a leader
     return torch.where(gap > PADDING_GAP / 2, v[..., 0], law.speed(gap))
 
@@ -129,7 +126,7 @@ class ReactionDelay(Effect):
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        return [Probe({}, {"T": T}) for T in (0.3, 0.8, 1.5)]
+        return [Probe({}, {"T": T}) for T in (0.3, 0.8, 1.5) if has_law(system)]
 
 
 @CATALOGUE.add
@@ -162,4 +159,4 @@ class Inertia(Effect):
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        return [Probe({}, {"tau_v": tau}) for tau in (0.3, 0.8, 2.0)]
+        return [Probe({}, {"tau_v": tau}) for tau in (0.3, 0.8, 2.0) if has_law(system)]

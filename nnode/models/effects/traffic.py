@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
+from nnode.errors import ConfigError
 from nnode.models.effects.base import (
     CATALOGUE,
     Effect,
@@ -30,11 +31,28 @@ CELLS = 32
 
 
 def law_of(state: State) -> FollowTheLeader:
-    """The law of the gap that an effect modifies."""
-    found = None if state.system is None else state.system.find(FollowTheLeader)
+    """The law of the gap that an effect modifies; see :func:`law_in`."""
+    return law_in(state.system)
+
+
+def law_in(system: System | None) -> FollowTheLeader:
+    """A model's law of the gap.
+
+    Raises:
+        ConfigError: the model has none.
+    """
+    found = None if system is None else system.find(FollowTheLeader)
     if found is None:
-        raise ValueError("an effect in a lane needs a model with a law of the gap")
+        raise ConfigError(
+            "an effect that modifies the law of the gap needs a model with one; derive the "
+            "model's own term from FollowTheLeader, or leave the effect out"
+        )
     return found
+
+
+def has_law(system: System) -> bool:
+    """Whether a model has a law of the gap; without one, an effect on it cannot be looked for."""
+    return system.find(FollowTheLeader) is not None
 
 
 def gaps(x: Tensor) -> Tensor:
@@ -197,7 +215,7 @@ class LeaderLength(Effect):
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         lengths = batch.length[torch.isfinite(batch.length)]
         different = lengths.numel() > 1 and float(lengths.std()) > 0.1
-        return [Probe({}, {"beta": 0.1})] if different else []
+        return [Probe({}, {"beta": 0.1})] if different and has_law(system) else []
 
 
 @CATALOGUE.add
@@ -246,7 +264,8 @@ class MultiAnticipation(Effect):
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        return super().probes(batch, system) if int(batch.agent.sum(1).max()) > 2 else []
+        second = int(batch.agent.sum(1).max()) > 2
+        return super().probes(batch, system) if second and has_law(system) else []
 
 
 @CATALOGUE.add

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Mapping
 
 import torch
@@ -14,6 +15,8 @@ from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
 from nnode.solvers.fused import crowd, fallback, neighbours, traffic
 
+log = logging.getLogger(__name__)
+
 
 class FusedSolver:
     """Euler's method and the exact gradient of the discrete scheme, in compiled code.
@@ -24,8 +27,9 @@ class FusedSolver:
     from which it differs by O(dt).
 
     Follow-the-leader laws that :mod:`nnode.solvers.fused.laws` knows and the crowd models
-    run compiled. Any other model goes through :mod:`nnode.solvers.fused.fallback`: the same
-    gradient, at the speed of PyTorch.
+    run compiled. Any other model, such as one with an effect, goes through
+    :mod:`nnode.solvers.fused.fallback`: the same gradient, at the speed of PyTorch. The solver
+    warns of it once.
 
     The first call for a law compiles (seconds) and keeps the result in the user's cache
     folder, or in NNODE_CACHE where this environment variable is set.
@@ -44,6 +48,9 @@ class FusedSolver:
             :func:`nnode.solvers.fused.neighbours.cutoff_distance`. 0 lets everybody meet
             everybody.
 
+    Attributes:
+        uncompiled: why the model it warned of is not compiled; empty: there was none.
+
     Raises:
         ConfigError: fewer than one thread, a cutoff that is not positive, or an error outside
             [0, 1).
@@ -61,6 +68,7 @@ class FusedSolver:
         neighbours.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads
         self.cutoff, self.cutoff_error = cutoff, cutoff_error
+        self.uncompiled = ""
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         """Simulate from the first measured state, at the batch's sampling times.
@@ -135,6 +143,14 @@ class FusedSolver:
                     cutoff=self.cutoff,
                     cutoff_error=self.cutoff_error,
                 )
+            )
+        # the relaxation alone is a baseline, and cheap
+        if not self.uncompiled and not crowd.without_partners(system):
+            self.uncompiled = fallback.reason(system)
+            log.warning(
+                "solver=fused works in batched PyTorch and not in compiled code: %s; the gradient "
+                "is the same, but costs up to hundreds of times as much, see docs/performance.md",
+                self.uncompiled,
             )
         y = fallback.simulate(system, batch, n, parameters)
         return Trajectory(*system.observe(y, batch))

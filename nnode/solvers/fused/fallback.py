@@ -4,19 +4,24 @@ The states are computed once, without a graph. Backwards, the right-hand side is
 many steps in one batched call; its Jacobian comes row by row, each row for all these steps and
 simulations at once; what is left per step is a small matrix product. Where the Jacobian would
 be larger than worth it (a crowd), each step is differentiated by itself instead.
+
+In a lane it costs hundreds of times as much as compiled code, which the solver says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
+from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.system import System, Traffic
+from nnode.models.term import Term
+from nnode.solvers.fused.laws import kernel_of
 from nnode.solvers.rates import Rates
 
 #: Jacobians of one batched call may hold so many numbers.
@@ -142,6 +147,21 @@ def _pull(
     for total, share in zip(totals, shares, strict=True):
         total += share
     return adjoint
+
+
+def reason(system: System) -> str:
+    """Why compiled code is not used, in words: terms that it does not cover, by their names."""
+    terms = cast(list[Term], list(system.terms))
+    if system.domain == "crowd":
+        without = [t for t in terms if type(t) not in (Relaxation, SocialForce, NetworkForce)]
+        alone = "a relaxation with one force, a network of one hidden layer at most,"
+    else:
+        without = [term for term in terms if kernel_of(term) is None]
+        alone = "one law"
+    names = ", ".join(term.name for term in without)
+    if names:
+        return f"it does not cover {names}"
+    return f"it covers {alone} on the CPU, without a gradient by what was measured"
 
 
 def simulate(system: System, batch: Batch, substeps: int, parameters: Sequence[Tensor]) -> Tensor:

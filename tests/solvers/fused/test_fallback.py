@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 import torch
 from torch import Tensor
@@ -103,3 +105,37 @@ def test_models_are_not_touched(ragged) -> None:  # type: ignore[no-untyped-def]
         "terms.0.L",
         "terms.1.c",
     ]
+
+
+SAID = {
+    "sway": "it does not cover sway",
+    "two_laws": "it covers one law",
+    "measured": "it does not cover sway",
+    "crowd": "it does not cover sway",
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_it_is_said_once_in_a_run_and_why(name, ragged, crowd, caplog) -> None:  # type: ignore[no-untyped-def]
+    system, solver = MODELS[name](), FusedSolver()
+    batch = single([crowd(3, samples=4)] if system.domain == "crowd" else ragged)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            solver(system, batch)
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    for words in ("batched PyTorch", SAID[name], "docs/performance.md"):
+        assert words in record.getMessage()
+    assert solver.uncompiled in record.getMessage()
+
+
+def test_compiled_models_and_the_baseline_without_forces_say_nothing(ragged, crowd, caplog) -> None:  # type: ignore[no-untyped-def]
+    solver = FusedSolver()
+    with caplog.at_level(logging.INFO):
+        solver(Traffic([Linear(18.0, 4.0)]), single(ragged))
+        solver(
+            Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1)]), single([crowd(3, samples=4)])
+        )
+        solver(Crowd([Relaxation()]), single([crowd(3, samples=4)]))
+    assert not caplog.records
+    assert solver.uncompiled == ""

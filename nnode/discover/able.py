@@ -1,0 +1,64 @@
+"""What the engines cannot diagnose, refused before any work begins."""
+
+from __future__ import annotations
+
+from nnode.errors import ConfigError
+from nnode.models.effects import Effect, IndividualEffect
+from nnode.models.extend import effects_of
+from nnode.models.system import System
+
+
+def check_effect(effect: type[Effect]) -> None:
+    """Refuse an effect that the engine of its domain cannot look for.
+
+    Raises:
+        ConfigError: names it and what to do.
+    """
+    reason = _reason(effect)
+    if reason:
+        raise ConfigError(
+            f"the diagnosis of {_MOTION[effect.domain]} cannot look for {effect.name}: {reason}; "
+            f"leave it out with discover.exclude=[{effect.name}], it can still be trained with "
+            f"'model.effects=[{{name: {effect.name}}}]'"
+        )
+
+
+def check_model(system: System) -> None:
+    """Refuse a model that the engine of its domain cannot simulate.
+
+    Raises:
+        ConfigError: names the term and what to do.
+    """
+    for term in system.terms if system.domain == "crowd" else ():
+        if term.memory:
+            raise ConfigError(
+                f"the diagnosis of crowds cannot simulate the model's term {term.name}: it has a "
+                "memory; diagnose the model without it"
+            )
+    names = [effect.name for effect in effects_of(system)]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigError(
+            f"the model has the effect {', '.join(twice)} twice, and a diagnosis tells effects "
+            "by their names; leave one out"
+        )
+    if not any(p.requires_grad and p.numel() for p in system.parameters()):
+        raise ConfigError(
+            "the model has no parameter that is calibrated, and a diagnosis begins with a "
+            "calibration; declare one in its terms"
+        )
+
+
+_MOTION = {"traffic": "lanes", "crowd": "crowds"}
+
+
+def _reason(effect: type[Effect]) -> str:
+    if effect.memory and (effect.domain == "crowd" or effect.individual):
+        return "it has a memory"
+    if effect.individual != issubclass(effect, IndividualEffect):
+        return "its class says individual, but is no IndividualEffect"
+    if not issubclass(effect, IndividualEffect) or effect.domain == "crowd":
+        return ""
+    settings = {name: setting.value for name, setting in effect.settings.items()}
+    number = len(effect.directions(settings))
+    return "" if number == 1 else f"it has {number} amounts for every driver, expected one"

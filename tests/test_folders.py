@@ -1,0 +1,54 @@
+"""A clone has the folders that the scripts write to, and they stay."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = ("runs/README.md", "data/README.md")
+
+
+def git(*words: str) -> subprocess.CompletedProcess[str]:
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("this is no clone")
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_folder_says_what_lands_there_and_what_may_be_deleted(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert "written by" in text
+    assert "may be deleted" in text
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_page_is_committed_and_nothing_else_of_the_folder(page: str) -> None:
+    folder = page.partition("/")[0]
+    assert git("ls-files", folder).stdout.split() == [page]
+    assert git("check-ignore", "--no-index", "--quiet", page).returncode == 1
+    assert git("check-ignore", "--no-index", "--quiet", f"{folder}/mine").returncode == 0
+
+
+def test_every_folder_that_a_script_writes_to_is_listed() -> None:
+    pages = {page.partition("/")[0]: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
+    for config in (ROOT / "conf").glob("*.yaml"):
+        for line in config.read_text(encoding="utf-8").splitlines():
+            _, found, place = line.partition("dir: ")
+            top, _, rest = place.strip(' "}').partition("/")
+            if found and top in pages:
+                assert f"`{rest.partition('/')[0]}/" in pages[top], line
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+def test_make_clean_keeps_the_pages(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name in (*PAGES, "runs/demo/traffic", "runs/train/kept", "data/prepared/kept"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    subprocess.run(["make", "clean"], cwd=tmp_path, capture_output=True, check=True)
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == {"Makefile", *PAGES, "runs/train/kept", "data/prepared/kept"}

@@ -1,0 +1,22 @@
+"""What ``import nnode`` offers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import nnode
+
+NAMES = ["__version__", "diagnose", "fit", "load"]
+
+
+def test_completion_finds_the_public_names_without_loading_torch() -> None:
+    code = "import sys, nnode; print(*dir(nnode)); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [" ".join(NAMES), "False"]
+
+
+def test_every_public_name_is_there() -> None:
+    assert sorted(nnode.__all__) == dir(nnode)
+    for name in dir(nnode):
+        assert getattr(nnode, name) is not None
