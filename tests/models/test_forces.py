@@ -128,6 +128,21 @@ def test_network_force(oneself: bool) -> None:
         np.testing.assert_allclose(found[b, : item.n_agents], expected, rtol=1e-8, atol=1e-9)
 
 
+def test_the_push_of_oneself_does_not_depend_on_where_others_are_seen() -> None:
+    batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)
+    x, v = batch.x[0], batch.v[0]
+    state = State(torch.zeros(()), x, v, scene, seen=(x + 0.3, v - 1))
+    found = []
+    for oneself in (False, True):
+        draw = torch.Generator().manual_seed(2)
+        term = NetworkForce(4, mass=MASS, self_interaction=oneself, generator=draw)
+        found.append(term(state))
+    at_nought = term.pair(torch.zeros_like(x[0, 0].repeat(2))) / MASS
+    for b, item in enumerate(CROWDS):
+        more = (found[1] - found[0])[b, : item.n_agents]
+        torch.testing.assert_close(more, (at_nought / item.n_agents).expand_as(more).to(more))
+
+
 def test_effects_change_no_force_of_a_person_on_himself() -> None:
     # who does not see those behind him still feels the push that the printed sum gives everyone
     batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)

@@ -132,7 +132,8 @@ class _Simulate(torch.autograd.Function):
             plan.module.backward(
                 jobs, plan.order, plan.per, plan.dt, plan.still, plan.wall, plan.scale,
                 plan.end, plan.rate, plan.slip, plan.mutual, plan.first, *ctx.values[1:],
-                ctx.states, grad_out, grad_y0, *(total[jobs[0, 5]] for total in totals), *plan.cutoff,
+                ctx.states, grad_out, grad_y0, *(total[jobs[0, 5]] for total in totals),
+                *plan.cutoff,
             )  # fmt: skip
 
         run_all(call, plan.jobs)

@@ -16,7 +16,14 @@ from numba import njit
 
 from nnode.solvers.fused.crowd_laws import LOOP, ROWS, SIZE, law, law_pull
 from nnode.solvers.fused.crowd_rows import blank, clear, copy, fill_up, increase
-from nnode.solvers.fused.neighbours import both_ways, grid, people_near, points_near, sort, with_oneself
+from nnode.solvers.fused.neighbours import (
+    both_ways,
+    grid,
+    people_near,
+    points_near,
+    sort,
+    with_oneself,
+)
 
 
 @njit(**LOOP)
