@@ -69,6 +69,8 @@ def _network_force(options: Options, generator: torch.Generator) -> System:
         mass=options["mass"],
         walls=options["walls"],
         box=options["box"],
+        # checkpoints from before there was this option do not name it
+        self_interaction=options.get("self_interaction", False),
         generator=generator,
     )
     return Crowd([Relaxation(options["tau"]), term], options["wall_spacing"])

@@ -65,7 +65,7 @@ class InteractionForce(Term):
     """Forces between people and from walls, averaged as in the paper.
 
     (1/m) mean over the N people of the pair force + (1/m) mean over the P wall points of the
-    wall force. A person exerts no force on himself, but counts in N.
+    wall force. A person exerts no force on himself unless a force says so, but counts in N.
 
     Args:
         mass: m, kg.
@@ -88,7 +88,8 @@ class InteractionForce(Term):
         raise NotImplementedError  # pragma: no cover - every force defines its own
 
     def pairs(self, state: State, ahead: Tensor | float = 0.0) -> Tensor:
-        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third).
+        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third),
+        0 where they are one.
 
         Args:
             state: positions and velocities.
@@ -191,6 +192,8 @@ class NetworkForce(InteractionForce):
     Args:
         hidden: neurons in each hidden layer, 4 in the paper.
         box: b keeps every weight in [-b, b]; None leaves them free.
+        self_interaction: True sums over j = i as well, as printed: NN_pair(0, 0) pushes everyone,
+            a lone person too, the same way. False leaves it out.
 
     Source: Göttlich & Totzeck, equation (NNseparate) and section 6.4.
     """
@@ -206,13 +209,23 @@ class NetworkForce(InteractionForce):
         mass: float = 1.0,
         walls: bool = True,
         box: float | None = None,
+        self_interaction: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(mass, walls)
+        self.self_interaction = self_interaction
         self.pair = FeedForward((4, hidden, 2), generator)
         self.wall = FeedForward((4, hidden, 2), generator)
         if box is not None:
             self.bound_all("", Interval(-box, box))
+
+    def components(self, state: State) -> dict[str, Tensor]:
+        parts = super().components(state)
+        if self.self_interaction:
+            here = torch.zeros_like(state.x[:1, :1])
+            own = self.pair_force(here, here) / (self.mass * state.scene.count)
+            parts["pair"] = parts["pair"] + own
+        return parts
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
         out: Tensor = self.pair(torch.cat([dx, dv], -1))

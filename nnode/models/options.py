@@ -75,3 +75,5 @@ class NetworkForceOptions(CrowdOptions):
 
     hidden: int = 4  # neurons in the hidden layer of each force
     box: float | None = None  # weights stay in [-box, box]; null leaves them free
+    # people's mean contains j = i, a push NN(0, 0), as the paper's formula; false leaves it out
+    self_interaction: bool = False

@@ -8,9 +8,11 @@ from typing import Any
 
 from nnode.errors import ConfigError
 from nnode.pages.page import Block
+from nnode.study import crowd_conventions as conventions
 from nnode.study import crowd_tasks as tasks
 from nnode.study.crowd_data import ALL, prepare_horizon
 from nnode.study.crowd_page import blocks
+from nnode.study.crowd_page_conventions import NETWORKS, network_key, to_calibrate
 from nnode.study.crowd_results import Crowd
 from nnode.study.options import CrowdStudyOptions
 from nnode.study.runner import Task, hash_of, run_tasks
@@ -24,7 +26,7 @@ SUBTITLE = (
 #: Resamples in one task.
 CHUNK = 10
 #: Relative times of the tasks.
-_COSTS = {"sf": 3.0, "nn": 20.0, "wall": 10.0}
+_COSTS = {"sf": 3.0, "nn": 20.0, "wall": 10.0, "convention": 8.0}
 
 
 def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
@@ -46,7 +48,8 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
         for horizon in options.horizons
         for kind in ("main", "others")
     }  # fmt: skip
-    study = Crowd(options, stores)
+    raw = conventions.recording_file(options.source, options.download or str(folder / "data/raw"))
+    study = Crowd(options, stores, raw)
     for number in range(len(options.horizons) + 1):
         assert options.workers is not None
         found = run_tasks(
@@ -64,8 +67,9 @@ def _checked(options: CrowdStudyOptions) -> CrowdStudyOptions:
     if options.quick:
         options = replace(
             options, horizons=options.horizons[:3:2], restarts=1, folds=2, bootstrap=4, steps=1,
+            cuts=1,
         )  # fmt: skip
-    for name, least in (("restarts", 1), ("folds", 2), ("bootstrap", 2), ("steps", 1)):
+    for name, least in (("restarts", 1), ("folds", 2), ("bootstrap", 2), ("steps", 1), ("cuts", 1)):
         if getattr(options, name) < least:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
     if not options.horizons or min(options.horizons) <= 0:
@@ -101,7 +105,42 @@ def _round(study: Crowd, number: int) -> list[Task]:
         )
     if number > 0:
         found += _after(study, horizons[number - 1])
+    if number < 2:
+        found += _networks(study) if number else _scans(study)
     return found
+
+
+def _scans(study: Crowd) -> list[Task]:
+    """Every convention that the paper leaves open."""
+    how = {"cuts": study.options.cuts, "seed": study.options.seed}
+    return [
+        Task(
+            conventions.key(one),
+            conventions.scan,
+            {**conventions.arguments(study.raw, one), **how},
+            cost=_COSTS["convention"],
+        )
+        for one in conventions.EVERY
+    ]
+
+
+def _networks(study: Crowd) -> list[Task]:
+    """The networks in the conventions nearest to the printed cost."""
+    options = study.options
+    return [
+        Task(
+            network_key(one, model, options.seed + i),
+            conventions.network,
+            {
+                **conventions.arguments(study.raw, one),
+                "model": model, "seed": options.seed + i, "steps": options.steps,
+            },
+            cost=_COSTS["nn"],
+        )
+        for one in to_calibrate(study)
+        for model in NETWORKS
+        for i in range(max(1, options.restarts // 4))
+    ]  # fmt: skip
 
 
 def _fits(study: Crowd, kind: str, scope: str, number: int) -> list[Task]:

@@ -25,30 +25,32 @@ from nnode.plots.interaction import interaction
 from nnode.solvers.fused.engine import FusedSolver
 from nnode.study.crowd_data import cut
 
+#: Social force and networks; those with the person himself in the sum, j = i, as printed.
 OPTIONS: dict[str, CrowdOptions] = {
     "sf": SocialForceOptions(name="sf", term="social_force"),
     "nn": NetworkForceOptions(name="nn", term="network_force"),
+    "nn_self": NetworkForceOptions(name="nn_self", term="network_force", self_interaction=True),
 }
 #: Parameters of the social force in the order of its rows.
 NAMES = ("A", "k", "kappa")
 
 #: Samples after which the horizon grows; the sequence's own length ends the list.
-GROWTH = {"sf": (4, 8, 13, 26, 51), "nn": (6, 13)}
+GROWTH = {"sf": (4, 8, 13, 26, 51), "nn": (6, 13), "nn_self": (6, 13)}
 #: Steps at most each time before the horizon grows.
-SHORT_STEPS = {"sf": 8, "nn": 3}
+SHORT_STEPS = {"sf": 8, "nn": 3, "nn_self": 3}
 #: Networks bear rounding to single precision and are twice as fast in it; A is too small for it.
-DTYPE = {"sf": torch.float64, "nn": torch.float32}
+DTYPE = {"sf": torch.float64, "nn": torch.float32, "nn_self": torch.float32}
 #: Parameters below this size are varied as if they had it.
-LEAST = {"sf": 1e-3, "nn": 0.1}
+LEAST = {"sf": 1e-3, "nn": 0.1, "nn_self": 0.1}
 
 
 def new_system(model: str, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
-    """``sf`` or ``nn`` at its random start."""
+    """A model of OPTIONS at its random start."""
     return build_model(asdict(OPTIONS[model]), seed, dtype)
 
 
 def system_of(model: str, row: np.ndarray | list[float]) -> System:
-    """``sf`` or ``nn`` with parameters ``row`` (K,)."""
+    """A model of OPTIONS with parameters ``row`` (K,)."""
     system = new_system(model)
     torch.nn.utils.vector_to_parameters(
         torch.as_tensor(np.array(row), dtype=torch.float64), system.parameters()
@@ -68,7 +70,7 @@ def calibrate(
     """Levenberg and Marquardt's method within the model's bounds.
 
     Args:
-        model: ``sf`` or ``nn``.
+        model: of OPTIONS.
         batch: training sequences.
         start: ``(K,)`` parameters.
         people: False keeps people of ``nn`` from acting on each other: the output weights of

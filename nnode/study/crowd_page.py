@@ -10,6 +10,7 @@ from nnode.plots.study_crowd import horizon_costs
 from nnode.study import printed_crowd as printed
 from nnode.study.crowd_data import ALL, GROUP, RECORDING
 from nnode.study.crowd_fit import NAMES
+from nnode.study.crowd_page_conventions import conventions
 from nnode.study.crowd_page_forces import force_blocks, restart_blocks
 from nnode.study.crowd_results import LABELS, MODELS, SIMPLE, Crowd
 from nnode.study.statistics import Paired
@@ -28,6 +29,7 @@ def blocks(study: Crowd) -> list[Block]:
         *_data(study),
         *_parameters(study),
         *_costs(study),
+        *conventions(study),
         *_heldout(study),
         *_others(study),
         *restart_blocks(study),
@@ -70,7 +72,8 @@ def _summary(study: Crowd) -> list[Block]:
     if sums["relaxation"] < min(printed.COSTS.values()):
         lines.append(
             "Both printed costs lie above that of no interaction here, so that the paper's "
-            "sequences or velocities must differ from those cut here as it describes."
+            "sequences or velocities must differ from those cut here as it describes; see "
+            "[the conventions that it leaves open](#table-crowd_conventions)."
         )
     parameters = study.parameters()
     for name in NAMES:

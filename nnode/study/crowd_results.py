@@ -63,10 +63,12 @@ class One:
 
 @dataclass
 class Crowd:
-    """A study: options, prepared data by ``main`` or ``others`` and horizon (s), results."""
+    """A study: options, prepared data by ``main`` or ``others`` and horizon (s), the paper's
+    recording as it is, results."""
 
     options: CrowdStudyOptions
     stores: dict[tuple[str, float], Store]
+    raw: str = ""
     found: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property

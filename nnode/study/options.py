@@ -48,3 +48,4 @@ class CrowdStudyOptions(StudyOptions):
     folds: int = 4  # blocks of time, each held out once
     steps: int = 4  # of the networks by Levenberg and Marquardt's method, at each length
     bootstrap: int = 100  # resamples of stretches of time
+    cuts: int = 25  # first frames, within a second, from which open conventions cut sequences

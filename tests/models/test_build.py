@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 
 from nnode.errors import ConfigError
-from nnode.models import Crowd, System, Traffic, build_model
+from nnode.models import Crowd, NetworkForce, System, Traffic, build_model
 from nnode.models.options import (
     LawOptions,
     NetworkForceOptions,
@@ -56,6 +56,17 @@ def test_two_networks_of_30_weights_move_the_crowd() -> None:
     model = build_model(options(NetworkForceOptions, "network_force"))
     assert isinstance(model, Crowd)
     assert flat(model).numel() == 60
+
+
+def test_people_act_on_themselves_where_the_options_say_so() -> None:
+    chosen = options(NetworkForceOptions, "network_force")
+    printed = build_model({**chosen, "self_interaction": True}).find(NetworkForce)
+    # checkpoints of earlier versions have no such option
+    chosen.pop("self_interaction")
+    earlier = build_model(chosen).find(NetworkForce)
+    assert printed is not None
+    assert earlier is not None
+    assert (printed.self_interaction, earlier.self_interaction) == (True, False)
 
 
 def test_social_force_starts_uniform_on_0_to_50() -> None:

@@ -19,6 +19,7 @@ from nnode.models import (
     State,
     Term,
 )
+from nnode.models.effects.crowd_force import FieldOfView
 
 A, K, KAPPA, R, B, MASS = 3.0, 40.0, 9.0, 0.25, 0.1, 70.0
 #: the walkable corridor lies between y = 0 and y = 2
@@ -76,7 +77,7 @@ def social_force_loop(item: Sequence, wall_sign: float) -> np.ndarray:
     return total
 
 
-def network_loop(term: NetworkForce, item: Sequence) -> np.ndarray:
+def network_loop(term: NetworkForce, item: Sequence, oneself: bool = False) -> np.ndarray:
     def evaluate(network: torch.nn.Module, inputs: list[float]) -> np.ndarray:
         (w1, w2), (b1, b2) = (
             [getattr(layer, name).detach().numpy() for layer in network.layers]
@@ -89,7 +90,7 @@ def network_loop(term: NetworkForce, item: Sequence) -> np.ndarray:
     total = np.zeros((n, 2))
     for i in range(n):
         for j in range(n):
-            if j != i:
+            if j != i or oneself:
                 total[i] += evaluate(term.pair, [*(x[i] - x[j]), *(v[i] - v[j])]) / (n * MASS)
         for point, normal in points:
             force = evaluate(term.wall, [*(x[i] - point), *(v[i] - normal)])
@@ -117,12 +118,42 @@ def test_the_samples_contain_contacts_with_people_and_walls() -> None:
     assert min(to_wall) < R
 
 
-def test_network_force() -> None:
-    term = NetworkForce(4, mass=MASS, generator=torch.Generator().manual_seed(2))
+@pytest.mark.parametrize("oneself", [False, True])
+def test_network_force(oneself: bool) -> None:
+    draw = torch.Generator().manual_seed(2)
+    term = NetworkForce(4, mass=MASS, self_interaction=oneself, generator=draw)
     found = accelerations(term, collate(CROWDS))
     for b, item in enumerate(CROWDS):
-        expected = network_loop(term, item)
+        expected = network_loop(term, item, oneself)
         np.testing.assert_allclose(found[b, : item.n_agents], expected, rtol=1e-8, atol=1e-9)
+
+
+def test_the_push_of_oneself_does_not_depend_on_where_others_are_seen() -> None:
+    batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)
+    x, v = batch.x[0], batch.v[0]
+    state = State(torch.zeros(()), x, v, scene, seen=(x + 0.3, v - 1))
+    found = []
+    for oneself in (False, True):
+        draw = torch.Generator().manual_seed(2)
+        term = NetworkForce(4, mass=MASS, self_interaction=oneself, generator=draw)
+        found.append(term(state))
+    at_nought = term.pair(torch.zeros_like(x[0, 0].repeat(2))) / MASS
+    for b, item in enumerate(CROWDS):
+        more = (found[1] - found[0])[b, : item.n_agents]
+        torch.testing.assert_close(more, (at_nought / item.n_agents).expand_as(more).to(more))
+
+
+def test_effects_change_no_force_of_a_person_on_himself() -> None:
+    # who does not see those behind him still feels the push that the printed sum gives everyone
+    batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)
+    changes = []
+    for oneself in (False, True):
+        draw = torch.Generator().manual_seed(2)
+        force = NetworkForce(4, self_interaction=oneself, generator=draw)
+        terms = [force, FieldOfView(lambda_=0.2)]
+        state = State(torch.zeros(()), batch.x[0], batch.v[0], scene, system=Crowd(terms))
+        changes.append(terms[1](state))
+    torch.testing.assert_close(changes[0], changes[1], rtol=0, atol=0)
 
 
 def test_relaxation() -> None:

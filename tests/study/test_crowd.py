@@ -203,7 +203,12 @@ def test_words_follow_from_the_interval(low, high, words):
 
 @pytest.mark.parametrize(
     ("changed", "words"),
-    [({"folds": 1}, "folds=1"), ({"horizons": []}, "horizons"), ({"restarts": 0}, "restarts=0")],
+    [
+        ({"folds": 1}, "folds=1"),
+        ({"horizons": []}, "horizons"),
+        ({"restarts": 0}, "restarts=0"),
+        ({"cuts": 0}, "cuts=0"),
+    ],
 )
 def test_options_out_of_range_are_refused_before_any_work(tmp_path, changed, words):
     with pytest.raises(ConfigError, match=words):
@@ -231,7 +236,8 @@ def test_the_quick_study_writes_its_page_and_continues(real_data, tmp_path):
     expected = {
         "crowd_parameters", "crowd_costs", "crowd_horizons", "crowd_heldout_runs",
         "crowd_restarts", "settings_sf", "settings_nn", "parameters", "crowd_data",
-        "crowd_blocks", "settings_nn_along",
+        "crowd_blocks", "settings_nn_along", "crowd_conventions", "crowd_conventions_means",
+        "crowd_conventions_networks",
     }  # fmt: skip
     assert set(tables) == expected
     assert np.isfinite(tables["crowd_costs"].frame["here (m² s)"]).all()

@@ -12,6 +12,7 @@ import pytest
 
 from nnode.pages.page import Block, FigureBlock, TableBlock, Text, write_page
 from nnode.study import crowd, crowd_page, crowd_page_forces
+from nnode.study import crowd_conventions as conventions
 from nnode.study import crowd_tasks as tasks
 from nnode.study.options import CrowdStudyOptions
 from nnode.study.printed_crowd import COSTS, PARAMETERS
@@ -25,6 +26,9 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> list[Block]:
     options = CrowdStudyOptions(workers=1, restarts=2, horizons=[2.0, 1.0], bootstrap=20)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(crowd, "prepare_horizon", invented.store)
+        patch.setattr(conventions, "recording_file", lambda *_: "a.txt")
+        patch.setattr(conventions, "scan", invented.scan)
+        patch.setattr(conventions, "network", invented.network)
         for name in ("fit", "resample", "baselines", "transfer"):
             patch.setattr(tasks, name, getattr(invented, name))
         return crowd.run(options, tmp_path_factory.mktemp("study"))
@@ -52,6 +56,8 @@ def test_costs_are_in_both_units(tables: dict[str, pd.DataFrame], words: str) ->
     assert "J_SF = 50.000 and J_NN = 25.000 m²" in words
     assert "the relaxation without any interaction has 100.000." in words
     assert "Both printed costs lie above" not in words
+    assert len(tables["crowd_conventions"]) == 30
+    assert len(tables["crowd_conventions_networks"]) == 6
 
 
 def test_parameters_and_which_printed_ones_are_inside(

@@ -72,6 +72,7 @@ class _Plan:
         rate: 1 / tau, 1/s.
         slip: factor of velocities at walls.
         mutual: partners exert opposite forces.
+        first: 0 lets people meet themselves as well, otherwise 1.
         cutoff: distances of pairs and of walls, m, or none.
         samples: K.
     """
@@ -89,6 +90,7 @@ class _Plan:
     rate: Any
     slip: Any
     mutual: bool
+    first: int
     cutoff: tuple[Any, ...]
     samples: int
 
@@ -109,8 +111,8 @@ class _Simulate(torch.autograd.Function):
         def call(jobs: np.ndarray) -> None:
             plan.module.forward(
                 jobs, plan.order, plan.per, plan.dt, values[0], plan.still, plan.wall,
-                plan.scale, plan.end, plan.rate, plan.slip, plan.mutual, values[1], values[2],
-                states, out.numpy(), *plan.cutoff,
+                plan.scale, plan.end, plan.rate, plan.slip, plan.mutual, plan.first, values[1],
+                values[2], states, out.numpy(), *plan.cutoff,
             )  # fmt: skip
 
         run_all(call, plan.jobs)
@@ -129,8 +131,9 @@ class _Simulate(torch.autograd.Function):
         def call(jobs: np.ndarray) -> None:
             plan.module.backward(
                 jobs, plan.order, plan.per, plan.dt, plan.still, plan.wall, plan.scale,
-                plan.end, plan.rate, plan.slip, plan.mutual, *ctx.values[1:], ctx.states,
-                grad_out, grad_y0, *(total[jobs[0, 5]] for total in totals), *plan.cutoff,
+                plan.end, plan.rate, plan.slip, plan.mutual, plan.first, *ctx.values[1:],
+                ctx.states, grad_out, grad_y0, *(total[jobs[0, 5]] for total in totals),
+                *plan.cutoff,
             )  # fmt: skip
 
         run_all(call, plan.jobs)
@@ -245,6 +248,7 @@ def simulate(
         rate=_scalar(number(1 / tau)),
         slip=_scalar(number(-social.friction_sign if social else 1.0)),
         mutual=social is not None,
+        first=0 if isinstance(force, NetworkForce) and force.self_interaction else 1,
         cutoff=tuple(_scalar(number(distance)) for distance in distances),
         samples=batch.n_samples,
     )

@@ -111,6 +111,7 @@ def forward(
     rate: Any,
     slip: Any,
     mutual: bool,
+    first: int,
     q: Any,
     q_wall: Any,
     states: Any,
@@ -153,7 +154,7 @@ def forward(
             clear(pull)
             clear(reaction)
             sides = (own, exists, y, exists)
-            meet(room, sides, (width, 1, shifts), mutual, q, pull, reaction, sums)
+            meet(room, sides, (width, first, shifts), mutual, q, pull, reaction, sums)
             clear(push)
             if points:
                 for c in range(4):
@@ -185,6 +186,7 @@ def backward(
     rate: Any,
     slip: Any,
     mutual: bool,
+    first: int,
     q: Any,
     q_wall: Any,
     states: Any,
@@ -233,7 +235,7 @@ def backward(
                 room, (own, exists, goal, always), span, False, False, (rate,), weight, total,
                 to_own, to_other, sums,
             )  # fmt: skip
-            span = (width, 1, shifts)
+            span = (width, first, shifts)
             meet_pull(
                 room, (own, exists, y, exists), span, mutual, True, q, weighed, total, to_own,
                 to_other, sums,

@@ -16,7 +16,14 @@ from numba import njit
 
 from nnode.solvers.fused.crowd_laws import LOOP, ROWS, SIZE, law, law_pull
 from nnode.solvers.fused.crowd_rows import blank, clear, copy, fill_up, increase
-from nnode.solvers.fused.neighbours import both_ways, grid, people_near, points_near, sort
+from nnode.solvers.fused.neighbours import (
+    both_ways,
+    grid,
+    people_near,
+    points_near,
+    sort,
+    with_oneself,
+)
 
 
 @njit(**LOOP)
@@ -122,7 +129,9 @@ def _scene(still: Any, wall: Any, points: int, cutoff: Any) -> tuple[Any, ...]:
 
 
 @njit(**LOOP)
-def _people(y: Any, own: Any, cutoff: Any, mutual: bool, pairs: Any) -> tuple[Any, Any, int]:
+def _people(
+    y: Any, own: Any, cutoff: Any, mutual: bool, first: int, pairs: Any
+) -> tuple[Any, Any, int]:
     """Sort people by cell into ``own``; their order, pairs of places in it, their number."""
     cells = grid(y[:, 0], y[:, 1], cutoff)
     order, cell, start = sort(y[:, 0], y[:, 1], cells)
@@ -130,6 +139,8 @@ def _people(y: Any, own: Any, cutoff: Any, mutual: bool, pairs: Any) -> tuple[An
     pairs, number = people_near(own[:, 0], own[:, 1], cells, cell, start, cutoff, pairs)
     if not mutual:
         pairs, number = both_ways(pairs, number)
+    if first == 0:
+        pairs, number = with_oneself(pairs, number, len(own))
     return order, pairs, number
 
 
@@ -144,8 +155,8 @@ def _slip(rows: Any, slip: Any) -> None:
 @njit(nogil=True, cache=True, **LOOP)
 def forward(
     jobs: Any, order: Any, per: int, dt: Any, y0: Any, still: Any, wall: Any, scale: Any,
-    end: Any, rate: Any, slip: Any, mutual: bool, q: Any, q_wall: Any, states: Any, out: Any,
-    cutoff: Any, cutoff_wall: Any,
+    end: Any, rate: Any, slip: Any, mutual: bool, first: int, q: Any, q_wall: Any, states: Any,
+    out: Any, cutoff: Any, cutoff_wall: Any,
 ) -> None:  # fmt: skip
     """As the function of the same name in crowd_dense; every block is one simulation."""
     room = blank(1, ROWS * SIZE, scale)[0]
@@ -168,7 +179,7 @@ def forward(
                     copy(states[begin + 4 * i :], y[i])
             if step > end[b]:
                 continue
-            sequel, pairs, meetings = _people(y, own, cutoff, mutual, pairs)
+            sequel, pairs, meetings = _people(y, own, cutoff, mutual, first, pairs)
             clear(force)
             _meet(room, own, own, pairs, meetings, mutual, q, force)
             clear(push)
@@ -193,8 +204,8 @@ def forward(
 @njit(nogil=True, cache=True, **LOOP)
 def backward(
     jobs: Any, order: Any, per: int, dt: Any, still: Any, wall: Any, scale: Any, end: Any,
-    rate: Any, slip: Any, mutual: bool, q: Any, q_wall: Any, states: Any, grad_out: Any,
-    grad_y0: Any, total: Any, total_wall: Any, cutoff: Any, cutoff_wall: Any,
+    rate: Any, slip: Any, mutual: bool, first: int, q: Any, q_wall: Any, states: Any,
+    grad_out: Any, grad_y0: Any, total: Any, total_wall: Any, cutoff: Any, cutoff_wall: Any,
 ) -> None:  # fmt: skip
     """As the function of the same name in crowd_dense."""
     room = blank(1, ROWS * SIZE, scale)[0]
@@ -221,7 +232,7 @@ def backward(
                 copy(y[i], states[begin + 4 * i : begin + 4 * i + 4])
                 for c in range(2):
                     weight[i, c] = dt * adjoint[i, 2 + c]
-            sequel, pairs, meetings = _people(y, own, cutoff, mutual, pairs)
+            sequel, pairs, meetings = _people(y, own, cutoff, mutual, first, pairs)
             for k in range(number):
                 for c in range(2):
                     weight_own[k, c] = weight[sequel[k], c] * scale[b, 0]

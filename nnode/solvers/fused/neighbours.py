@@ -203,3 +203,12 @@ def both_ways(pairs: Any, number: int) -> tuple[Any, int]:
     pairs[0, number : 2 * number] = pairs[1, :number]
     pairs[1, number : 2 * number] = pairs[0, :number]
     return pairs, 2 * number
+
+
+@njit(**LOOP)
+def with_oneself(pairs: Any, number: int, people: int) -> tuple[Any, int]:
+    """The pairs, and everyone with himself."""
+    pairs = with_room(pairs, number + people)
+    for i in range(people):
+        pairs[0, number + i] = pairs[1, number + i] = i
+    return pairs, number + people

@@ -37,6 +37,7 @@ MODELS = {
     "sf_open": lambda: [Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1, walls=False)],
     "nn": lambda: [Relaxation(), network()],
     "nn_open": lambda: [network(3, mass=2.0, walls=False), Relaxation()],
+    "nn_self": lambda: [Relaxation(), network(self_interaction=True)],
     "nn_one": lambda: [Relaxation(), network(1)],
 }
 

@@ -236,9 +236,10 @@ def test_lists_give_the_gradient(walls: bool) -> None:
     assert difference(single[1], wanted) < 1e-4
 
 
-def test_networks_with_a_cutoff() -> None:
-    batch = hall(40)
-    model = Crowd([Relaxation(), NetworkForce(generator=torch.Generator().manual_seed(2))])
+@pytest.mark.parametrize("oneself", [False, True])
+def test_networks_with_a_cutoff(oneself: bool) -> None:
+    batch, draw = hall(40), torch.Generator().manual_seed(2)
+    model = Crowd([Relaxation(), NetworkForce(self_interaction=oneself, generator=draw)])
     _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     for cutoff, same in ((100.0, True), (2.0, False)):
         _, own = gradient(model, FusedSolver(0.02, cutoff=cutoff), batch)
