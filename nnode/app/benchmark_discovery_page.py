@@ -161,7 +161,7 @@ def _figures(frame: pd.DataFrame, domain: str) -> list[Block]:
                 f"confusion_{domain}",
                 confusion_figure(shares),
                 "Percent of the cases of each row. Effects in brackets are not in the catalogue; "
-                "*unknown* is the verdict without a name.",
+                "*unknown* and *unconfirmed* are verdicts without a name.",
                 f"Matrix of hidden and first named effects in {domain}.",
             ),
         ]
