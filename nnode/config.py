@@ -129,12 +129,16 @@ class DiscoveryBenchmarkOptions:
     # null: all
     arms: list[str] | None = None
     effects: list[str] | None = None  # null: all; else only cases that hide one of these
+    # null: all; of nothing: white | autocorrelated | windows | heterogeneous | recording
+    variants: list[str] | None = None
     seeds: int = 10  # per effect, pair or fault
-    nothing_seeds: int = 70  # per kind of nothing, of which there are three
-    first_seed: int = 0  # of the cases
+    nothing_seeds: int = 400  # per variant of nothing
+    first_seed: int = 0  # of the cases, while rules may still change
+    # full hash of the commit that froze the rules; seeds follow from it
+    seeds_of: str | None = None
     strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
     noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
-    sizes: list[int] = field(default_factory=lambda: [20])  # numbers of sequences
+    sizes: list[int] = field(default_factory=lambda: [20])  # numbers of platoons or crowds
     peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
     workers: int | None = None  # processes; null: one per core
 

@@ -10,6 +10,10 @@ Examples:
   python scripts/benchmark_discovery.py 'benchmark_discovery.domains=[traffic]' \\
       'benchmark_discovery.arms=[single]' 'benchmark_discovery.noises=[0,0.05,0.3]' \\
       'benchmark_discovery.sizes=[5,20,80]'
+  # how often chance passes where nothing is hidden, on seeds that follow from a commit
+  python scripts/benchmark_discovery.py 'benchmark_discovery.arms=[nothing]' \\
+      'benchmark_discovery.variants=[white,windows]' benchmark_discovery.nothing_seeds=400 \\
+      benchmark_discovery.seeds_of=0000000000000000000000000000000000000000
 
 Results: a page with tables of what was found, missed and invented, over all cases that the folder
 holds. The same command goes on where it was stopped.

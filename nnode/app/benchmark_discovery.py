@@ -13,22 +13,23 @@ from nnode.app.benchmark_discovery_task import diagnose_case, sources, task_of
 from nnode.config import DiscoveryBenchmarkOptions
 from nnode.errors import ConfigError
 from nnode.groundtruth import ARMS, Case
-from nnode.groundtruth.arms import cases, hides
+from nnode.groundtruth.arms import cases, first_seed, hides
 from nnode.machine import cores
 from nnode.pages.page import write_page
 from nnode.study.runner import kept_results, run_tasks
 
-#: Arms that need many cases: they show how often something is named where nothing is hidden.
+#: The arm that needs many cases: it shows how often something is named where nothing is hidden.
 _NOTHING = "nothing"
 
 
 def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     """Generate, diagnose and score all cases, write the page, and print where it is.
 
-    The page shows all cases that the folder holds, those of earlier runs of the same code too.
+    The page shows all cases of the same origin of seeds (a commit, or none) that the folder holds,
+    those of earlier runs of the same code too.
 
     Raises:
-        ConfigError: unknown domains, arms or effects, or no case at all.
+        ConfigError: unknown domains, arms, variants or effects, no hash of a commit, or no case.
         StudyError: tasks failed.
         Interrupted: a signal asked to stop; what is done is kept.
     """
@@ -39,16 +40,21 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     if workers < 1:
         raise ConfigError(f"benchmark_discovery.workers={workers} must be at least 1")
     code = sources()
+    last_of_peers = _first(options) + options.peer_seeds
     run_tasks(
-        [task_of(case, case.seed < options.first_seed + options.peer_seeds) for case in chosen],
+        [task_of(case, case.seed < last_of_peers, options.seeds_of) for case in chosen],
         folder,
         workers=workers,
         fingerprint=code,
         title="diagnoses",
     )
-    rows = kept_results(folder, diagnose_case, code)
+    rows = [
+        row
+        for row in kept_results(folder, diagnose_case, code).values()
+        if row["seeds_of"] == options.seeds_of
+    ]
     paths = write_page(
-        blocks_of(list(rows.values()), time.monotonic() - start, workers),
+        blocks_of(rows, time.monotonic() - start, workers, code),
         folder,
         title=TITLE,
         subtitle=SUBTITLE,
@@ -68,32 +74,48 @@ def cases_of(options: DiscoveryBenchmarkOptions) -> list[Case]:
     for name in ("seeds", "nothing_seeds"):
         if getattr(options, name) < 1:
             raise ConfigError(f"benchmark_discovery.{name} must be at least 1")
+    items = [item for domain in options.domains for arm in ARMS for item in hides(domain, arm)]
     known = {
-        name
-        for domain in options.domains
-        for arm in ARMS
-        for item in hides(domain, arm)
-        for name in item.effects
+        "effects": {name for item in items for name in item.effects},
+        "variants": {item.variant for item in items},
     }
-    strange = sorted(set(options.effects or ()) - known)
-    if strange:
-        raise ConfigError(
-            f"benchmark_discovery.effects: {strange[0]} is hidden nowhere, expected some of "
-            f"{', '.join(sorted(known))}"
-        )
-    found = []
+    for name, words in known.items():
+        strange = sorted(set(getattr(options, name) or ()) - words)
+        if strange:
+            raise ConfigError(
+                f"benchmark_discovery.{name}: {strange[0]} is hidden nowhere, expected some of "
+                f"{', '.join(sorted(words))}"
+            )
+    first, found = _first(options), []
     for domain in options.domains:
         for arm in options.arms or list(ARMS):
             number = options.nothing_seeds if arm == _NOTHING else options.seeds
             found += cases(
                 domain,
                 arm,
-                seeds=range(options.first_seed, options.first_seed + number),
+                seeds=range(first, first + number),
                 strengths=options.strengths,
                 noises=[None] if options.noises is None else options.noises,
                 sizes=options.sizes,
                 effects=options.effects,
+                variants=options.variants,
             )
     if not found:
-        raise ConfigError("the benchmark has no case: check its domains, arms and effects")
+        raise ConfigError("the benchmark has no case: check its domains, arms, variants, effects")
     return found
+
+
+def _first(options: DiscoveryBenchmarkOptions) -> int:
+    """The first seed.
+
+    Raises:
+        ConfigError: given by hand beside a commit, or no full hash.
+    """
+    if options.seeds_of is None:
+        return options.first_seed
+    if options.first_seed:
+        raise ConfigError(
+            f"benchmark_discovery.first_seed={options.first_seed} beside seeds_of: expected one of "
+            "them, as a commit tells where its seeds begin"
+        )
+    return first_seed(options.seeds_of)

@@ -6,44 +6,52 @@ from typing import Any
 
 import pandas as pd
 
+from nnode.app import benchmark_discovery_level as level
 from nnode.app import benchmark_discovery_tables as tables
+from nnode.app.benchmark_discovery_criteria import criteria
 from nnode.groundtruth import ARMS
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
-from nnode.plots.benchmark_discovery import confusion_figure, map_figure
+from nnode.plots.benchmark_discovery import confusion_figure, map_figure, uniform_figure
 
 TITLE = "The diagnosis against hidden truths"
 SUBTITLE = (
     "Synthetic measured trajectories in which an effect is hidden; the truth is opened after the "
     "diagnosis has ended."
 )
+_DIGITS = {"noise, m": 2, "first screen, p": 3, "final names, p": 3}
 _PACKAGES = ("torch", "numba", "numpy", "scipy")
 
 
-def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int) -> list[Block]:
+def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int, code: str) -> list[Block]:
     """The page's blocks.
 
     Args:
         rows: one per case, as :func:`nnode.app.benchmark_discovery_task.diagnose_case` gives it.
         seconds: that this run took.
         workers: processes.
+        code: digest of the code that the rows are of.
     """
     frame, coefficients = tables.frame_of(rows), tables.coefficients_of(rows)
     blocks: list[Block] = [
         Heading("What was asked for and what was reached"),
         TableBlock(
             "criteria",
-            tables.criteria(frame, coefficients),
+            criteria(frame, coefficients),
             "Shares of cases, or medians, at the noise and the number of sequences that most cases "
             "have; of medium strength where not said otherwise. *closure* is the share of what the "
-            "truth itself closes of the sealed gap.",
+            "truth itself closes of the sealed gap. Where nothing is hidden: the probability of so "
+            "many rejections or more if a gate keeps its level.",
         ),
+        *_level(frame),
         Heading("By arm"),
         Text("\n".join(f"- `{name}`: {what}" for name, what in ARMS.items())),
         TableBlock(
             "arms",
             tables.by_arm(frame),
-            "Percent of the cases; *right* is what the arm asks for, with its interval of 95 %.",
+            "Percent of the cases; *right* is what the arm asks for, with its interval of 95 % "
+            "(Clopper and Pearson). What is *unconfirmed* is a lead, not a name; *false faults*: a "
+            "sound sequence was blamed.",
             digits=0,
         ),
     ]
@@ -68,8 +76,9 @@ def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int) -> list[
             TableBlock(
                 "effects",
                 effects,
-                "Percent of the cases in which exactly the hidden effects were named, or effects "
-                "of their classes.",
+                "Percent of the cases in which exactly the hidden effects were named; were listed "
+                "as indistinguishable, or among their equals; were named by effects of their "
+                "classes; or were exactly the leads that sealed clusters did not confirm.",
                 digits={
                     **dict.fromkeys(effects.columns, 0),
                     "closure (median)": 2,
@@ -99,8 +108,41 @@ def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int) -> list[
             "How often each verdict was given, by arm; the file holds one line per case.",
             full=frame,
         ),
-        _made(frame, seconds, workers),
+        _made(frame, seconds, workers, code),
     ]
+    return blocks
+
+
+def _level(frame: pd.DataFrame) -> list[Block]:
+    """What chance does where nothing is hidden."""
+    found = level.level(frame)
+    if found.empty:
+        return []
+    blocks: list[Block] = [
+        Heading("Level"),
+        TableBlock(
+            "level",
+            found,
+            "Cases with nothing hidden in which the first screen rejects at 5 %, and in which "
+            "something is named in the end. p: one-sided binomial test against 5 %; below 2.5 % "
+            "the gate does not keep its level. Leads that sealed clusters did not confirm "
+            "(*unconfirmed*) are no names. Heterogeneity is neither where agents do differ.",
+            digits={**dict.fromkeys(found.columns, 0), **_DIGITS},
+        ),
+    ]
+    for domain in dict.fromkeys(frame["domain"]):
+        values = level.screens(frame, domain)
+        if values:
+            blocks.append(
+                FigureBlock(
+                    f"level_{domain}",
+                    uniform_figure(values),
+                    f"First screens in {domain} where nothing is hidden: family-wise p-values in "
+                    "their order against those expected of uniform ones, with the exact pointwise "
+                    "band of 95 %. On the line or above it a p-value is what it says, or larger.",
+                    f"Quantiles of the first screen's p-values in {domain} against uniform ones.",
+                )
+            )
     return blocks
 
 
@@ -119,7 +161,7 @@ def _figures(frame: pd.DataFrame, domain: str) -> list[Block]:
                 f"confusion_{domain}",
                 confusion_figure(shares),
                 "Percent of the cases of each row. Effects in brackets are not in the catalogue; "
-                "*unknown* is the verdict without a name.",
+                "*unknown* and *unconfirmed* are verdicts without a name.",
                 f"Matrix of hidden and first named effects in {domain}.",
             ),
         ]
@@ -137,10 +179,16 @@ def _figures(frame: pd.DataFrame, domain: str) -> list[Block]:
     return blocks
 
 
-def _made(frame: pd.DataFrame, seconds: float, workers: int) -> Provenance:
+def _made(frame: pd.DataFrame, seconds: float, workers: int, code: str) -> Provenance:
+    commit = frame["seeds_of"].iloc[0]
+    seeds = f"{frame['seed'].min()} to {frame['seed'].max()}"
     return Provenance(
         {
             "Cases": str(len(frame)),
+            "Seeds": f"{seeds}, development: rules may have changed after a look at these cases"
+            if commit is None
+            else f"{seeds}, from the hash of the commit that froze the rules, {commit}",
+            "Code": f"digest {code}",
             "Time": f"{seconds:.0f} s in this run with {workers} worker process(es); one diagnosis "
             f"{frame['seconds'].median():.1f} s (median), {frame['seconds'].max():.1f} s (most)",
             **how_made(_PACKAGES),

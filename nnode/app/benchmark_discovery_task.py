@@ -29,7 +29,9 @@ _PACKAGES = ("discover", "groundtruth", "models", "data", "calibrate", "solvers"
 _KEPT = ("named", "exact", "class_right", "found", "false_names", "closure", "worse", "right")
 
 
-def diagnose_case(case: dict[str, Any], peers: bool = False) -> dict[str, Any]:
+def diagnose_case(
+    case: dict[str, Any], peers: bool = False, seeds_of: str | None = None
+) -> dict[str, Any]:
     """The score of one diagnosis, and how long it took.
 
     The truth stays outside the folder that the diagnosis is given.
@@ -37,12 +39,15 @@ def diagnose_case(case: dict[str, Any], peers: bool = False) -> dict[str, Any]:
     Args:
         case: of :class:`nnode.groundtruth.Case`, as plain JSON.
         peers: scores of the peers as well, by name.
+        seeds_of: hash of the commit that the seed comes from; is handed through.
     """
     # imported here: all workers read this file, and tests put another diagnosis in its place
     from nnode.app import benchmark_discovery_peers, discover
     from nnode.discover.options import DiscoverOptions
+    from nnode.models.effects import CATALOGUE
 
     what = Case.from_dict(case)
+    classes = {effect.name: effect.kin for effect in CATALOGUE.effects.values()}
     with TemporaryDirectory(prefix="nnode-case-") as made, TemporaryDirectory() as given:
         start = time.monotonic()
         truth = generate(what, Path(made))
@@ -68,10 +73,11 @@ def diagnose_case(case: dict[str, Any], peers: bool = False) -> dict[str, Any]:
         if peers and not failure:
             found = benchmark_discovery_peers.peers_on_table(table, what.domain, **told)
             for name, other in found.items():
-                scored = score(truth, other)
+                scored = score(truth, other, classes)
                 others[name] = {key: scored[key] for key in _KEPT}
     return {
-        **score(truth, report),
+        **score(truth, report, classes),
+        "seeds_of": seeds_of,
         "seconds": seconds,
         "seconds_to_generate": generated,
         "laps": report.get("seconds", {}),
@@ -80,10 +86,11 @@ def diagnose_case(case: dict[str, Any], peers: bool = False) -> dict[str, Any]:
     }
 
 
-def task_of(case: Case, peers: bool) -> Task:
+def task_of(case: Case, peers: bool, seeds_of: str | None) -> Task:
     """A case as a task that is kept; larger ones start first."""
     size = case.n_sequences * (1.0 if case.domain == "traffic" else 2.0)
-    return Task(case.key, diagnose_case, {"case": case.to_dict(), "peers": peers}, cost=size)
+    arguments = {"case": case.to_dict(), "peers": peers, "seeds_of": seeds_of}
+    return Task(case.key, diagnose_case, arguments, cost=size)
 
 
 def sources() -> str:

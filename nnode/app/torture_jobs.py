@@ -183,7 +183,8 @@ def jobs(raw: Path) -> list[Job]:
         Job("benchmark_discovery",
             [f"benchmark_discovery.{option}" for option in (
                 "domains=[traffic]", "arms=[nothing]", "nothing_seeds=1", "sizes=[4]",
-                "noises=[0.05]", "peer_seeds=0", "workers=1")],
+                "variants=[white,autocorrelated,heterogeneous]", "noises=[0.05]",
+                "peer_seeds=0", "workers=1")],
             _tasks, _names, 12, before=_small_diagnosis),
     ]  # fmt: skip
 

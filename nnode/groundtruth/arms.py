@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -9,7 +11,10 @@ from nnode.errors import ConfigError
 from nnode.groundtruth import crowd_catalogue, faults, traffic_catalogue
 from nnode.groundtruth.case import ARMS, Case
 
-NULLS = ("white", "autocorrelated", "heterogeneous")
+#: Kinds of data in which nothing is hidden; ``recording`` is one of traffic alone.
+NULLS = ("white", "autocorrelated", "windows", "heterogeneous")
+
+_COMMIT = re.compile(r"[0-9a-f]{40}([0-9a-f]{24})?")
 
 #: Effects that act in different places, times or variables, so that both can be told.
 TRAFFIC_PAIRS = (
@@ -41,17 +46,23 @@ CROWD_PAIRS = (
 
 @dataclass(frozen=True)
 class Hides:
-    """What one case of an arm hides."""
+    """What one case of an arm hides.
+
+    Attributes:
+        effects, variant: of the case.
+        runs: number of runs, whatever is asked for; 0: as many as are asked for.
+    """
 
     effects: tuple[str, ...] = ()
     variant: str = "plain"
+    runs: int = 0
 
 
 def _traffic() -> dict[str, list[Hides]]:
     return {
         "single": [Hides((name,)) for name in traffic_catalogue.CATALOGUE],
         "pair": [Hides(pair) for pair in TRAFFIC_PAIRS],
-        "nothing": [Hides((), variant) for variant in NULLS],
+        "nothing": [Hides((), variant) for variant in NULLS] + [Hides((), "recording", runs=2)],
         "outside": [Hides((name,)) for name in traffic_catalogue.OUTSIDE],
         "near_miss": [
             Hides(("speed_zone",), "smooth"),
@@ -99,6 +110,22 @@ def hides(domain: str, arm: str) -> list[Hides]:
     return _HIDES[domain]()[arm]
 
 
+def first_seed(commit: str) -> int:
+    """The first of the seeds that belong to a commit: nobody can look at their cases before it.
+
+    The first seven hexadecimal digits of the SHA-256 digest of the full hash, as a number.
+
+    Raises:
+        ConfigError: no full hash in small letters.
+    """
+    if not _COMMIT.fullmatch(commit):
+        raise ConfigError(
+            f"{commit!r} is no full hash of a commit: expected the 40 or 64 characters that "
+            "git rev-parse COMMIT prints"
+        )
+    return int(hashlib.sha256(commit.encode()).hexdigest()[:7], 16)
+
+
 def cases(
     domain: str,
     arm: str,
@@ -108,6 +135,7 @@ def cases(
     noises: Iterable[float | None] = (None,),
     sizes: Iterable[int] = (20,),
     effects: Iterable[str] | None = None,
+    variants: Iterable[str] | None = None,
 ) -> list[Case]:
     """Every case of an arm: what it hides × strengths × noise × number of sequences × seeds.
 
@@ -116,22 +144,26 @@ def cases(
 
     Args:
         noises: standard deviations of measured positions (m); None takes the domain's low one.
-        sizes: numbers of sequences.
+        sizes: numbers of runs.
         effects: keeps the cases that hide at least one of these.
+        variants: keeps the cases of these variants.
 
     Raises:
         ConfigError: an unknown domain, arm or strength.
     """
     wanted = None if effects is None else set(effects)
+    kept = None if variants is None else set(variants)
     found = []
     seeds, noises, sizes, strengths = list(seeds), list(noises), list(sizes), list(strengths)
     for item in hides(domain, arm):
         if wanted is not None and not wanted & set(item.effects):
             continue
+        if kept is not None and item.variant not in kept:
+            continue
         idle = not item.effects or arm == "no_excitation"
         for strength in ["full"] if idle else strengths:
             for noise in noises:
-                for size in sizes:
+                for size in [item.runs] if item.runs else sizes:
                     found += [
                         Case(
                             domain=domain,

@@ -29,7 +29,7 @@ def write_crowd(case: Case, folder: Path) -> dict[str, Any]:
     if case.arm == "fault":
         x, faults = insert(case, x)
     agents, clock = agents_of(case, "p"), clock_of(case, scene.clocks)
-    heads = np.array([name.split("/")[1] for name in case.names])[:, None]
+    heads = np.array(case.runs)[:, None]
     group = np.char.add(heads, np.char.add("g", scene.group.astype(str)))
     columns = {
         "x": np.round(x[..., 0], 5),
@@ -55,7 +55,7 @@ def write_crowd(case: Case, folder: Path) -> dict[str, Any]:
             "correlation": scene.correlation,
         },
         amplitude=made.amplitude,
-        costs=made.costs(made.truth),
+        costs=made.costs(made.truth) if case.effects else None,
         faults=faults,
         agents=agents,
         clock=clock,

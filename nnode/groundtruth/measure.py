@@ -121,9 +121,10 @@ def closure(truth: dict[str, Any], report: dict[str, Any]) -> float | None:
     """
     sealed = {tail(name) for name in (report.get("split") or {}).get("sealed", ())}
     cost = truth["cost"]
+    if cost is None or truth["case"]["arm"] == "no_excitation":
+        return None
     places = [i for i, name in enumerate(cost["oracle"]) if tail(name) in sealed]
-    hidden = truth["effects"] or truth["outside"] or truth["nuisance"]
-    if not places or not hidden or truth["case"]["arm"] == "no_excitation":
+    if not places:
         return None
     base, best = (
         sum(list(cost[name].values())[i] for i in places) / len(places)

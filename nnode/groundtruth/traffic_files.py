@@ -49,7 +49,7 @@ def write_traffic(case: Case, folder: Path) -> dict[str, Any]:
             "correlation": road.correlation,
         },
         amplitude=made.amplitude,
-        costs=made.costs(made.truth),
+        costs=made.costs(made.truth) if case.effects else None,
         faults=faults,
         agents=agents,
         clock=clock,

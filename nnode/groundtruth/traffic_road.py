@@ -25,6 +25,8 @@ _STABLE = 0.33
 #: Leaders vary their speed by at least this much, m/s.
 _LEAST_RANGE = 6.0
 _TRUCKS = 0.25
+#: Drivers' disturbances are correlated over this time, s; in the variant ``recording`` over that.
+_CORRELATION, _LASTING = (2.0, 5.0), 6.0
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,9 @@ def lay_out(case: Case, around: Surroundings) -> Road:
     eta = (eta - own.mean()) / own.std()
 
     rng = case.generator("drivers")
-    correlation = float(rng.uniform(2, 5))
+    correlation = float(rng.uniform(*_CORRELATION))
+    if case.variant == "recording":
+        correlation = _LASTING
     kick = ornstein_uhlenbeck(
         rng,
         (sequences, vehicles, steps + 1),

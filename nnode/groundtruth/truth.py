@@ -53,7 +53,7 @@ def write_truth(
     base: dict[str, float],
     noise: dict[str, Any],
     amplitude: Amplitude,
-    costs: Costs,
+    costs: Costs | None,
     faults: list[Fault],
     agents: list[list[str]],
     clock: np.ndarray,
@@ -68,8 +68,8 @@ def write_truth(
         model: what the diagnosis has to be told of the base model.
         base: the base model's true parameters.
         noise: of drivers or walkers.
-        amplitude, costs: how strength was set, and what it came to.
-        agents: names by sequence.
+        amplitude, costs: how strength was set, and what it came to; None where nothing is hidden.
+        agents: names by run.
         clock: ``(S, K + 1)`` s.
         not_testable: what data without excitation cannot show.
         more: further keys.
@@ -81,7 +81,7 @@ def write_truth(
         "key": case.key,
         "model": model,
         "base": base,
-        "recalibrated": costs.recalibrated,
+        "recalibrated": None if costs is None else costs.recalibrated,
         "effects": described([n for n in case.effects if n in catalogue], catalogue, effects),
         "outside": described([n for n in case.effects if n in outside], outside, effects),
         "nuisance": described(nuisance, catalogue, effects),
@@ -90,12 +90,14 @@ def write_truth(
         "noise": {"measurement": case.sigma, **noise},
         "strength": {
             "share": amplitude.share,
-            "reached": costs.share if case.effects else None,
+            "reached": costs.share if costs is not None and case.effects else None,
             "misfit": amplitude.misfit,
             "spread": amplitude.spread,
             "alone": amplitude.alone,
         },
-        "cost": {
+        "cost": None
+        if costs is None
+        else {
             "unit": "m²",
             "floor": costs.floor,
             "base": dict(zip(names, costs.base.tolist(), strict=True)),
@@ -114,25 +116,28 @@ def table(
 
     Args:
         clock: ``(S, K + 1)`` s.
-        agents: N names by sequence.
+        agents: N names by run.
         columns: ``(S, K + 1, N)`` or, where they do not change, ``(S, N)``.
     """
     shape = (*clock.shape, case.n_agents)
-
-    def spread(value: np.ndarray) -> np.ndarray:
-        value = value if value.ndim == 3 else value[:, None]
-        return np.broadcast_to(value, shape).ravel()
-
-    sequence = np.array([name.split("/")[1] for name in case.names])
-    frame = pd.DataFrame(
-        {
-            "sequence": spread(sequence[:, None]),
-            "time": spread(clock[:, :, None]),
-            "agent": spread(np.array(agents)),
-            **{name: spread(value) for name, value in columns.items()},
-        }
-    )
-    return str(frame.to_csv(index=False))
+    whole = {"time": clock[:, :, None], "agent": np.array(agents), **columns}
+    spread = {
+        name: np.broadcast_to(value if value.ndim == 3 else value[:, None], shape)
+        for name, value in whole.items()
+    }
+    frames = [
+        pd.DataFrame(
+            {
+                "sequence": window.name,
+                **{
+                    k: v[window.run, window.samples, window.agents].ravel()
+                    for k, v in spread.items()
+                },
+            }
+        )
+        for window in case.windows()
+    ]
+    return str(pd.concat(frames).to_csv(index=False))
 
 
 def clock_of(case: Case, starts: np.ndarray) -> np.ndarray:
@@ -141,6 +146,5 @@ def clock_of(case: Case, starts: np.ndarray) -> np.ndarray:
 
 
 def agents_of(case: Case, letter: str) -> list[list[str]]:
-    """Names of the agents by sequence; no agent is in two sequences."""
-    heads = [name.split("/")[1] for name in case.names]
-    return [[f"{head}{letter}{i}" for i in range(case.n_agents)] for head in heads]
+    """Names of the agents by run: no agent is in two runs, and windows of a run share theirs."""
+    return [[f"{run}{letter}{i}" for i in range(case.n_agents)] for run in case.runs]

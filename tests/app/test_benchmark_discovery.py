@@ -9,11 +9,14 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
+from nnode.app import benchmark_discovery_criteria as criteria
+from nnode.app import benchmark_discovery_level as level
 from nnode.app import benchmark_discovery_tables as tables
 from nnode.app import discover
 from nnode.app.benchmark_discovery import benchmark_discovery, cases_of
 from nnode.config import DiscoveryBenchmarkConfig, DiscoveryBenchmarkOptions
 from nnode.errors import ConfigError, DataError
+from nnode.groundtruth.arms import first_seed
 
 CALLS: list[dict[str, Any]] = []
 
@@ -34,6 +37,8 @@ def stand_in(path: Path, domain: str, **given: Any) -> dict[str, Any]:
         ],
         "data_faults": [],
         "not_testable": [],
+        "screen": {"p_value": 0.01, "effect": "relative_speed", "clusters": 2, "floor": 0.25},
+        "clusters": {"open": 2, "sealed": 1},
         "gap": {"before": 2.0, "after": 1.0, "noise_floor": 0.0, "closed": 0.5},
         "split": {"open": names[1:], "sealed": names[:1]},
         "seconds": {"name": 0.1},
@@ -72,9 +77,9 @@ def test_named_effects_are_scored_and_summed_up(tmp_path):
     assert rows.loc["time_gap", "class_right"]
     for file in ("benchmark.html", "benchmark.md", "coefficients.csv"):
         assert (tmp_path / file).is_file()
-    criteria = pd.read_csv(tmp_path / "criteria.csv").set_index("measure")
-    assert criteria.loc["one effect: exact name", "reached"] == 0.5
-    assert criteria.loc["one effect: right class", "met"]
+    found = pd.read_csv(tmp_path / "criteria.csv").set_index("measure")
+    assert found.loc["one effect: exact name", "reached"] == 0.5
+    assert found.loc["one effect: right class", "met"]
 
 
 def test_weak_effects_and_other_noise_do_not_count_for_the_headline(tmp_path):
@@ -93,15 +98,129 @@ def test_weak_effects_and_other_noise_do_not_count_for_the_headline(tmp_path):
     assert list(shown.index) == ["medium"]
 
 
+def test_kin_comes_from_the_catalogue(tmp_path):
+    rows = run(tmp_path, domains=["traffic"], arms=["single"], effects=["multi_anticipation"])
+    assert list(rows["class_right"].astype(bool)) == [True]
+
+
 def test_false_names_and_failures_are_counted(tmp_path):
-    rows = run(tmp_path, domains=["traffic"], arms=["nothing", "fault"])
+    rows = run(tmp_path, domains=["traffic"], arms=["nothing", "fault"], variants=["white", "jump"])
     jumped = rows.set_index("variant").loc["jump"]
     assert (jumped["verdict"], jumped["failure"]) == ("error", "DataError: too far within one step")
     assert (rows.loc[rows["arm"] == "nothing", "false_names"] == "relative_speed").all()
-    criteria = pd.read_csv(tmp_path / "criteria.csv").set_index("measure")
-    assert criteria.loc["nothing hidden: any effect named", "reached"] == 1.0
-    assert not criteria.loc["nothing hidden: any effect named", "met"]
-    assert criteria.loc["faults of the data: located", "reached"] == 0.0
+    found = pd.read_csv(tmp_path / "criteria.csv").set_index("measure")
+    assert found.loc["nothing hidden, white: p of final names above 5 %", "reached"] == 0.05
+    assert found.loc["faults of the data: located", "reached"] == 0.0
+
+
+def test_null_arms_run_by_themselves_and_show_their_level(tmp_path):
+    rows = run(tmp_path, arms=["nothing"], variants=["white", "windows"], nothing_seeds=2)
+    assert sorted(rows["variant"] + " " + rows["domain"]) == sorted(
+        2 * ["white traffic", "windows traffic", "white crowd", "windows crowd"]
+    )
+    assert set(rows["screen_p"]) == {0.01}
+    shown = pd.read_csv(tmp_path / "level.csv").set_index(["domain", "variant"])
+    for key in shown.index:
+        assert tuple(shown.loc[key, ["cases", "first screen", "final names"]]) == (2, 2, 2)
+        assert shown.loc[key, "first screen, p"] == pytest.approx(0.05**2)
+        assert (tmp_path / "figures" / f"level_{key[0]}.png").is_file()
+    found = pd.read_csv(tmp_path / "criteria.csv").set_index(["domain", "measure"])
+    row = found.loc[("crowd", "nothing hidden, windows: p of first screen above 5 %")]
+    assert (row["cases"], row["met"]) == (2, False)
+
+
+def null_rows(number: int, rejected: int, **more: Any) -> pd.DataFrame:
+    """Made-up cases with nothing hidden."""
+    return pd.DataFrame(
+        {
+            "domain": "traffic", "arm": "nothing", "variant": "white", "noise": 0.05,
+            "n_sequences": 20, "clusters_open": 15, "verdict": "none",
+            "screen_p": [0.01] * rejected + [0.6] * (number - rejected),
+            "screen_false": [True] * rejected + [False] * (number - rejected),
+            "false_names": "", **more,
+        },
+        index=range(number),
+    )  # fmt: skip
+
+
+def test_a_gate_is_held_to_5_percent_by_a_one_sided_test():
+    # of 400 cases 20 are expected; 29 or more have a probability of 3.2 %, 30 of 2.0 %
+    for rejected, met in ((29, True), (30, False)):
+        rows = level.criteria(null_rows(400, rejected))
+        assert [(row["cases"], row["met"]) for row in rows] == [(400, met), (400, True)]
+    # what was not screened is no case of the screen's
+    untested = null_rows(8, 0, screen_p=None, screen_false=None, verdict="not_testable")
+    (row,) = level.criteria(untested)
+    assert "final names" in row["measure"]
+    assert level.level(untested)["not testable"].tolist() == [8]
+    # a lead is shown and is no name
+    leads = level.level(null_rows(8, 8, verdict="unconfirmed"))
+    assert leads[["first screen", "final names", "unconfirmed"]].to_numpy().tolist() == [[8, 0, 8]]
+
+
+def test_other_sizes_have_lines_but_no_criteria_of_their_own():
+    both = pd.concat([null_rows(3, 0), null_rows(2, 0, n_sequences=5)], ignore_index=True)
+    assert level.level(both)["runs"].tolist() == [20, 5]
+    assert [row["cases"] for row in level.criteria(both)] == [3, 3]
+
+
+def measured(**columns: Any) -> pd.DataFrame:
+    """Criteria of made-up cases."""
+    given = {
+        "key": "k", "domain": "crowd", "arm": "pair", "variant": "plain", "strength": "medium",
+        "noise": 0.01, "n_sequences": 20, "hidden": "drift+obstacle", "verdict": "named",
+        "exact": False, "class_right": True, "among_equals": False, "found": 2,
+        "false_names": "", "unknown": False, "right": False, "faults_hidden": 0,
+        "faults_located": 0, "faults_false": 0, "closure": None, "overlap": None, "worse": None,
+        **columns,
+    }  # fmt: skip
+    rows = pd.DataFrame(given, index=[0])
+    return criteria.criteria(rows, tables.coefficients_of([])).set_index("measure")
+
+
+def test_two_effects_and_a_third_are_not_both_and_nothing_else():
+    found = measured(false_names="sliding_friction")
+    assert found.loc["two effects: both named, and nothing else", "reached"] == 0.0
+
+
+def test_near_misses_equals_and_blamed_sequences_have_criteria():
+    near = measured(arm="near_miss", exact=True, found=1)
+    assert near.loc["near misses: exact name", "met"]
+    equal = measured(arm="single", verdict="indistinguishable", among_equals=True)
+    assert equal.loc["indistinguishable: the right one is listed", "reached"] == 1.0
+    assert equal.loc["one effect: exact name", "reached"] == 0.0
+    blamed = measured(faults_false=1)
+    assert not blamed.loc["sound sequences: none is blamed", "met"]
+    outside = measured(arm="outside", exact=None, verdict="indistinguishable", false_names="drift")
+    assert outside.loc["outside the catalogue: a wrong name", "reached"] == 1.0
+
+
+def test_coefficients_of_crowds_are_held_to_the_same_bound():
+    rows = pd.DataFrame({"key": ["k"], "domain": "crowd", "relative": [0.07], "covered": [True]})
+    base = measured().reset_index()
+    assert "coefficients: median relative error" not in set(base["measure"])
+    frame = pd.DataFrame(
+        {"key": ["k"], "domain": "crowd", "arm": "single", "variant": "plain", "strength": "medium",
+         "noise": 0.01, "n_sequences": 20, "hidden": "drift", "verdict": "named", "exact": True,
+         "class_right": True, "among_equals": False, "false_names": "", "unknown": False,
+         "right": True, "faults_hidden": 0, "faults_located": 0, "faults_false": 0,
+         "closure": None, "overlap": None, "worse": None}
+    )  # fmt: skip
+    found = criteria.criteria(frame, rows).set_index("measure")
+    assert not found.loc["coefficients: median relative error", "met"]
+
+
+def test_published_seeds_follow_from_a_commit_and_the_page_says_so(tmp_path):
+    asked = {"domains": ["traffic"], "arms": ["single"], "effects": ["inertia"]}
+    run(tmp_path, **asked, first_seed=3)
+    assert "3 to 3, development" in (tmp_path / "benchmark.md").read_text()
+    commit = "0" * 40
+    rows = run(tmp_path, **asked, seeds_of=commit)
+    # cases of other seeds are not mixed in
+    assert list(rows["seed"]) == [first_seed(commit)]
+    said = (tmp_path / "benchmark.md").read_text()
+    assert f"from the hash of the commit that froze the rules, {commit}" in said
+    assert "development" not in said
 
 
 def test_the_diagnosis_is_told_what_it_has_to_know_and_no_more(tmp_path):
@@ -137,7 +256,8 @@ def test_headline_holds_what_was_asked_for():
     found = cases_of(DiscoveryBenchmarkOptions())
     for domain in ("traffic", "crowd"):
         part = [case for case in found if case.domain == domain]
-        assert sum(case.arm == "nothing" for case in part) >= 200
+        nothing = [case.variant for case in part if case.arm == "nothing"]
+        assert len(nothing) == 400 * len(set(nothing)) >= 1600
         singles = [case.effects for case in part if case.arm == "single"]
         assert len(singles) == 10 * len(set(singles))
         assert len({case.effects for case in part if case.arm == "outside"}) >= 4
@@ -151,6 +271,9 @@ def test_headline_holds_what_was_asked_for():
         ({"arms": ["solo"]}, "arm=solo"),
         ({"effects": ["telepathy"]}, "telepathy is hidden nowhere"),
         ({"arms": ["nothing"], "effects": ["drift"]}, "has no case"),
+        ({"domains": ["crowd"], "variants": ["recording"]}, "recording is hidden nowhere"),
+        ({"seeds_of": "314307e"}, "is no full hash"),
+        ({"seeds_of": "0" * 40, "first_seed": 5}, "first_seed=5 beside seeds_of"),
         ({"seeds": 0}, "at least 1"),
         ({"workers": 0}, "at least 1"),
     ],
@@ -160,10 +283,6 @@ def test_options_that_make_no_sense_are_refused(tmp_path, options, message):
         benchmark_discovery(config(**options), tmp_path)
 
 
-def test_wilson_intervals_are_those_of_the_textbook():
-    # Agresti & Coull 1998: 0 of 10 gives an upper limit of 1.96² / (10 + 1.96²)
-    low, high = tables.wilson(0.0, 10)
-    assert low == 0.0
-    assert high == pytest.approx(1.96**2 / (10 + 1.96**2))
-    low, high = tables.wilson(0.5, 100)
-    assert low == pytest.approx(1 - high)
+def test_intervals_of_shares_are_exact():
+    # none of 10: the upper limit p has (1 - p)^10 = 2.5 %
+    assert tables.interval(pd.Series([False] * 10)) == f"0–{100 * (1 - 0.025**0.1):.0f}"

@@ -103,6 +103,28 @@ def test_inserted_faults_are_found_where_the_truth_says_and_nowhere_else(tmp_pat
         )
 
 
+def test_windows_of_crowds_hold_the_same_people_on_one_clock(tmp_path):
+    case = small(arm="nothing", variant="windows")
+    generate(case, tmp_path)
+    sequences = read(tmp_path)
+    assert [s.name for s in sequences] == case.names
+    assert len(sequences) == 6
+    assert {s.x.shape for s in sequences} == {(30, 16, 2)}
+    assert sequences[0].agents == sequences[2].agents
+    assert not set(sequences[2].agents) & set(sequences[3].agents)
+    assert sequences[1].time[0] - sequences[0].time[-1] == pytest.approx(case.dt)
+    assert np.abs(sequences[1].x[0] - sequences[0].x[-1]).max() < 0.4
+    assert sequences[0].group == sequences[1].group
+
+
+@pytest.mark.parametrize("variant", ["autocorrelated", "windows"])
+def test_disturbances_that_last_outlast_a_window_and_blame_nobody(tmp_path, variant):
+    truth = generate(small(arm="nothing", variant=variant, n_sequences=6), tmp_path)
+    assert truth["noise"]["correlation"] >= 1.0
+    assert truth["noise"]["amplitude"] > 0
+    assert not [f for s in read(tmp_path) for f in find_faults(s, "crowd")]
+
+
 def test_heterogeneity_has_the_standard_deviation_that_the_truth_tells():
     made = CrowdCase(small("walker_heterogeneity"))
     assert made.scene.eta.std() == pytest.approx(1.0)

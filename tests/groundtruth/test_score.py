@@ -7,8 +7,13 @@ from typing import Any
 
 import pytest
 
-from nnode.groundtruth.score import kin, score
+from nnode.groundtruth import score as scoring
 
+#: Classes as a catalogue states them.
+CLASSES = {
+    "reaction_delay": "late", "inertia": "late", "relative_speed": "ahead",
+    "time_gap": "ahead", "asymmetric_response": "ahead", "speed_zone": "", "speed_period": "",
+}  # fmt: skip
 NAMES = [f"trajectories/s{i:03d}" for i in range(4)]
 
 
@@ -55,22 +60,62 @@ def report(*effects: str, verdict: str = "named", **more: Any) -> dict[str, Any]
     }
 
 
+def score(truth: dict[str, Any], report: dict[str, Any]) -> dict[str, Any]:
+    return scoring.score(truth, report, CLASSES)
+
+
+def listed(name: str, *others: str, verdict: str = "indistinguishable") -> dict[str, Any]:
+    """A report of equals."""
+    found = report(name, verdict=verdict)
+    found["effects"][0]["alternatives"] = [{"name": other, "loss": 1.0} for other in others]
+    return found
+
+
 def test_an_exact_name_is_exact_and_right():
     row = score(truth("relative_speed"), report("relative_speed"))
     assert (row["exact"], row["class_right"], row["right"]) == (True, True, True)
     assert not row["false_names"]
 
 
-def test_kin_and_alternatives_are_of_the_right_class_only():
-    row = score(truth("inertia"), report("reaction_delay"))
-    assert (row["exact"], row["class_right"], row["confidently_wrong"]) == (False, True, True)
-    other = report("multi_anticipation", verdict="indistinguishable")
-    assert not score(truth("inertia"), other)["class_right"]
-    other["effects"][0]["alternatives"] = [{"name": "inertia", "loss": 1.0}]
-    row = score(truth("inertia"), other)
-    assert (row["exact"], row["class_right"], row["confidently_wrong"]) == (False, True, False)
-    assert kin("alignment", "sliding_friction")
-    assert not kin("alignment", "drift")
+@pytest.mark.parametrize(
+    ("found", "equals", "class_right", "false"),
+    [
+        (listed("inertia", "relative_speed"), True, True, []),
+        (listed("relative_speed", "inertia"), True, True, []),
+        (listed("relative_speed", "time_gap"), False, False, ["relative_speed"]),
+        (listed("reaction_delay", "time_gap"), False, True, ["reaction_delay"]),
+    ],
+)
+def test_equals_are_never_exact_and_have_a_measure_of_their_own(found, equals, class_right, false):
+    row = score(truth("inertia"), found)
+    assert (row["exact"], row["right"]) == (False, False)
+    assert (row["among_equals"], row["class_right"]) == (equals, class_right)
+    assert row["false_names"] == false
+
+
+def test_equals_count_under_their_verdict_alone():
+    assert not score(truth("inertia"), report("inertia"))["among_equals"]
+    row = score(truth("inertia"), listed("relative_speed", "inertia", verdict="named"))
+    assert (row["among_equals"], row["false_names"]) == (False, ["relative_speed"])
+
+
+def test_kin_is_what_the_catalogue_says_and_nothing_else():
+    hidden, said = truth("inertia"), report("reaction_delay")
+    assert score(hidden, said)["class_right"]
+    assert not scoring.score(hidden, said, {})["class_right"]
+    # no class is none: two effects without one are no kin
+    assert not score(truth("speed_zone"), report("speed_period"))["class_right"]
+
+
+def test_unconfirmed_effects_are_leads_and_no_names():
+    row = score(truth("relative_speed"), report("relative_speed", verdict="unconfirmed"))
+    assert (row["exact"], row["class_right"], row["right"]) == (False, False, False)
+    assert (row["named"], row["leads"], row["found"]) == ("nothing", "relative_speed", 0)
+    assert row["lead_exact"]
+    wrong = score(truth("relative_speed"), report("speed_zone", verdict="unconfirmed"))
+    assert (wrong["lead_exact"], wrong["false_names"]) == (False, [])
+    idle = score(truth(arm="nothing"), report("speed_zone", verdict="unconfirmed"))
+    assert (idle["right"], idle["leads"]) == (True, "speed_zone")
 
 
 def test_a_further_name_is_false():
@@ -101,8 +146,11 @@ def test_heterogeneous_drivers_may_be_named_where_they_are():
 def test_what_the_catalogue_lacks_is_to_be_called_unknown():
     outside = truth(arm="outside")
     assert score(outside, report(verdict="unknown"))["right"]
-    row = score(outside, report("speed_zone"))
-    assert (row["right"], row["confidently_wrong"], row["exact"]) == (False, True, None)
+    # whatever the verdict, its first sentence names something
+    for verdict in ("named", "indistinguishable", "unknown"):
+        row = score(outside, report("speed_zone", verdict=verdict))
+        assert (row["right"], row["false_names"]) == (False, ["speed_zone"])
+        assert (row["exact"], row["unknown"]) == (None, False)
 
 
 def test_without_excitation_an_effect_is_to_be_called_not_testable():
@@ -110,6 +158,7 @@ def test_without_excitation_an_effect_is_to_be_called_not_testable():
     assert not score(still, report(verdict="none"))["right"]
     assert score(still, report(verdict="none", not_testable=["inertia"]))["right"]
     assert not score(still, report("inertia", not_testable=["inertia"]))["right"]
+    assert not score(still, report("time_gap", not_testable=["inertia"]))["right"]
 
 
 @pytest.mark.parametrize(
@@ -128,11 +177,43 @@ def test_a_fault_is_located_by_sequence_agent_and_time(found, located, false):
         "kind": "jump", "sequence": NAMES[1], "agents": ["s001v2", "s001v3"], "places": [2, 3],
         "time": 10.0,
     }  # fmt: skip
-    row = score(
-        truth(arm="fault", data_faults=[hidden]), report(verdict="data_fault", data_faults=[found])
-    )
+    said = report(verdict="none", data_faults=[found])
+    row = score(truth(arm="fault", data_faults=[hidden]), said)
     assert (row["faults_hidden"], row["faults_located"], row["faults_false"]) == (1, located, false)
     assert row["right"] == bool(located)
+    both = report(verdict="none", data_faults=[found, {**hidden, "sequence": NAMES[3]}, hidden])
+    row = score(truth(arm="fault", data_faults=[hidden]), both)
+    assert (row["faults_located"], row["faults_false"], row["right"]) == (1, 1 + false, False)
+
+
+def test_a_sound_sequence_that_is_blamed_makes_nothing_hidden_wrong():
+    found = {"sequence": "s001", "agents": ["s001v2"], "time": 1.0}
+    row = score(truth(arm="nothing"), report(verdict="none", data_faults=[found]))
+    assert (row["faults_false"], row["right"]) == (1, False)
+
+
+@pytest.mark.parametrize(
+    ("p_value", "effect", "false"),
+    [
+        (0.04, "inertia", True),
+        (0.06, "inertia", False),
+        (0.04, "driver_heterogeneity", False),
+        (None, None, None),
+    ],
+)
+def test_the_first_screen_is_kept_with_its_clusters(p_value, effect, false):
+    quiet = truth(arm="nothing")
+    quiet["nuisance"] = [{"name": "driver_heterogeneity", "coefficients": {}}]
+    found = report(
+        verdict="none",
+        screen={"p_value": p_value, "effect": effect, "clusters": 15, "floor": 2**-15},
+        clusters={"open": 15, "sealed": 5},
+        confirmation={"p_value": 0.3, "clusters": 5, "confirmed": False, "reason": ""},
+    )
+    row = score(quiet, found)
+    assert (row["screen_p"], row["screen_effect"], row["screen_false"]) == (p_value, effect, false)
+    assert (row["clusters_open"], row["clusters_sealed"]) == (15, 5)
+    assert (row["confirmed"], row["confirmation_p"]) == (False, 0.3)
 
 
 def test_coefficients_are_compared_with_regard_to_what_means_no_effect():
@@ -165,6 +246,8 @@ def test_closure_is_measured_on_the_sealed_sequences():
     row = score(truth("relative_speed"), found)
     assert row["worse"]
     assert row["closure"] == pytest.approx(-0.1 / 0.9)
+    # an extension that is not confirmed is not handed over
+    assert not score(truth("relative_speed"), {**found, "verdict": "unconfirmed"})["worse"]
 
 
 def test_crowds_compare_shares_where_they_cannot_be_simulated_again():
@@ -177,4 +260,4 @@ def test_crowds_compare_shares_where_they_cannot_be_simulated_again():
 
 
 def test_nothing_hidden_has_no_closure():
-    assert score(truth(arm="nothing"), report(verdict="none"))["closure"] is None
+    assert score(truth(arm="nothing", cost=None), report(verdict="none"))["closure"] is None

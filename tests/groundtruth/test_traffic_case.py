@@ -15,7 +15,7 @@ from nnode.data.quality import find_faults
 from nnode.data.table import read_table
 from nnode.errors import ConfigError
 from nnode.groundtruth import Case, generate
-from nnode.groundtruth.arms import cases
+from nnode.groundtruth.arms import cases, first_seed
 from nnode.groundtruth.case import TABLE, TRUTH
 from nnode.groundtruth.traffic import TrafficCase
 from nnode.groundtruth.traffic_catalogue import CATALOGUE, EFFECTS
@@ -145,6 +145,55 @@ def test_inserted_faults_are_where_the_truth_says(tmp_path, kind):
             assert step.max() > 8.0
 
 
+def test_windows_keep_names_and_clock_so_that_platoons_stay_clusters(tmp_path):
+    whole = small(arm="nothing", variant="windows", strength="full", n_sequences=2)
+    generate(whole, tmp_path)
+    sequences = read(tmp_path)
+    assert [s.name for s in sequences] == whole.names
+    assert [s.name.split("/")[1] for s in sequences[:4]] == ["s000w0", "s000w1", "s000w2", "s001w0"]
+    first, second, third, other = sequences[:4]
+    assert first.agents == second.agents == third.agents
+    assert not set(first.agents) & set(other.agents)
+    # one clock, and no sample twice
+    assert second.time[0] - first.time[-1] == pytest.approx(whole.dt)
+    assert first.time[-1] - first.time[0] == pytest.approx(10 - whole.dt)
+    # nobody jumps from one window to the next
+    assert np.all(second.x[0] - first.x[-1] > 0)
+    assert np.all(second.x[0] - first.x[-1] < 8)
+
+
+def test_a_recording_is_two_streams_that_hang_together(tmp_path):
+    (case,) = cases("traffic", "nothing", seeds=[0], variants=["recording"])
+    assert (case.n_sequences, case.n_agents, case.duration, case.sigma) == (2, 24, 90.0, 0.1)
+    truth = generate(case, tmp_path)
+    assert truth["noise"]["correlation"] == 6.0
+    sequences = read(tmp_path)
+    assert [len(s.agents) for s in sequences] == [8] * 54
+    assert {s.x.shape for s in sequences} == {(50, 8, 1)}
+    assert len({agent for s in sequences for agent in s.agents}) == 48
+    parts = [set(s.agents) for s in sequences]
+    clusters = []
+    while parts:
+        one = parts.pop()
+        while near := [part for part in parts if part & one]:
+            one |= set().union(*near)
+            parts = [part for part in parts if part not in near]
+        clusters.append(one)
+    assert [len(one) for one in clusters] == [24, 24]
+
+
+def test_nothing_hidden_is_not_replayed(tmp_path, monkeypatch):
+    monkeypatch.setattr(TrafficCase, "costs", None)
+    case = small(arm="nothing", variant="heterogeneous", strength="full")
+    truth = generate(case, tmp_path)
+    assert (truth["cost"], truth["strength"]["reached"]) == (None, None)
+
+
+def test_what_is_hidden_is_not_cut_into_windows():
+    with pytest.raises(ConfigError, match="variant=windows of arm=single with 1 effect"):
+        small("inertia", variant="windows")
+
+
 def test_other_cases_hold_no_fault(tmp_path):
     for i, case in enumerate(cases("traffic", "nothing", seeds=[0], noises=[0.3], sizes=[6])):
         generate(case, tmp_path / str(i))
@@ -164,3 +213,11 @@ def test_unknown_words_are_refused():
         TrafficCase(small("telepathy"))
     with pytest.raises(ConfigError, match="arm=solo"):
         cases("traffic", "solo", seeds=[0])
+
+
+def test_seeds_follow_from_the_hash_of_a_commit():
+    # printf '0%.0s' {1..40} | sha256sum
+    assert first_seed("0" * 40) == 0x9692E67
+    for wrong in ("0" * 7, "0" * 41, "A" * 40):
+        with pytest.raises(ConfigError, match="is no full hash of a commit"):
+            first_seed(wrong)

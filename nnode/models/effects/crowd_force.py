@@ -99,6 +99,7 @@ class EvasiveRotation(ForceEffect):
     formula = "sum over j of (R(theta (1 - e_i·e_j)/2) - 1) f_ij"
     source = "Totzeck 2020 (an angle proportional to gamma there)"
     strengths = {"theta": Strength(0.0, 0.1, Interval(-1.6, 1.6), "rad", usual=0.3)}
+    kin = "avoidance_side"
     separated_by = "encounters passed on the left as well as on the right, head on and crossing"
 
     theta: Tensor
