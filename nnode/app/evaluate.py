@@ -71,7 +71,7 @@ def choose(store: Store, checkpoint: Checkpoint, part: str) -> tuple[str, list[i
 def _cutting(manifest: dict[str, Any]) -> dict[str, Any]:
     """The options that decide how files become sequences, whichever of them are kept."""
     options = dict(manifest.get("options", {}))
-    for key in ("recording", "faults", "path", "name", *NOT_PREPARATION):
+    for key in ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION):
         options.pop(key, None)
     return options
 

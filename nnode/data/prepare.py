@@ -19,6 +19,7 @@ from omegaconf.errors import MissingMandatoryValue
 from nnode.data.download import sha256
 from nnode.data.esimas import esimas_files, read_esimas
 from nnode.data.highd import highd_files, read_highd
+from nnode.data.identity import identify
 from nnode.data.juelich import juelich_files, read_juelich
 from nnode.data.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
 from nnode.data.options import (
@@ -139,9 +140,19 @@ def _prepared(
         faults[s.name] = find_faults(s, domain)
         stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
+    # faults are told with the source's own identifiers, and of faulty sequences they are looked
+    # at as well: through them one of those agents may go on
+    agents, notes = identify(sequences, domain, options.agents)
+    unique = {s.name: replace(s, agents=own) for s, own in zip(sequences, agents, strict=True)}
+    kept = [unique[s.name] for s in kept]
+    if notes:
+        more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
+        log.info("%s%s; data.agents decides by hand", notes[0], more)
     manifest = {
         "package": {"name": "nnode", "version": VERSION},
+        "reader": type(options).__name__,
         "options": plain(options),
+        "identifiers": notes,
         "domain": domain,
         "dt": _interval(kept),
         "files": {key: {"name": path.name, "sha256": sha256(path)} for key, path in files.items()},
