@@ -274,6 +274,25 @@ def _end(s: Sequence, n: int, which: int) -> np.ndarray:
     return known[which] if len(known) else np.full(x.shape[1], np.nan)
 
 
+def given_anew(time: np.ndarray, x: np.ndarray, other: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Behind which rows of a road an identifier is another vehicle's.
+
+    Such are the holes over which no vehicle can have driven, and those that last longer than any
+    vehicle is in view without one: by then it has left the road in view.
+
+    Args:
+        time: ``(rows,)`` s, ascending for each identifier, one identifier after the other.
+        x: ``(rows,)`` m.
+        other: ``(rows - 1,)`` whether the next row has another identifier.
+        hole: ``(rows - 1,)`` whether the next row is the same one's after a hole.
+    """
+    first = np.concatenate([[0], np.flatnonzero(other | hole) + 1])
+    last = np.append(first[1:] - 1, len(time) - 1)
+    gap = np.diff(time)
+    can = reachable(x[:-1, None], x[1:, None], gap, "traffic")
+    return np.asarray(hole & (~can | (gap > (time[last] - time[first]).max())))
+
+
 def reachable(
     start: np.ndarray, end: np.ndarray, gap: np.ndarray | float, domain: Domain
 ) -> np.ndarray:

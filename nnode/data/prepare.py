@@ -22,11 +22,13 @@ from nnode.data.highd import highd_files, read_highd
 from nnode.data.identity import identify
 from nnode.data.juelich import juelich_files, read_juelich
 from nnode.data.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
+from nnode.data.ngsim import read_ngsim
 from nnode.data.options import (
     DataOptions,
     EsimasOptions,
     HighDOptions,
     JuelichOptions,
+    NgsimOptions,
     SumoOptions,
     TableOptions,
     VehicleTableOptions,
@@ -78,6 +80,7 @@ def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any]
 FORMATS: dict[type[DataOptions], Format] = {
     EsimasOptions: Format(esimas_files, _each(read_esimas)),
     VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
+    NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
     JuelichOptions: Format(juelich_files, _each(read_juelich)),
     TableOptions: Format(
         table_files, lambda files, options: read_table(files[TABLE], options, files.get(WALLS))

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.identity import identify
+from nnode.data.identity import given_anew, identify
 from nnode.data.options import Agents, Faults, SplitOptions, TableOptions
 from nnode.data.prepare import prepare
 from nnode.data.quality import LIMITS
@@ -145,6 +145,25 @@ def test_an_identifier_that_is_given_to_another_vehicle_later() -> None:
         "run: 1 identifiers are used again for another agent, who cannot have come from where the "
         "one before was (such as 4, another one from 7 s on in run/late)"
     )
+
+
+@pytest.mark.parametrize(
+    ("gap", "end", "another"),
+    [
+        (2.0, 120.0, False),  # 10 m/s on
+        (2.0, 96.0, False),  # further back, but within the reach of a path
+        (2.0, 94.0, True),
+        (2.0, 226.0, True),  # faster than 60 m/s
+        (9.9, 200.0, False),
+        (10.1, 200.0, True),  # nobody is in view for more than 10 s
+    ],
+)
+def test_holes_in_a_vehicle_s_record(gap: float, end: float, another: bool) -> None:
+    time = np.array([0.0, 5.0, 5.0 + gap, 6.0 + gap, 0.0, 10.0])
+    x = np.array([50.0, 100.0, end, end + 10, 0.0, 100.0])
+    other, hole = np.zeros((2, 5), dtype=bool)
+    other[3] = hole[1] = True
+    assert given_anew(time, x, other, hole).tolist() == [False, another, False, False, False]
 
 
 def test_a_number_that_is_a_name_already_is_not_given() -> None:
