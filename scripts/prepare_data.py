@@ -9,10 +9,11 @@ Examples:
   # your own files
   python scripts/prepare_data.py data=table data.path=mine.csv data.domain=traffic
   python scripts/prepare_data.py data=vehicles data.path=FILE 'data.columns={vehicle: id, x: pos}'
+  python scripts/prepare_data.py data=ngsim data.path=FILE
   python scripts/prepare_data.py data=sumo data.path=fcd.xml
 
 Results: the sequences, manifest.json, and pictures of those with faults. Train with
-data.prepared=FOLDER.
+data.prepared=FOLDER, and no other option of the data.
 """
 
 from nnode.app.cli import run

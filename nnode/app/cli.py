@@ -19,6 +19,7 @@ from nnode.app.flags import read_command_line
 from nnode.app.help import help_text
 from nnode.app.launchers import check_launcher, has_no_part, out_of_sight
 from nnode.app.overrides import check_overrides
+from nnode.app.prepared import prepared_group
 from nnode.app.sweep import failures, record_failure
 from nnode.calibrate.distributed import World, join
 from nnode.calibrate.interrupt import Interrupted
@@ -84,8 +85,9 @@ def _arguments(
         sys.exit()
     given = line.overrides
     asked = "--help" in line.flags
-    if inject is not None and not asked:
-        extra = inject(given)
+    if not asked:
+        extra = prepared_group(given, folder, name)
+        extra += inject([*given, *extra]) if inject is not None else []
         first = sys.argv.index(given[0], 1) if given else len(sys.argv)
         sys.argv[first:first] = extra
         given = extra + given

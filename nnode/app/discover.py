@@ -15,6 +15,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.given import Table, model_options, table_options
+from nnode.app.prepared import with_prepared
 from nnode.app.saved import plain_config
 from nnode.app.train import brief, set_threads
 from nnode.app.typed import changes, group_defaults, shell_override
@@ -83,6 +84,7 @@ def discover(config: DictConfig, folder: Path) -> None:
     start = time.monotonic()
     with BreakingGuard() as guard:
         try:
+            config = with_prepared(config)
             plain = plain_config(config)
             options = cast(DiscoverOptions, OmegaConf.to_object(config.discover))
             data = cast(DataOptions, OmegaConf.to_object(config.data))
@@ -175,8 +177,9 @@ def _job(
     check_options(options, system.domain)  # type: ignore[arg-type]
     check_model(system)
     inputs = read_inputs(data, folder / "data")
-    # what the extended model is trained and tested on are the sequences without a fault
-    plain_data = {**plain_data, "faults": Faults.drop.value}
+    if data.prepared is None:  # a folder is taken as it is
+        # what the extended model is trained and tested on are the sequences without a fault
+        plain_data = {**plain_data, "faults": Faults.drop.value}
     seconds = time.monotonic() - start
     return Job(model, plain_data, groups, system, inputs, options, seconds)
 

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from nnode.app.prepared import with_prepared
 from nnode.app.saved import merge_saved
 from nnode.app.train import build_solver, set_threads, source_hashes, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
@@ -71,7 +72,7 @@ def choose(store: Store, checkpoint: Checkpoint, part: str) -> tuple[str, list[i
 def _cutting(manifest: dict[str, Any]) -> dict[str, Any]:
     """The options that decide how files become sequences, whichever of them are kept."""
     options = dict(manifest.get("options", {}))
-    for key in ("recording", "faults", "path", "name", *NOT_PREPARATION):
+    for key in ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION):
         options.pop(key, None)
     return options
 
@@ -83,7 +84,7 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
         NNodeError: no such checkpoint, no such data, or data of another domain.
     """
     checkpoint = load_checkpoint(config.checkpoint)
-    config = merge_saved(config, checkpoint.config, ("data", "solver"))
+    config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
     data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)

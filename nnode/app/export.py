@@ -14,6 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.evaluate import choose
+from nnode.app.prepared import with_prepared
 from nnode.app.saved import merge_saved, path_given, saved_groups
 from nnode.app.train import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
@@ -94,7 +95,7 @@ def export(config: DictConfig, folder: Path) -> None:
         NNodeError: no such run or data, an unknown target, or one that the model does not have.
     """
     checkpoint = load_checkpoint(checkpoint_of(config.run))
-    config = merge_saved(config, checkpoint.config, ("data", "solver"))
+    config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
     model = checkpoint.build()
     targets = targets_of(config.to, model)
     if config.trajectories not in SOURCES:

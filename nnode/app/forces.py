@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.app.prepared import with_prepared
 from nnode.app.saved import merge_saved
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.options import DataOptions
@@ -69,7 +70,7 @@ def plot_forces(config: DictConfig, folder: Path) -> None:
 def _traffic(
     models: dict[str, System], config: DictConfig, first: Checkpoint, folder: Path
 ) -> list[Path]:
-    merged = merge_saved(config, first.config, ("data",))
+    merged = with_prepared(merge_saved(config, first.config, ("data",)))
     data: DataOptions = OmegaConf.to_object(merged.data)  # type: ignore[assignment]
     try:
         store = open_data(data, folder / "data")

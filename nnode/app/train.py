@@ -13,6 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
+from nnode.app.prepared import with_prepared
 from nnode.app.saved import merge_saved, plain_config, refuse_changes
 from nnode.app.sweep import RESULT
 from nnode.app.typed import shell_override
@@ -162,8 +163,10 @@ def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:
     resume = config.resume
     if resume is not None:
         checkpoint = load_checkpoint(resume)
-        config = merge_saved(config, checkpoint.config, SECTIONS)
+        config = with_prepared(merge_saved(config, checkpoint.config, SECTIONS))
         refuse_changes(plain_config(config), checkpoint.config, RESUMABLE)
+    else:
+        config = with_prepared(config)
     _check(config)
     return config, checkpoint
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,13 +21,16 @@ class Table:
 
     Args:
         path: the table; ``.parquet`` or ``.pq`` is read as Parquet, all else as CSV.
+        names: of the columns of a CSV without a line of names.
+        csv: further options of :func:`pandas.read_csv`.
 
     Raises:
         DataError: no such file, an empty one, or one that is not of its format.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, names: list[str] | None = None, **csv: Any) -> None:
         self.path = path
+        self._first = 2 if names is None else 1
         self.parquet = path.suffix.lower() in (".parquet", ".pq")
         if not path.is_file():
             raise DataError(f"there is no table {path}; set data.path, or data.source, to it")
@@ -35,7 +39,10 @@ class Table:
                 frame = pd.read_parquet(path).reset_index(drop=True)
             else:
                 # Blank lines are kept at first, so that row numbers are those of the file.
-                frame = pd.read_csv(path, low_memory=False, skip_blank_lines=False)
+                how: dict[str, Any] = {"low_memory": False, "skip_blank_lines": False, **csv}
+                if names is not None:
+                    how["names"] = names
+                frame = pd.read_csv(path, **how)
         except pd.errors.EmptyDataError as error:
             raise DataError(f"{path} is empty; expected a line of column names and rows") from error
         except Exception as error:  # a damaged file leads to almost any error
@@ -146,7 +153,7 @@ class Table:
     def row(self, i: int) -> str:
         """Where the i-th row stands in the file, in words."""
         index = int(self.frame.index[i])
-        return f"row {index + 1}" if self.parquet else f"line {index + 2}"
+        return f"row {index + 1}" if self.parquet else f"line {index + self._first}"
 
     def _listing(self) -> str:
         return ", ".join(self.frame.columns) or "none"

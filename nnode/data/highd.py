@@ -77,7 +77,7 @@ def read_highd(files: dict[str, Path], options: HighDOptions) -> list[Sequence]:
         length=length,
         kind=kind,
     )
-    return cut_vehicles(rows, options, files[TRACKS].name.removesuffix(TRACKS))
+    return cut_vehicles({files[TRACKS].name.removesuffix(TRACKS): rows}, options)
 
 
 def _rate(path: Path) -> float:

@@ -17,6 +17,17 @@ class Faults(str, Enum):
     error = "error"
 
 
+#: Whose name an identifier is, see :mod:`nnode.data.identity`: ``auto`` looks at what it names,
+#: ``sequence`` takes it for another agent in every sequence, ``global`` for one agent throughout
+#: its recording. Not written as a class: ``global`` is a word of Python's own.
+Agents = Enum(
+    "Agents",
+    {"auto": "auto", "sequence": "sequence", "global": "global"},
+    type=str,
+    module=__name__,
+)
+
+
 class SplitMode(str, Enum):
     """How held-out sequences are chosen: see :mod:`nnode.data.split`."""
 
@@ -69,6 +80,8 @@ class DataOptions:
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop
+    # auto | sequence | global: whether one identifier in two sequences of a recording is one agent
+    agents: Agents = Agents.auto
     split: SplitOptions = field(default_factory=SplitOptions)
     loader: LoaderOptions = field(default_factory=LoaderOptions)
 
@@ -95,6 +108,15 @@ class LaneOptions(DataOptions):
     min_vehicles: int = 3  # fewest vehicles of a platoon
     min_samples: int = 3  # fewest points of the time grid
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    # s, window of the local cubics that smooth positions and give speeds; null: as measured
+    smooth: float | None = None
+
+
+@dataclass
+class NgsimOptions(LaneOptions):
+    """NGSIM's public trajectories of freeways, in feet and ms, as they are published."""
+
+    name: str = "ngsim"
 
 
 @dataclass

@@ -7,17 +7,22 @@ in which the same vehicles are in view.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from nnode.data.options import LaneOptions
+from nnode.data.identity import given_anew, numbered
+from nnode.data.options import Agents, LaneOptions
 from nnode.data.recordings import check_known, positive, wanted
 from nnode.data.sequence import Sequence
+from nnode.data.smooth import smooth
 from nnode.errors import ConfigError, DataError
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +72,9 @@ class _Stint:
 
 
 def cut_vehicles(
-    rows: Vehicles, options: LaneOptions, stem: str, lane_word: str = "lane"
+    recordings: Mapping[str, Vehicles], options: LaneOptions, lane_word: str = "lane"
 ) -> list[Sequence]:
-    """Cut a recording into sequences.
+    """Cut a file's recordings into sequences.
 
     Without ``window`` a sequence is a maximal interval during which the same vehicles are in
     view. With it, time is cut into consecutive windows that share their boundary sample, and a
@@ -78,9 +83,8 @@ def cut_vehicles(
     its leader.
 
     Args:
-        rows: the recording.
+        recordings: by name, to which ``_`` and the lane are added.
         options: lanes, time grid and the way of cutting, checked by :func:`check_cutting`.
-        stem: name of the recording, to which ``_`` and the lane are added.
         lane_word: stands before the lane's name.
 
     Returns:
@@ -90,21 +94,26 @@ def cut_vehicles(
         ConfigError: an unknown lane or recording.
         DataError: one vehicle twice at one time, or no sequence at all.
     """
-    lanes = _stints(rows, options)
-    recordings = {f"{stem}_{lane_word}{lane}" if lane else stem: lane for lane in lanes}
+    chosen = _lanes(options, recordings.values())
+    lanes = {
+        f"{stem}_{lane_word}{lane}" if lane else stem: stints
+        for stem, rows in recordings.items()
+        for lane, stints in _stints(rows, options, chosen, stem).items()
+    }
     asked = wanted(options.recording)
     if asked is not None:
-        check_known(asked, recordings)
-        recordings = {name: recordings[name] for name in asked}
+        check_known(asked, lanes)
+        lanes = {name: lanes[name] for name in asked}
     found = [
         _sequence(f"{name}/{number:03d}", name, platoon, first, last, options.dt)
-        for name, lane in recordings.items()
-        for number, (platoon, first, last) in enumerate(_cut(lanes[lane], options))
+        for name, stints in lanes.items()
+        for number, (platoon, first, last) in enumerate(_cut(stints, options))
     ]
     if not found:
         vehicles = {stint.vehicle for stints in lanes.values() for stint in stints}
+        path = next(iter(recordings.values())).path
         raise DataError(
-            f"{rows.path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
+            f"{path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
             f"lane for {options.min_samples} samples of {options.dt:g} s"
             + (f" throughout a window of {options.window:g} s" if options.window else "")
             + f" ({len(vehicles)} vehicles, {len(lanes)} lanes); lower data.min_vehicles, "
@@ -121,6 +130,8 @@ def check_cutting(options: LaneOptions) -> None:
     """
     positive("dt", options.dt)
     positive("max_hole", options.max_hole)
+    if options.smooth is not None:
+        positive("smooth", options.smooth)
     if options.min_vehicles < 1 or options.min_samples < 1:
         raise ConfigError("data.min_vehicles and data.min_samples must be at least 1")
     if options.window is not None:
@@ -137,51 +148,63 @@ def check_cutting(options: LaneOptions) -> None:
             )
 
 
-def _lanes(options: LaneOptions, rows: Vehicles) -> list[str]:
-    if rows.lane is None:
-        if options.lane is not None:
+def _lanes(options: LaneOptions, recordings: Iterable[Vehicles]) -> list[str]:
+    present: set[str] = set()
+    for rows in recordings:
+        if rows.lane is None and options.lane is not None:
             raise ConfigError(
                 f"data.lane={options.lane}, but {rows.path} has no lane column; set "
                 "data.columns.lane or data.lane=null"
             )
-        return [""]
-    present = sorted(set(rows.lane), key=lambda name: (len(name), name))
+        present |= {""} if rows.lane is None else set(rows.lane)
+    known = sorted(present, key=lambda name: (len(name), name))
     if options.lane is None:
-        return present
+        return known
     chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
     names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
     for name in names:
         if name not in present:
             raise ConfigError(
-                f"data.lane={name}: {rows.path} has the lanes {', '.join(present[:20])}"
+                f"data.lane={name}: {rows.path} has the lanes {', '.join(known[:20])}"
             )
     return names
 
 
-def _stints(recording: Vehicles, options: LaneOptions) -> dict[str, list[_Stint]]:
+def _stints(
+    recording: Vehicles, options: LaneOptions, lanes: list[str], stem: str
+) -> dict[str, list[_Stint]]:
     """Every vehicle's stays by lane, on the reference time grid."""
-    lanes = _lanes(options, recording)
-    vehicle, time, x, lane = recording.vehicle, recording.time, recording.x, recording.lane
-    speed, length, kind = recording.speed, recording.length, recording.kind
+    vehicle, lane = recording.vehicle, recording.lane
+    length, kind = recording.length, recording.kind
     ids, code = np.unique(vehicle.astype(str), return_inverse=True)
-    order = np.lexsort((time, code))
-    step = np.diff(time[order])
-    same = np.diff(code[order]) == 0
-    twice = np.flatnonzero(same & (step <= 0))
+    order = np.lexsort((recording.time, code))
+    time, x, code = recording.time[order], recording.x[order], code[order]
+    speed = None if recording.speed is None else recording.speed[order]
+    step, other = np.diff(time), np.diff(code) != 0
+    twice = np.flatnonzero(~other & (step <= 0))
     if twice.size:
         i, j = sorted(order[twice[0] : twice[0] + 2])
         raise DataError(
-            f"{recording.path}, {recording.row(j)}: vehicle {vehicle[j]} at time {time[j]:g} s "
-            f"stands there a second time (first in {recording.row(i)}); expected one row per "
-            "vehicle and time"
+            f"{recording.path}, {recording.row(j)}: vehicle {vehicle[j]} at time "
+            f"{recording.time[j]:g} s stands there a second time (first in {recording.row(i)}); "
+            "expected one row per vehicle and time"
         )
-    cut = ~same | (step > options.max_hole + 1e-9)
+    hole = ~other & (step > options.max_hole + 1e-9)
+    number = np.ones(len(order), dtype=int)
+    if options.agents is Agents.auto:
+        number = _numbers(ids[code], time, x, other, hole, stem)
+    taken = set(ids)
+    if options.smooth is not None:
+        x, speed = _smoothed(time, x, other | hole, options.smooth)
+    cut = other | hole
     if lane is not None:
         cut |= lane[order][1:] != lane[order][:-1]
     names_of_kinds = {str(code): str(name) for code, name in dict(options.kinds).items()}
-    found: dict[str, list[_Stint]] = {name: [] for name in lanes}
-    for rows in np.split(order, np.flatnonzero(cut) + 1):
-        place = "" if lane is None else lane[rows[0]]
+    present = {""} if lane is None else set(lane)
+    found: dict[str, list[_Stint]] = {name: [] for name in lanes if name in present}
+    for rows in np.split(np.arange(len(order)), np.flatnonzero(cut) + 1):
+        i = order[rows[0]]
+        place = "" if lane is None else lane[i]
         if place not in found:
             continue
         first = int(np.ceil(time[rows[0]] / options.dt - 1e-6))
@@ -189,18 +212,49 @@ def _stints(recording: Vehicles, options: LaneOptions) -> dict[str, list[_Stint]
         if last < first:
             continue
         grid = np.arange(first, last + 1) * options.dt
-        code_of_kind = "" if kind is None else kind[rows[0]]
+        code_of_kind = "" if kind is None else kind[i]
         found[place].append(
             _Stint(
-                vehicle=str(ids[code[rows[0]]]),
+                vehicle=numbered(str(ids[code[rows[0]]]), int(number[rows[0]]), taken),
                 first=first,
                 x=np.interp(grid, time[rows], x[rows]),
                 speed=None if speed is None else np.interp(grid, time[rows], speed[rows]),
-                length=np.nan if length is None else float(length[rows[0]]),
+                length=np.nan if length is None else float(length[i]),
                 kind=None if kind is None else names_of_kinds.get(code_of_kind, code_of_kind),
             )
         )
     return found
+
+
+def _numbers(
+    ids: np.ndarray, time: np.ndarray, x: np.ndarray, other: np.ndarray, hole: np.ndarray, stem: str
+) -> np.ndarray:
+    """Each row's vehicle among those of its identifier, counted from 1."""
+    new = given_anew(time, x, other, hole)
+    if new.any():
+        row = int(np.flatnonzero(new)[0]) + 1
+        log.info(
+            "%s: %d identifiers are used again for another vehicle, after a time or over a "
+            "distance that are none of one vehicle (such as %s, another one from %g s on); "
+            "data.agents=global takes them as they stand",
+            stem, len(set(ids[1:][new])), ids[row], time[row],
+        )  # fmt: skip
+    so_far = np.concatenate([[0], np.cumsum(new)])
+    start = np.concatenate([[0], np.where(other, np.arange(1, len(ids)), 0)])
+    return np.asarray(1 + so_far - so_far[np.maximum.accumulate(start)])
+
+
+def _smoothed(
+    time: np.ndarray, x: np.ndarray, cut: np.ndarray, window: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and speeds, every record without a hole by itself."""
+    parts = [
+        smooth(time[rows], x[rows], window)
+        for rows in np.split(np.arange(len(time)), np.flatnonzero(cut) + 1)
+    ]
+    speed = np.concatenate([v for _, v in parts])
+    # a vehicle that stands shall not roll back
+    return np.concatenate([own for own, _ in parts]), np.maximum(speed, 0.0)
 
 
 _Platoon = tuple[list[_Stint], int, int]

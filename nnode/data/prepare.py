@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,13 +19,16 @@ from omegaconf.errors import MissingMandatoryValue
 from nnode.data.download import sha256
 from nnode.data.esimas import esimas_files, read_esimas
 from nnode.data.highd import highd_files, read_highd
+from nnode.data.identity import identify
 from nnode.data.juelich import juelich_files, read_juelich
 from nnode.data.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
+from nnode.data.ngsim import read_ngsim
 from nnode.data.options import (
     DataOptions,
     EsimasOptions,
     HighDOptions,
     JuelichOptions,
+    NgsimOptions,
     SumoOptions,
     TableOptions,
     VehicleTableOptions,
@@ -77,6 +80,7 @@ def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any]
 FORMATS: dict[type[DataOptions], Format] = {
     EsimasOptions: Format(esimas_files, _each(read_esimas)),
     VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
+    NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
     JuelichOptions: Format(juelich_files, _each(read_juelich)),
     TableOptions: Format(
         table_files, lambda files, options: read_table(files[TABLE], options, files.get(WALLS))
@@ -139,9 +143,19 @@ def _prepared(
         faults[s.name] = find_faults(s, domain)
         stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
+    # faults are told with the source's own identifiers, and of faulty sequences they are looked
+    # at as well: through them one of those agents may go on
+    agents, notes = identify(sequences, domain, options.agents)
+    unique = {s.name: replace(s, agents=own) for s, own in zip(sequences, agents, strict=True)}
+    kept = [unique[s.name] for s in kept]
+    if notes:
+        more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
+        log.info("%s%s; data.agents decides by hand", notes[0], more)
     manifest = {
         "package": {"name": "nnode", "version": VERSION},
+        "reader": type(options).__name__,
         "options": plain(options),
+        "identifiers": notes,
         "domain": domain,
         "dt": _interval(kept),
         "files": {key: {"name": path.name, "sha256": sha256(path)} for key, path in files.items()},
@@ -161,32 +175,70 @@ def open_data(options: DataOptions, folder: Path | str) -> Store:
     """The prepared data that options ask for.
 
     Args:
-        options: with ``prepared`` set, that folder is opened; otherwise data are prepared.
+        options: with ``prepared`` set, that folder is opened as it is, and nothing else needs to
+            be said; otherwise data are prepared.
         folder: where they are prepared, without plots.
 
     Raises:
-        ConfigError: ``prepared`` holds data that were prepared with other options; names them.
+        ConfigError: ``prepared`` holds data that were prepared with other options than those
+            that are not left at their defaults; names them.
         DataError, FaultError: see :func:`prepare`; or ``prepared`` holds no sound store.
     """
     options = _as_dataclass(options)
     if options.prepared is None:
         return prepare(options, folder)
     store = Store(Path(options.prepared).expanduser())
-    before = _preparation(store.manifest.get("options", {}))
-    now = _preparation(plain(options))
-    absent = object()
-    differing = [
-        f"data.{key}={before.get(key, 'not known')} then, {now.get(key, 'not known')} now"
-        for key in sorted({*before, *now})
-        if before.get(key, absent) != now.get(key, absent)
-    ]
-    if differing:
+    if (made := made_by(store)) is not type(options):
         raise ConfigError(
-            f"data.prepared={options.prepared} was prepared with other options: "
-            f"{'; '.join(differing)}. Set them back, prepare the data again, or set "
-            "data.prepared=null to prepare on the fly"
+            f"data.prepared={options.prepared} holds data of {made.__name__}, the options are "
+            f"{type(options).__name__}; give {made.__name__}(prepared=...)"
         )
+    usual = plain(type(options)())
+    asked = {key: value for key, value in plain(options).items() if value != usual[key]}
+    refuse_others(store, asked)
     return store
+
+
+def made_by(store: Store) -> type[DataOptions]:
+    """The class of the options that a store was prepared with.
+
+    Raises:
+        ConfigError: a store of an earlier version, which did not note it.
+    """
+    name = store.manifest.get("reader")
+    found = next((kind for kind in FORMATS if kind.__name__ == name), None)
+    if found is None:
+        raise ConfigError(
+            f"{store.folder} does not tell which of nnode's readers prepared it (found {name!r}); "
+            "prepare the data again, or set data.prepared=null to prepare on the fly"
+        )
+    return found
+
+
+def refuse_others(store: Store, asked: Mapping[str, Any]) -> None:
+    """Refuse options that a store was not prepared with.
+
+    Args:
+        store: prepared.
+        asked: plain values by the option's name, dots within it reach into mappings.
+
+    Raises:
+        ConfigError: names the options, what the store has, and what to do.
+    """
+    made = OmegaConf.create(_told(store.manifest.get("options", {})))
+    differing = []
+    for key, value in _told(asked).items():
+        has = OmegaConf.select(made, key)
+        has = OmegaConf.to_container(has) if OmegaConf.is_config(has) else has
+        if value != has:
+            differing.append((key, has, value))
+    if differing:
+        what = "; ".join(f"data.{k}={has} then, {value} now" for k, has, value in differing)
+        names = ", ".join(f"data.{key}" for key, _, _ in differing)
+        raise ConfigError(
+            f"{store.folder} was prepared with other options: {what}. Leave out {names} to take "
+            "the folder as it is, or data.prepared to prepare the data anew"
+        )
 
 
 def plain(options: DataOptions) -> dict[str, Any]:
@@ -213,13 +265,13 @@ def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
     return options
 
 
-def _preparation(options: dict[str, Any]) -> dict[str, Any]:
+def _told(options: Mapping[str, Any]) -> dict[str, Any]:
     """The options that decide what is prepared; of a table's path only the name."""
-    chosen = {key: value for key, value in options.items() if key not in NOT_PREPARATION}
+    chosen = {k: v for k, v in options.items() if k.partition(".")[0] not in NOT_PREPARATION}
     for key in ("path", "walls", "geometry"):
         if isinstance(chosen.get(key), str):
             chosen[key] = Path(chosen[key]).name
-    return chosen
+    return {key: value for key, value in chosen.items() if value != "???"}
 
 
 def _domain(options: DataOptions, sequences: list[Sequence]) -> Domain:

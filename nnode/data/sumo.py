@@ -63,7 +63,7 @@ def read_sumo(path: Path, options: SumoOptions) -> list[Sequence]:
             f"data.dt={options.dt:g} s is finer than the steps of {path}, {step:g} s; set "
             f"data.dt={step:g}, or let SUMO write with --step-length {options.dt:g}"
         )
-    return cut_vehicles(rows, options, _stem(path), lane_word="")
+    return cut_vehicles({_stem(path): rows}, options, lane_word="")
 
 
 def _stem(path: Path) -> str:

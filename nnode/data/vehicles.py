@@ -47,7 +47,7 @@ def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
     if options.direction not in (1, -1):
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     check_cutting(options)
-    return cut_vehicles(_rows(Table(path), options), options, path.stem)
+    return cut_vehicles({path.stem: _rows(Table(path), options)}, options)
 
 
 def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:

@@ -120,23 +120,6 @@ def test_crowd_from_raw_file_to_plots(script: Script, raw: Path, tmp_path: Path)
     assert names == {"sf_force_x.png", "sf_force_y.png", "sf_settings.png", "sf_settings.csv"}
 
 
-def test_prepared_data_are_taken_and_other_options_refused(
-    script: Script, raw: Path, tmp_path: Path
-) -> None:
-    prepared = tmp_path / "prepared"
-    source = f"data.source={raw}"
-    done = script("prepare_data", "data=demo_traffic", source, f"hydra.run.dir={prepared}")
-    assert done.returncode == 0, done.stderr
-    arguments = ["experiment=demo_traffic", "trainer.max_epochs=1", f"data.prepared={prepared}"]
-    run = tmp_path / "run"
-    done = script("train", *arguments, f"hydra.run.dir={run}")
-    assert done.returncode == 0, done.stderr
-    assert not (run / "data").exists()
-    done = script("train", *arguments, "data.faults=keep", f"hydra.run.dir={run}")
-    assert done.returncode != 0
-    assert "data.faults=drop then, keep now" in done.stderr
-
-
 def test_sweep_ends_with_one_table_and_survives_a_failing_run(
     script: Script, raw: Path, tmp_path: Path
 ) -> None:

@@ -158,11 +158,28 @@ def test_open_prepared(tmp_path: Path, options: EsimasOptions) -> None:
         ConfigError, match=r"data\.faults=drop then, keep now; data\.min_vehicles=3 then, 2 now"
     ):
         open_data(options, tmp_path / "unused")
-    with pytest.raises(ConfigError, match=r"data\.t_seq=not known then, 1\.0 now"):
+    with pytest.raises(ConfigError, match=r"out holds data of EsimasOptions, the options are Jue"):
         open_data(JuelichOptions(prepared=options.prepared), tmp_path / "unused")
     options.prepared = str(tmp_path / "raw")
     with pytest.raises(DataError):
         open_data(options, tmp_path / "unused")
+
+
+def test_the_folder_is_enough(tmp_path: Path, options: EsimasOptions) -> None:
+    options.faults, options.recording = Faults.keep, ["demo"]
+    prepare(options, tmp_path / "out")
+    assert len(open_data(EsimasOptions(prepared=str(tmp_path / "out")), tmp_path / "unused")) == 3
+    other = EsimasOptions(prepared=str(tmp_path / "out"), recording="demo", faults=Faults.error)
+    with pytest.raises(ConfigError, match=r"data\.recording=\['demo'\] then, demo now; data\.faul"):
+        open_data(other, tmp_path / "unused")
+
+
+def test_a_folder_that_does_not_tell_its_reader(tmp_path: Path, options: EsimasOptions) -> None:
+    prepare(options, tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"reader"', '"earlier"'))
+    with pytest.raises(ConfigError, match=r"does not tell which of nnode's readers .* again"):
+        open_data(EsimasOptions(prepared=str(tmp_path / "out")), tmp_path / "unused")
 
 
 def test_open_prepares_on_the_fly(tmp_path: Path, options: EsimasOptions) -> None:

@@ -1,0 +1,309 @@
+"""Who is who: identifiers that name one agent each, in all sequences of a recording.
+
+A source's identifiers may start again in every sequence, together with the clock; windows cut
+from one recording keep both; and an identifier may be given to another agent later on. These are
+told apart by where the agents are:
+
+- Two sequences that share identifiers at the same times are of one world if most of these are
+  where an agent is in the other one too, and so are sequences of which the second carries on where
+  the first ends. If any two are not of one world, an identifier would be at two places at one time:
+  it then belongs to the sequences of one world, which may be a single one.
+- Otherwise there is one clock, and an identifier that turns up again where its agent cannot have
+  got to since is another agent's.
+
+Places are the same within the error that :mod:`nnode.data.quality` grants a single position;
+windows of one recording repeat the same rows and do not need it. Most agents, not all, because a
+single one at another place is what a fault of the measurement looks like.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from nnode.data.options import Agents
+from nnode.data.quality import LIMITS
+from nnode.data.sequence import Domain, Sequence
+
+#: Greatest number of a sampling time that adds up without rounding.
+_LATEST = 2.0**52
+
+
+def numbered(name: str, number: int, taken: frozenset[str] | set[str] = frozenset()) -> str:
+    """What the ``number``-th agent of one identifier is called: ``5``, ``5#2``, ``5#3``, ..."""
+    called = name if number == 1 else f"{name}#{number}"
+    while number > 1 and called in taken:
+        called += "#"
+    return called
+
+
+def identify(
+    sequences: list[Sequence], domain: Domain, mode: Agents
+) -> tuple[list[tuple[str, ...]], list[str]]:
+    """Identifiers that are the same in two sequences of a recording only for the same agent.
+
+    Args:
+        sequences: of any recordings; NaN where an agent has no position.
+        domain: of the data.
+        mode: how, see :data:`~nnode.data.options.Agents`.
+
+    Returns:
+        Each sequence's identifiers, the source's own for the first agent that bears them and
+        with a number behind for the others; and for each recording in which they are not the
+        source's a sentence that says why.
+    """
+    named = [s.agents for s in sequences]
+    notes: list[str] = []
+    if mode is Agents["global"]:
+        return named, notes
+    recordings: dict[str, list[int]] = defaultdict(list)
+    for i, s in enumerate(sequences):
+        if s.agents:
+            recordings[s.recording].append(i)
+    for recording, places in recordings.items():
+        own = [sequences[i] for i in places]
+        found = _by_sequence(own) if mode is Agents.sequence else _judged(own, domain)
+        if found is None:
+            continue
+        notes.append(f"{recording}: {found.why}")
+        taken = {name for s in own for name in s.agents}
+        for i, s, numbers in zip(places, own, found.numbers, strict=True):
+            named[i] = tuple(
+                numbered(name, n, taken) for name, n in zip(s.agents, numbers, strict=True)
+            )
+    return named, notes
+
+
+@dataclass
+class _Found:
+    """Per sequence and agent the number of the agent among those of its name, and the reason."""
+
+    numbers: list[list[int]]
+    why: str
+
+
+def _by_sequence(sequences: list[Sequence]) -> _Found:
+    return _Found(
+        _counted(sequences, range(len(sequences))), "identifiers belong to their sequence"
+    )
+
+
+def _counted(sequences: list[Sequence], worlds: Iterable[int]) -> list[list[int]]:
+    """Number the agents of one name by the worlds that they are in, as these appear."""
+    seen: dict[str, dict[int, int]] = defaultdict(dict)
+    return [
+        [seen[name].setdefault(int(world), len(seen[name]) + 1) for name in s.agents]
+        for s, world in zip(sequences, worlds, strict=True)
+    ]
+
+
+def _judged(sequences: list[Sequence], domain: Domain) -> _Found | None:
+    error = LIMITS[domain].noise
+    tracks = _tracks(sequences)
+    near, far = _neighbours(tracks, error)
+
+    def one_world(pair: tuple[int, int]) -> bool:
+        votes = list(_met(tracks, pair, error).values())
+        return 2 * sum(votes) > len(votes)
+
+    apart = next((pair for pair in far if not one_world(pair)), None)
+    if apart is None:
+        return _used_again(sequences, domain)
+    same = [pair for pair in near if one_world(pair)]
+    row, column = np.array(same, dtype=int).reshape(-1, 2).T
+    n = len(sequences)
+    graph = coo_array((np.ones(len(row)), (row, column)), shape=(n, n))
+    count, worlds = connected_components(graph, directed=False)
+    i, j = apart
+    name = min(name for name, met in _met(tracks, apart, error).items() if not met)
+    whose = "their sequence" if count == n else f"one of {count} runs of sequences that carry on"
+    return _Found(
+        _counted(sequences, worlds),
+        f"identifiers belong to {whose}, because {sequences[i].name} and {sequences[j].name} "
+        f"have the same times and identifiers (such as {name}) at different places",
+    )
+
+
+@dataclass
+class _Track:
+    """A sequence at the times k·dt that all sequences share.
+
+    Attributes:
+        first: k of the first row.
+        x: ``(K + 1, N, D)`` m; the last row is one interval ahead of the sequence's end, where
+            the agents would be at constant velocity.
+        place: column of each identifier.
+    """
+
+    first: int
+    x: np.ndarray
+    place: dict[str, int]
+
+
+def _tracks(sequences: list[Sequence]) -> list[_Track | None]:
+    """None for sequences whose times cannot be compared with the others'."""
+    steps = [s.dt for s in sequences if s.n_samples > 1]
+    usual = float(np.median(steps)) if steps else float("nan")
+    return [_track(s, usual) for s in sequences]
+
+
+def _track(s: Sequence, step: float) -> _Track | None:
+    if s.n_samples < 2 or not (step > 0 and np.isclose(s.dt, step, rtol=1e-2)):
+        return None
+    if not abs(s.time).max() < _LATEST * step:
+        return None
+    first = int(np.ceil(s.time[0] / step - 1e-6))
+    last = max(int(np.floor(s.time[-1] / step + 1e-6)), first)
+    grid = np.arange(first, last + 1) * step
+    flat = s.x.reshape(s.n_samples, -1)
+    x = np.stack([np.interp(grid, s.time, column) for column in flat.T], axis=1)
+    x = x.reshape(-1, *s.x.shape[1:])
+    ahead = x[-1] + (s.x[-1] - s.x[-2]) * step / s.dt
+    return _Track(first, np.concatenate([x, ahead[None]]), {a: i for i, a in enumerate(s.agents)})
+
+
+_Pairs = list[tuple[int, int]]
+
+
+def _neighbours(tracks: list[_Track | None], error: float) -> tuple[_Pairs, _Pairs]:
+    """Pairs of sequences in which an identifier is at one place at one time, and at two.
+
+    Of each identifier's places at a time only those next to each other are compared.
+    """
+    often = Counter(name for track in tracks if track for name in track.place)
+    number = {name: code for code, name in enumerate(often)}
+    parts = []
+    for i, track in enumerate(tracks):
+        names = [name for name in track.place if often[name] > 1] if track else []
+        if track is None or not names:
+            continue
+        k, _, d = track.x.shape
+        rows = np.empty((k, len(names), 4 + d))
+        rows[:, :, 0] = [number[name] for name in names]
+        rows[:, :, 1] = track.first + np.arange(k)[:, None]
+        rows[:, :, 2] = i
+        rows[:, :, 3] = (np.arange(k) == k - 1)[:, None]
+        rows[:, :, 4:] = track.x[:, [track.place[name] for name in names]]
+        parts.append(rows.reshape(-1, 4 + d))
+    if not parts:
+        return [], []
+    table = np.concatenate(parts)
+    table = table[np.isfinite(table).all(axis=1)]
+    table = table[np.lexsort((table[:, 2], *table.T[:3:-1], table[:, 1], table[:, 0]))]
+    one, two = table[:-1], table[1:]
+    ghosts = one[:, 3] + two[:, 3]
+    met = (one[:, :2] == two[:, :2]).all(axis=1) & (one[:, 2] != two[:, 2]) & (ghosts < 2)
+    close = np.linalg.norm(one[:, 4:] - two[:, 4:], axis=1) <= error
+
+    def pairs(mask: np.ndarray) -> _Pairs:
+        both = np.sort(np.stack([one[mask, 2], two[mask, 2]], axis=1), axis=1)
+        return [(int(i), int(j)) for i, j in np.unique(both, axis=0)]
+
+    return pairs(met & close), pairs(met & ~close & (ghosts == 0))
+
+
+def _met(tracks: list[_Track | None], pair: tuple[int, int], error: float) -> dict[str, bool]:
+    """Which identifiers that two sequences share are, in one, where anybody is in the other.
+
+    Anybody, because agents whose names are exchanged are a fault within one world.
+    """
+    a, b = sorted((tracks[i] for i in pair), key=lambda t: t.first if t else 0)
+    if a is None or b is None:
+        return {}
+    # the row ahead of the end counts only where the sequences have no other time in common
+    rows = max(min(a.first + len(a.x), b.first + len(b.x)) - 1 - b.first, 1)
+    own = a.x[b.first - a.first :][:rows]
+    other = b.x[: len(own)]
+    found = {}
+    for name in a.place.keys() & b.place.keys():
+        apart = np.linalg.norm(own[:, a.place[name], None] - other, axis=2)
+        known = np.isfinite(apart)
+        if known[:, b.place[name]].any():
+            found[name] = bool((known.any(0) & ((apart <= error) | ~known).all(0)).any())
+    return found
+
+
+def _used_again(sequences: list[Sequence], domain: Domain) -> _Found | None:
+    """Identifiers that turn up where their agent cannot have got to, on one clock."""
+    stays: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for i in np.argsort([s.time[0] for s in sequences], kind="stable"):
+        for n, name in enumerate(sequences[i].agents):
+            stays[name].append((int(i), n))
+    steps: list[tuple[str, int, tuple[int, int], bool]] = []
+    votes: dict[tuple[int, int], int] = defaultdict(int)
+    for name, places in stays.items():
+        before = places[0]
+        for number, place in enumerate(places[1:], start=1):
+            s, t = sequences[before[0]], sequences[place[0]]
+            gap = float(t.time[0] - s.time[-1])
+            if gap > 0:
+                can = bool(reachable(_end(s, before[1], -1), _end(t, place[1], 0), gap, domain))
+                steps.append((name, number, (before[0], place[0]), can))
+                votes[before[0], place[0]] += 1 if can else -1
+            if t.time[-1] >= s.time[-1]:
+                before = place
+    # where most cannot be who they were, the others are there by chance
+    new = {(name, number) for name, number, pair, can in steps if not can or votes[pair] < 0}
+    if not new:
+        return None
+    numbers = [[1] * s.n_agents for s in sequences]
+    for name, places in stays.items():
+        count = 1
+        for number, (i, n) in enumerate(places):
+            count += (name, number) in new
+            numbers[i][n] = count
+    name, number = min(new)
+    i = stays[name][number][0]
+    return _Found(
+        numbers,
+        f"{len({name for name, _ in new})} identifiers are used again for another agent, who "
+        f"cannot have come from where the one before was (such as {name}, another one from "
+        f"{sequences[i].time[0]:g} s on in {sequences[i].name})",
+    )
+
+
+def _end(s: Sequence, n: int, which: int) -> np.ndarray:
+    """The first (0) or last (-1) known position of an agent, NaN where there is none."""
+    x = s.x[:, n]
+    known = x[np.isfinite(x).all(axis=1)]
+    return known[which] if len(known) else np.full(x.shape[1], np.nan)
+
+
+def given_anew(time: np.ndarray, x: np.ndarray, other: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Behind which rows of a road an identifier is another vehicle's.
+
+    Such are the holes over which no vehicle can have driven, and those that last longer than any
+    vehicle is in view without one: by then it has left the road in view.
+
+    Args:
+        time: ``(rows,)`` s, ascending for each identifier, one identifier after the other.
+        x: ``(rows,)`` m.
+        other: ``(rows - 1,)`` whether the next row has another identifier.
+        hole: ``(rows - 1,)`` whether the next row is the same one's after a hole.
+    """
+    first = np.concatenate([[0], np.flatnonzero(other | hole) + 1])
+    last = np.append(first[1:] - 1, len(time) - 1)
+    gap = np.diff(time)
+    can = reachable(x[:-1, None], x[1:, None], gap, "traffic")
+    return np.asarray(hole & (~can | (gap > (time[last] - time[first]).max())))
+
+
+def reachable(
+    start: np.ndarray, end: np.ndarray, gap: np.ndarray | float, domain: Domain
+) -> np.ndarray:
+    """Whether an agent at ``start`` can be at ``end`` (..., D; m) ``gap`` seconds later.
+
+    No faster than the greatest possible speed, and a vehicle no further back than a path's reach
+    (see :class:`~nnode.data.quality.Limits`); what is not known is possible.
+    """
+    limits = LIMITS[domain]
+    step = np.asarray(end - start)
+    far = np.linalg.norm(step, axis=-1) > limits.max_speed * gap + limits.reach
+    if domain == "traffic":
+        far |= step[..., 0] < -limits.reach
+    return np.asarray(~far)

@@ -1,0 +1,144 @@
+"""Smoothing: exact on cubics, and the figures of docs/data.md."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nnode.data.ngsim import read_ngsim
+from nnode.data.options import NgsimOptions, VehicleTableOptions
+from nnode.data.sequence import Sequence
+from nnode.data.smooth import smooth
+from nnode.data.vehicles import read_vehicles
+from nnode.errors import ConfigError
+
+DOCS = Path(__file__).parents[2] / "docs" / "data.md"
+STEP = 0.1
+WINDOWS = (None, 1.0, 2.0, 4.0)
+
+
+def truth(seconds: float = 600.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, speed and acceleration of a car in stop-and-go traffic.
+
+    Waves of 60 s between 2 and 18 m/s, with corrections of 5 s by a driver on top: accelerations
+    of up to 1.5 m/s².
+    """
+    time = np.arange(0, seconds, STEP)
+    slow, quick = 2 * np.pi / 60, 2 * np.pi / 5
+    speed = 10 - 8 * np.cos(slow * time) + 0.5 * np.sin(quick * time)
+    return time, speed, 8 * slow * np.sin(slow * time) + 0.5 * quick * np.cos(quick * time)
+
+
+def position(time: np.ndarray) -> np.ndarray:
+    slow, quick = 2 * np.pi / 60, 2 * np.pi / 5
+    return 10 * time - 8 / slow * np.sin(slow * time) - 0.5 / quick * np.cos(quick * time)
+
+
+def errors(kind: str, n: int) -> np.ndarray:
+    """Errors of 0.3 m that are new at every sample, or that last (1 s)."""
+    draw = np.random.default_rng(0).standard_normal(n)
+    if kind == "new":
+        return 0.3 * draw
+    keep, found = np.exp(-STEP), np.empty(n)
+    found[0] = draw[0]
+    for k in range(1, n):
+        found[k] = keep * found[k - 1] + np.sqrt(1 - keep**2) * draw[k]
+    return 0.3 * found
+
+
+def spread(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def acceleration(s: Sequence) -> np.ndarray:
+    return np.diff(s.velocity(), axis=0) / s.dt
+
+
+def figures(folder: Path, kind: str, window: float | None) -> tuple[float, float, float]:
+    """RMS errors (m, m/s, m/s²) of what the reader gives."""
+    time, speed, force = truth()
+    x = position(time)
+    path = folder / f"{kind}-{window}.csv"
+    x_measured = x + errors(kind, len(time))
+    pd.DataFrame({"vehicle": 1, "time": time, "x": x_measured}).to_csv(path, index=False)
+    (s,) = read_vehicles(path, VehicleTableOptions(min_vehicles=1, smooth=window))
+    at = np.round(s.time / STEP).astype(int)[1:-1]  # the last speed of a measured one is repeated
+    middle = 0.5 * (force[at[:-1]] + force[at[1:]])
+    return (
+        spread(s.x[1:-1, 0, 0] - x[at]),
+        spread(s.velocity()[1:-1, 0, 0] - speed[at]),
+        spread(acceleration(s)[1:-1, 0, 0] - middle),
+    )
+
+
+def test_a_cubic_stays_as_it_is() -> None:
+    time = np.arange(0, 8, STEP)
+    x = 3 + 8 * time + 0.5 * time**2 - 0.05 * time**3
+    found, speed = smooth(time, x, 2.0)
+    np.testing.assert_allclose(found, x, atol=1e-9)
+    np.testing.assert_allclose(speed, 8 + time - 0.15 * time**2, atol=1e-8)
+    # a hole that is interpolated, and a record shorter than the window
+    some = np.delete(np.arange(len(time)), [31, 32])
+    assert np.abs(smooth(time[some], x[some], 2.0)[0] - x[some]).max() < 0.01
+    np.testing.assert_allclose(smooth(time[:8], x[:8], 2.0)[1], (8 + time - 0.15 * time**2)[:8])
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 4])
+def test_a_record_of_few_samples_stays_as_it_is(samples: int) -> None:
+    time = STEP * np.arange(samples)
+    found, speed = smooth(time, 5 * time, 2.0)
+    np.testing.assert_array_equal(found, 5 * time)
+    np.testing.assert_allclose(speed, 5.0 if samples > 1 else 0.0)
+
+
+def test_a_window_that_smooths_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"smooth=0.3 s holds 3 samples .* data.smooth=0.4 at le"):
+        figures(tmp_path, "new", 0.3)
+    with pytest.raises(ConfigError, match=r"data.smooth=-1.0: expected a positive number"):
+        figures(tmp_path, "new", -1.0)
+
+
+def test_records_are_smoothed_apart_and_nobody_rolls_back(tmp_path: Path) -> None:
+    time = np.arange(0, 10, STEP)
+    noise = np.random.default_rng(0).normal(0, 0.3, (2, len(time)))
+    parts = [pd.DataFrame({"vehicle": i, "time": time, "x": 50.0 * i + noise[i]}) for i in range(2)]
+    path = tmp_path / "t.csv"
+    pd.concat(parts).to_csv(path, index=False)
+    options = VehicleTableOptions(min_vehicles=2, smooth=2.0)
+    (s,) = read_vehicles(path, options)
+    assert s.v is not None
+    assert (s.v >= 0).all()
+    assert np.abs(s.x[:, :, 0] - [0, 50]).max() < 1
+
+
+def row(label: str) -> list[float]:
+    """The figures in a row of the page's table."""
+    (line,) = (line for line in DOCS.read_text().splitlines() if line.startswith(f"| {label} |"))
+    return [float(number) for number in re.findall(r"\d+\.\d+", line.split("|", 2)[2])]
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_the_page_s_figures_on_a_known_truth(tmp_path: Path, window: float | None) -> None:
+    found = [f for kind in ("new", "lasting") for f in figures(tmp_path, kind, window)]
+    label = "as measured" if window is None else f"`data.smooth={window:g}`"
+    assert row(label) == pytest.approx(found, abs=0.0006)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("window", WINDOWS[1:])
+def test_the_page_s_figures_on_a_reconstructed_table(real_data: Path, window: float | None) -> None:
+    path = real_data / "ngsim" / "i80_lanes_1_2.csv"
+    raw = read_ngsim(path, NgsimOptions(window=10.0))
+    found = read_ngsim(path, NgsimOptions(window=10.0, smooth=window))
+    assert [s.agents for s in raw] == [s.agents for s in found]
+    pairs = list(zip(raw, found, strict=True))
+    figures = [
+        spread(np.concatenate([(a.x - b.x).ravel() for a, b in pairs])),
+        spread(np.concatenate([(a.velocity() - b.velocity()).ravel() for a, b in pairs])),
+        *(spread(np.concatenate([acceleration(s).ravel() for s in own])) for own in (raw, found)),
+    ]
+    assert row(f"NGSIM, `data.smooth={window:g}`") == pytest.approx(figures, abs=0.0006)
