@@ -140,6 +140,7 @@ class DiscoveryBenchmarkOptions:
     strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
     noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
     sizes: list[int] = field(default_factory=lambda: [20])  # numbers of platoons or crowds
+    structure: bool = True  # look for what has no name too; without, nothing is unknown
     peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
     workers: int | None = None  # processes; null: one per core
 

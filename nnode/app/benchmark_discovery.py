@@ -42,7 +42,10 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     code = sources()
     last_of_peers = _first(options) + options.peer_seeds
     run_tasks(
-        [task_of(case, case.seed < last_of_peers, options.seeds_of) for case in chosen],
+        [
+            task_of(case, case.seed < last_of_peers, options.seeds_of, options.structure)
+            for case in chosen
+        ],
         folder,
         workers=workers,
         fingerprint=code,

@@ -30,7 +30,10 @@ _KEPT = ("named", "exact", "class_right", "found", "false_names", "closure", "wo
 
 
 def diagnose_case(
-    case: dict[str, Any], peers: bool = False, seeds_of: str | None = None
+    case: dict[str, Any],
+    peers: bool = False,
+    seeds_of: str | None = None,
+    structure: bool = True,
 ) -> dict[str, Any]:
     """The score of one diagnosis, and how long it took.
 
@@ -40,6 +43,7 @@ def diagnose_case(
         case: of :class:`nnode.groundtruth.Case`, as plain JSON.
         peers: scores of the peers as well, by name.
         seeds_of: hash of the commit that the seed comes from; is handed through.
+        structure: as in the options of the diagnosis.
     """
     # imported here: all workers read this file, and tests put another diagnosis in its place
     from nnode.app import benchmark_discovery_peers, discover
@@ -64,7 +68,7 @@ def diagnose_case(
         }
         table, start, failure = Path(given) / TABLE, time.monotonic(), ""
         try:
-            options = DiscoverOptions(page=False, animation=False)
+            options = DiscoverOptions(page=False, animation=False, structure=structure)
             report = discover.diagnose_table(table, what.domain, **told, options=options)
         except NNodeError as error:
             report, failure = {"verdict": ERROR, "effects": []}, f"{type(error).__name__}: {error}"
@@ -86,10 +90,12 @@ def diagnose_case(
     }
 
 
-def task_of(case: Case, peers: bool, seeds_of: str | None) -> Task:
+def task_of(case: Case, peers: bool, seeds_of: str | None, structure: bool = True) -> Task:
     """A case as a task that is kept; larger ones start first."""
     size = case.n_sequences * (1.0 if case.domain == "traffic" else 2.0)
-    arguments = {"case": case.to_dict(), "peers": peers, "seeds_of": seeds_of}
+    arguments = {
+        "case": case.to_dict(), "peers": peers, "seeds_of": seeds_of, "structure": structure,
+    }  # fmt: skip
     return Task(case.key, diagnose_case, arguments, cost=size)
 
 

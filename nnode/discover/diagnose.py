@@ -104,7 +104,7 @@ def diagnose(
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     stages.begin("locating")
-    variables = engine.variables()
+    variables = engine.variables() if options.structure else []
     first = weighed(engine, base, curves(engine, base, variables), SURE)
     located = places(first, _excess(engine, base))
     clock.lap("locate")
@@ -135,15 +135,14 @@ def diagnose(
     final = sealed.corrected(found)
     kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
     seen = [one for kind in kinds if (one := individuals(engine, found.fit, kind)) is not None]
-    agents = []
     for one in seen:
         one.p_value = min(1.0, one.p_value * len(seen))
-        agents.append(sealed.agents(one, final.system, options.alpha, bool(left), enough))
-    own = [one for one, agent in zip(seen, agents, strict=True) if agent.named]
+    agents = [sealed.agents(one, final.system, options.alpha, bool(left), enough) for one in seen]
+    both = list(zip(seen, agents, strict=True))
+    own = [one for one, agent in both if agent.named]
     absent += [
-        agents_absent(one, options.alpha / len(seen))
-        for one, agent in zip(seen, agents, strict=True) if not agent.named
-    ]  # fmt: skip
+        agents_absent(one, options.alpha / len(seen)) for one, agent in both if not agent.found
+    ]
     extended = sealed.with_numbers(engine, final, own)
     gap, each = sealed.gap(extended, own)
     clock.lap("sealed")
@@ -152,19 +151,20 @@ def diagnose(
         named(engine, final, step, one.p_value)
         for step, one in zip(found.steps, sealed.tried, strict=False)
     ]
-    effects_found += [
-        named_agents(one, agent.confirmed)
-        for one, agent in zip(seen, agents, strict=True) if agent.named
-    ]  # fmt: skip
+    effects_found += [named_agents(one, agent.confirmed) for one, agent in both if agent.named]
+    leads_found = sealed.leads(engine, leads)
+    leads_found += [
+        named_agents(one, agent.confirmed) for one, agent in both if agent.found and not agent.named
+    ]
     diagnosis = Diagnosis(
-        verdict=_verdict(found, left, removed, bool(own), bool(leads), enough),
+        verdict=_verdict(found, left, removed, bool(own), bool(leads_found), enough),
         domain=domain,
         model="",
         clusters=numbers,
         screen=_first(found, numbers),
-        confirmation=sealed.confirmation(),
+        confirmation=sealed.confirmation(agents),
         effects=effects_found,
-        leads=sealed.leads(engine, leads),
+        leads=leads_found,
         agents=agents,
         data_faults=[],
         not_testable=[one.name for one in absent if not one.testable],
@@ -268,9 +268,9 @@ def _verdict(
         return "indistinguishable" if any(step.rivals for step in found.steps) else "named"
     if own:
         return "named"
-    if leads:
-        return "unconfirmed"
-    return "unknown" if left else "none"
+    if left:
+        return "unknown"
+    return "unconfirmed" if leads else "none"
 
 
 def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:

@@ -25,6 +25,9 @@ class DiscoverOptions:
     effects: list[str] | None = None  # names of the catalogue to look for; null: all
     exclude: list[str] = field(default_factory=list)  # names not to look for
     max_effects: int = 4  # at most so many are added
+    structure: bool = (
+        True  # look for what has no name; without, it is faster and nothing is unknown
+    )
     step: float | None = None  # s, of the simulations that figures show; null takes the domain's
     page: bool = True  # report.html with figures, and figures in TensorBoard
     animation: bool = True  # one sealed sequence as a moving picture in the page

@@ -217,7 +217,8 @@ class Agents:
         later: mean square errors in the last part of the sealed sequences by who predicts, m².
         confirmed: one-sided p-value, by cluster, that own numbers predict the last part better
             than none, and than one number per sequence (the larger of both).
-        named: whether it was.
+        found: whether it stands out in the open clusters.
+        named: whether it was confirmed as well.
         reason: why not, in words.
     """
 
@@ -233,6 +234,7 @@ class Agents:
     common: list[float]
     later: dict[str, float]
     confirmed: float
+    found: bool
     named: bool
     reason: str = ""
 

@@ -145,13 +145,16 @@ class Sealed:
             if self.whole is not None
         ]
 
-    def confirmation(self) -> Confirmation:
-        """What is said of the population's effects."""
+    def confirmation(self, agents: list[Agents]) -> Confirmation:
+        """What is said of the effects that were found: those of the population, or else those with
+        numbers of agents."""
         few = too_few(self.clusters)
-        if not self.tried:
+        tried = [(one.confirmed, one.named, one.reason) for one in agents if one.found]
+        tried = [(one.p_value, one.good, few or one.reason) for one in self.tried] or tried
+        if not tried:
             return Confirmation(None, self.clusters, None, few)
-        last = self.tried[-1]
-        return Confirmation(last.p_value, self.clusters, last.good, few or last.reason)
+        p_value, good, reason = tried[-1]
+        return Confirmation(p_value, self.clusters, good, reason)
 
     def agents(
         self, one: Individuals, system: System, alpha: float, structure: bool, enough: bool
@@ -176,7 +179,8 @@ class Sealed:
                 p_value = max(improvement(other, own) for other in others)
             if means[MODELS[1]] >= means[MODELS[0]]:
                 p_value = 1.0
-        reason = _why_not(one, alpha, low, p_value, found, structure, enough, self.clusters)
+        hindered = _hindered(one, alpha, structure, enough)
+        reason = hindered or _why_not(p_value, found, self.clusters)
         return Agents(
             name=one.effect.name,
             strength=one.sigma,
@@ -190,6 +194,7 @@ class Sealed:
             common=one.common,
             later=means,
             confirmed=p_value,
+            found=not hindered,
             named=not reason,
             reason=reason,
         )
@@ -225,23 +230,19 @@ class Sealed:
         return Gap(first, last, floor, closed), each
 
 
-def _why_not(
-    one: Individuals,
-    alpha: float,
-    low: float,
-    p_value: float,
-    found: Later | None,
-    structure: bool,
-    enough: bool,
-    clusters: int,
-) -> str:
-    """Why agents' own numbers are not named; empty where they are."""
+def _hindered(one: Individuals, alpha: float, structure: bool, enough: bool) -> str:
+    """Why agents' own numbers are not found in the open clusters; empty where they are."""
     if not enough:
         return "there are too few clusters to test it"
-    if one.p_value > alpha or low <= 0:
+    if one.p_value > alpha or one.interval()[0] <= 0:
         return "what an agent's numbers have in common over time does not stand out"
     if structure:
         return "something without a name is left, which numbers of agents would absorb"
+    return ""
+
+
+def _why_not(p_value: float, found: Later | None, clusters: int) -> str:
+    """Why the sealed clusters do not confirm them; empty where they do."""
     if found is None:
         return "the sealed sequences are too short to be divided"
     if p_value > LEVEL:

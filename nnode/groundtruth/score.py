@@ -26,7 +26,7 @@ def score(
 
     Returns:
         What was asked (``domain``, ``arm``, ``hidden``, ...), what was said (``verdict``,
-        ``named``; ``leads`` are the effects of an unconfirmed report, which are no names), and:
+        ``named``; ``leads`` were found and not confirmed, which are no names), and:
 
         * ``exact``: the verdict is ``named``, and the names are exactly the hidden effects, beside
           the nuisance where the arm has one; None where the catalogue has none of what is hidden,
@@ -53,9 +53,8 @@ def score(
     case, verdict = truth["case"], str(report["verdict"])
     hidden = [item["name"] for item in truth["effects"]]
     nuisance = {item["name"] for item in truth["nuisance"]}
-    effects = report.get("effects", [])
-    named = [] if verdict == LEADS else effects
-    names, leads = ([item["name"] for item in found] for found in (named, effects))
+    named = report.get("effects", [])
+    names, leads = ([item["name"] for item in found] for found in (named, report.get("leads", [])))
     equals = {item["name"]: set(_names(item.get("alternatives", ()))) for item in named}
     asked = hidden if case["arm"] in ("single", "pair", "near_miss") else []
     false = [
@@ -89,7 +88,7 @@ def score(
         "reached": truth["strength"]["reached"],
         "verdict": verdict,
         "named": "+".join(names) or "nothing",
-        "leads": "+".join(leads) if verdict == LEADS else "",
+        "leads": "+".join(leads),
         **(measured if asked else dict.fromkeys(measured)),
         "found": sum(name in names for name in asked),
         "false_names": false,
