@@ -244,6 +244,8 @@ def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -
 
 
 def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> list[Curves]:
+    if not variables:
+        return []
     screen = Screen(fit, engine.cluster, seed, FLIPS)
     before = heldout(fit, engine.cluster)
     looks = [_Look(engine, fit, screen, variable) for variable in variables]
