@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,10 @@ LAYOUTS = {
     )
 }
 
+#: Columns by their name in small letters: files differ in capitals.
+_KNOWN = {name.lower(): name for names in LAYOUTS.values() for name in names}
 _NEEDED = ("Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID")
+_USED = ("v_Vel", "v_Length", "v_Class", "Direction", "Location")
 
 #: Columns of the reconstructed table that some have in place of the public file, in SI units.
 RECONSTRUCTED = {
@@ -98,7 +102,9 @@ def read_ngsim(path: Path, options: NgsimOptions) -> list[Sequence]:
 
 def _table(path: Path) -> Table:
     """The file as a table, its columns named as in ``LAYOUTS`` whatever their capitals."""
-    names, how = None, {}
+    names: list[str] | None = None
+    how: dict[str, Any] = {}
+    cells: list[str] = []
     if path.suffix.lower() not in (".parquet", ".pq") and path.is_file():
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             first = next((line for line in file if line.strip()), "")
@@ -112,10 +118,11 @@ def _table(path: Path) -> Table:
                     f"{path} has {len(cells)} columns without names; NGSIM's files have "
                     f"{', '.join(map(str, LAYOUTS))}: set data=vehicles for a table of your own"
                 )
+    if set(_NEEDED) <= {_KNOWN.get(cell.strip().lower(), "") for cell in names or cells}:
+        how["usecols"] = lambda name: _KNOWN.get(name.strip().lower()) in (*_NEEDED, *_USED)
     # the portal has written 6042842.1 as "6,042,842.1" at times
     table = Table(path, names, thousands=",", **how)
-    known = {name.lower(): name for name in (*_HEAD, *_STREET, *_TAIL, "Location")}
-    table.frame.columns = [known.get(name.lower(), name) for name in table.frame.columns]
+    table.frame.columns = [_KNOWN.get(name.lower(), name) for name in table.frame.columns]
     return table
 
 
