@@ -111,6 +111,7 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
     return Sequence(
         name=entry["name"],
         recording=entry["recording"],
+        site=entry.get("site", ""),
         time=time[:, 0].copy(),
         x=x,
         v=vectors("v"),

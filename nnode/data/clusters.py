@@ -2,7 +2,8 @@
 
 Folds, sign flips, jackknife, paired tests and sealed sets all go by cluster.
 
-- Sequences of a recording that share an agent are one cluster.
+- Sequences of a recording, or of recordings of one site (lanes of a road), that share an agent are
+  one cluster.
 - Without identifiers (ESIMAS), two sequences closer in time than ``gap`` count as sharing one. The
   default of 5 s comes from those recordings: at the end of a sequence its last vehicle has 2 to 3 s
   (median) and mostly (82 to 95 %) at most 5 s to go until it leaves the camera's view, so that
@@ -27,7 +28,7 @@ from scipy.sparse.csgraph import connected_components
 
 from nnode.data.sequence import Sequence
 
-#: Per sequence ``name``, ``recording``, ``start``, ``end`` and ``agents``.
+#: Per sequence ``name``, ``recording``, ``site``, ``start``, ``end`` and ``agents``.
 Index = ListLike[Mapping[str, Any]]
 
 #: s; sequences without identifiers that are closer in time may share an agent.
@@ -40,6 +41,7 @@ def index_of(sequences: Iterable[Sequence]) -> list[dict[str, Any]]:
         {
             "name": s.name,
             "recording": s.recording,
+            "site": s.site,
             "start": float(s.time[0]),
             "end": float(s.time[-1]),
             "agents": list(s.agents),
@@ -54,10 +56,10 @@ def clusters(index: Index, gap: float = GAP, *, together: bool = False) -> np.nd
     Args:
         index: see :func:`index_of`.
         gap: s, see above; 0 connects no sequences without identifiers.
-        together: sequences of a recording that overlap in time are one, whoever is in them.
+        together: sequences of a site that overlap in time are one, whoever is in them.
     """
     edges: list[tuple[int, int]] = []
-    for members in by_recording(index).values():
+    for members in _groups(index, "site").values():
         known = identified(index, members)
         if known:
             first: dict[str, int] = {}
@@ -84,9 +86,13 @@ def _near(
 
 def by_recording(index: Index) -> dict[str, list[int]]:
     """Positions of the sequences of each recording."""
+    return _groups(index, "recording")
+
+
+def _groups(index: Index, what: str) -> dict[str, list[int]]:
     groups: dict[str, list[int]] = {}
     for i, entry in enumerate(index):
-        groups.setdefault(entry["recording"], []).append(i)
+        groups.setdefault(entry.get(what) or entry["recording"], []).append(i)
     return groups
 
 

@@ -95,17 +95,21 @@ def cut_vehicles(
         DataError: one vehicle twice at one time, or no sequence at all.
     """
     chosen = _lanes(options, recordings.values())
-    lanes = {
-        f"{stem}_{lane_word}{lane}" if lane else stem: stints
+    lanes_of = {
+        stem: {
+            f"{stem}_{lane_word}{lane}" if lane else stem: stints
+            for lane, stints in _stints(rows, options, chosen, stem).items()
+        }
         for stem, rows in recordings.items()
-        for lane, stints in _stints(rows, options, chosen, stem).items()
     }
+    lanes = {name: stints for rows in lanes_of.values() for name, stints in rows.items()}
     asked = wanted(options.recording)
     if asked is not None:
         check_known(asked, lanes)
         lanes = {name: lanes[name] for name in asked}
+    site = {name: stem for stem, rows in lanes_of.items() for name in rows}
     found = [
-        _sequence(f"{name}/{number:03d}", name, platoon, first, last, options.dt)
+        _sequence(f"{name}/{number:03d}", name, site[name], platoon, first, last, options.dt)
         for name, stints in lanes.items()
         for number, (platoon, first, last) in enumerate(_cut(stints, options))
     ]
@@ -307,7 +311,7 @@ def _windows(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
 
 
 def _sequence(
-    name: str, recording: str, platoon: list[_Stint], first: int, last: int, dt: float
+    name: str, recording: str, site: str, platoon: list[_Stint], first: int, last: int, dt: float
 ) -> Sequence:
     def cut(values: list[np.ndarray]) -> np.ndarray:
         parts = zip(platoon, values, strict=True)
@@ -319,6 +323,7 @@ def _sequence(
     return Sequence(
         name=name,
         recording=recording,
+        site=site,
         time=np.arange(first, last + 1) * dt,
         x=cut([s.x for s in platoon])[:, :, None],
         v=cut(speeds)[:, :, None] if speeds else None,

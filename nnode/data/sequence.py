@@ -25,6 +25,8 @@ class Sequence:
     Attributes:
         name: unique within a data set, by convention ``recording/number``.
         recording: the recording (file, run) that the sequence was cut from.
+        site: what recordings have in common whose clock and identifiers are the same, as the lanes
+            of a road; empty: the recording is alone.
         time: ``(K,)`` s, equally spaced, as recorded (not shifted to zero).
         x: ``(K, N, D)`` positions in m, D = 1 (traffic) or 2 (crowd). Traffic is ordered
             along the lane: agent N - 1 leads.
@@ -50,6 +52,7 @@ class Sequence:
     group: tuple[str, ...] | None = None
     destination: np.ndarray | None = None
     walls: np.ndarray | None = None
+    site: str = ""
 
     def __post_init__(self) -> None:
         x = np.asarray(self.x, dtype=np.float64)

@@ -209,6 +209,7 @@ def _entry(item: Sequence, walls: list[np.ndarray]) -> dict[str, Any]:
     return {
         "name": item.name,
         "recording": item.recording,
+        "site": item.site,
         "n_samples": item.n_samples,
         "n_agents": item.n_agents,
         "start": float(item.time[0]),

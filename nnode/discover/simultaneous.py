@@ -1,6 +1,6 @@
 """Do agents behave alike who are there at one time but share nobody?
 
-The mean residuals of two clusters of a recording over the seconds that they have in common are
+The mean residuals of two clusters of a site over the seconds that they have in common are
 multiplied. Where they have nothing to do with each other, the sum of these products is as large
 when each cluster is shifted along its own time, which keeps how long its residuals last.
 
@@ -27,7 +27,7 @@ class Simultaneous:
     """What the test said.
 
     Attributes:
-        pairs: of clusters of a recording that have at least two seconds in common.
+        pairs: of clusters of a site that have at least two seconds in common.
         correlation: of their mean residuals; NaN without a pair.
         p_value: one-sided; 1 without a pair.
     """
@@ -44,7 +44,7 @@ class Simultaneous:
     def plain(self) -> str:
         """In a sentence."""
         if not self.pairs:
-            return "no two clusters of a recording were there at one time"
+            return "no two clusters of a site were there at one time"
         kept = "they are one cluster" if self.together else "they are taken as independent"
         return (
             f"{self.pairs} pairs of clusters that were there at one time: correlation of their "
@@ -57,8 +57,8 @@ def simultaneous(engine: Engine, fit: Fit, seed: int = 0) -> Simultaneous:
     series = _series(engine, fit)
     rng = np.random.default_rng(seed)
     pairs, own, size, chance = 0, 0.0, 0.0, np.zeros(SHIFTS)
-    for recording in {name for name, _, _ in series}:
-        members = [(first, one) for name, first, one in series if name == recording]
+    for site in sorted({name for name, _, _ in series}):
+        members = [(first, one) for name, first, one in series if name == site]
         number, length = _pairs(members)
         if not number:
             continue
@@ -103,7 +103,7 @@ def _pairs(members: list[_Member]) -> tuple[int, float]:
 
 
 def _series(engine: Engine, fit: Fit) -> list[tuple[str, int, np.ndarray]]:
-    """Of each cluster its recording, its first second, and ``(T, C)`` mean residuals of every
+    """Of each cluster its site, its first second, and ``(T, C)`` mean residuals of every
     second and component from then on; 0 where there is none."""
     second = np.floor(engine.clock / BIN).astype(int)
     kinds = int(engine.component.max()) + 1
@@ -115,6 +115,6 @@ def _series(engine: Engine, fit: Fit) -> list[tuple[str, int, np.ndarray]]:
         number = (int(second[own].max()) - first + 1) * kinds
         count = np.bincount(at, minlength=number)
         mean = np.bincount(at, fit.residual[own], number) / np.maximum(count, 1)
-        recording = engine.sequences[int(engine.sequence[own][0])].recording
-        found.append((recording, first, mean.reshape(-1, kinds)))
+        one = engine.sequences[int(engine.sequence[own][0])]
+        found.append((one.site or one.recording, first, mean.reshape(-1, kinds)))
     return found
