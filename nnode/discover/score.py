@@ -135,11 +135,30 @@ class Screen:
         #: of each effect's name the largest statistic of its probes under each flip
         self._chance: dict[str, np.ndarray] = {}
         self._least = np.ones(len(self._signs))
+        self._blown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def beyond(self, columns: np.ndarray) -> np.ndarray:
         """``columns`` without what the model's own parameters can do."""
         rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
         return rest
+
+    def parts(self, z: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """``(G, k)`` scores of directions that are free of the model's parameters.
+
+        What the parameters have taken out of the residuals makes the clusters' scores vary less
+        than the errors do; signs of those would promise too little chance. So each cluster's
+        residuals are blown up by its leverage, and the sum of the scores is kept.
+
+        Source: Bell & McCaffrey 2002 (CR2).
+        """
+        own = id(label)
+        if own not in self._blown:
+            self._blown[own] = _blown_up(self.residual, self._basis, label), label
+        raw = z.T @ self.residual
+        found, size = sums(z * self._blown[own][0][:, None], label), sums(z**2, label)
+        share = size / np.maximum(size.sum(0), 1e-300)
+        spread: np.ndarray = found + (raw - found.sum(0)) * share
+        return spread
 
     def flipped(self, parts: np.ndarray) -> np.ndarray:
         """``(F, C)`` sums of the clusters ``(G, C)``, as they are and with every flip."""
@@ -208,7 +227,7 @@ class Screen:
 
     def _single(self, trace: Trace) -> Score:
         z, label = self.beyond(trace.columns), self.label(trace.effect.name)
-        parts = sums(z * self.residual[:, None], label)
+        parts = self.parts(z, label)
         grams = grams_of(z, label)
         chance = self._joint(parts, grams, self._flips(trace.effect.name))
         statistic = float(chance[0])
@@ -234,7 +253,7 @@ class Screen:
     def _interval(self, trace: Trace) -> list[Score]:
         """The best interval of neighbouring cells."""
         z, label = self.beyond(trace.columns), self.label(trace.effect.name)
-        parts = sums(z * self.residual[:, None], label)
+        parts = self.parts(z, label)
         grams = grams_of(z, label)
         cells = z.shape[1]
         first, last = np.triu_indices(cells)
@@ -359,6 +378,22 @@ def _wallace(squares: np.ndarray, degrees: np.ndarray) -> np.ndarray:
     """
     factor = (8 * degrees + 1) / (8 * degrees + 3)
     found: np.ndarray = factor * np.sqrt(degrees * np.log1p(squares / degrees))
+    return found
+
+
+def _blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """``(n,)`` residuals times (1 - H)^-1/2 of each cluster's part H of the projection onto an
+    orthonormal basis; what one cluster alone determines stays as it is."""
+    found = residual.copy()
+    if not basis.shape[1]:
+        return found
+    for own, gram in enumerate(grams_of(basis, label)):
+        part = label == own
+        size, turn = np.linalg.eigh(gram)
+        known = (size > 1e-12) & (size < 1 - 1e-6)
+        size, turn = size[known], turn[:, known]
+        more = turn * ((1 / np.sqrt(1 - size) - 1) / size) @ turn.T
+        found[part] += basis[part] @ (more @ (basis[part].T @ residual[part]))
     return found
 
 

@@ -273,7 +273,7 @@ class _Look:
         columns = columns_of(engine, fit, variable)
         self.z = screen.beyond(columns)
         self.parts = sums(self.z * fit.residual[:, None], engine.cluster)
-        self.total = screen.flipped(self.parts)
+        self.total = screen.flipped(screen.parts(self.z, engine.cluster))
         self.absorbed = np.linalg.lstsq(fit.jacobian, columns, rcond=1e-9)[0]
         self.squares: list[np.ndarray] = []
         if variable.lengths:
