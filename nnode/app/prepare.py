@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.data.clusters import clusters, relation
 from nnode.data.options import DataOptions
 from nnode.data.prepare import prepare
 from nnode.plots.quality import plot_faults
@@ -26,5 +27,8 @@ def prepare_data(config: DictConfig, folder: Path) -> None:
     if reasons:
         listed = ", ".join(f"{kind} in {number}" for kind, number in sorted(reasons.items()))
         print(f"faults: {listed} sequences; pictures in {folder / 'faults'}")
+    gap = options.split.gap
+    number = int(clusters(store.index, gap).max()) + 1
+    print(f"clusters: {number} (sequences that {relation(store.index, gap)} are one)")
     print(f"{len(store)} sequences: {folder} (train with data.prepared={folder})")
     print(f"manifest: {folder / 'manifest.json'}")

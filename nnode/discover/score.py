@@ -26,6 +26,7 @@ from nnode.data.clusters import signs
 from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit, sums
 from nnode.discover.fit import grams as grams_of
+from nnode.discover.leverage import blown_up, orthonormal
 from nnode.models.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
@@ -128,7 +129,7 @@ class Screen:
         self.fit, self.cluster, self.levels = fit, cluster, levels or {}
         self.residual = fit.residual
         self.variance = fit.cost / len(fit.residual)
-        self._basis = _orthonormal(fit.tangents)
+        self._basis = orthonormal(fit.tangents)
         self._rng = np.random.default_rng(seed)
         #: ``(F, G)``, the data as they are first
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
@@ -153,7 +154,7 @@ class Screen:
         """
         own = id(label)
         if own not in self._blown:
-            self._blown[own] = _blown_up(self.residual, self._basis, label), label
+            self._blown[own] = blown_up(self.residual, self._basis, label), label
         raw = z.T @ self.residual
         found, size = sums(z * self._blown[own][0][:, None], label), sums(z**2, label)
         share = size / np.maximum(size.sum(0), 1e-300)
@@ -379,33 +380,6 @@ def _wallace(squares: np.ndarray, degrees: np.ndarray) -> np.ndarray:
     factor = (8 * degrees + 1) / (8 * degrees + 3)
     found: np.ndarray = factor * np.sqrt(degrees * np.log1p(squares / degrees))
     return found
-
-
-def _blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """``(n,)`` residuals times (1 - H)^-1/2 of each cluster's part H of the projection onto an
-    orthonormal basis; what one cluster alone determines stays as it is."""
-    found = residual.copy()
-    if not basis.shape[1]:
-        return found
-    for own, gram in enumerate(grams_of(basis, label)):
-        part = label == own
-        size, turn = np.linalg.eigh(gram)
-        known = (size > 1e-12) & (size < 1 - 1e-6)
-        size, turn = size[known], turn[:, known]
-        more = turn * ((1 / np.sqrt(1 - size) - 1) / size) @ turn.T
-        found[part] += basis[part] @ (more @ (basis[part].T @ residual[part]))
-    return found
-
-
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the columns' span."""
-    scale = np.linalg.norm(columns, axis=0)
-    columns = columns[:, scale > 0] / scale[scale > 0]
-    if not columns.shape[1]:
-        return columns
-    vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
-    kept: np.ndarray = vectors[:, values > 1e-8 * values[0]]
-    return kept
 
 
 def _normal(squares: np.ndarray, k: int) -> np.ndarray:
