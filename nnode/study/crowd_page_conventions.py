@@ -86,9 +86,9 @@ def conventions(study: Crowd) -> list[Block]:
             "crowd_conventions_means",
             means,
             "What the same costs are in other means: least and greatest over all conventions in "
-            f"which people move, and in how many of these {COSTS['sf']} lies between the least "
-            "and the greatest over the first frames. With the paper's formula, 1/2 and the time "
-            "step are in it.",
+            f"which people move, and how many and which have {COSTS['sf']} between the least and "
+            "the greatest over their first frames. The paper's formula has the factor 1/2 and the "
+            "time step.",
             digits={"least": 3, "greatest": 3},
         ),
         TableBlock(
@@ -121,16 +121,20 @@ def _means(every: pd.DataFrame, step: float) -> pd.DataFrame:
     for half, time, person in product((True, False), (False, True), (False, True)):
         value = moving["printed"] * (1 if half else 2) * (step if time else 1)
         value = value / moving["people"] if person else value
-        groups = value.groupby(level=_LEVELS)
+        groups = value.groupby(level=_LEVELS, sort=False)
         between = (groups.min() <= COSTS["sf"]) & (COSTS["sf"] <= groups.max())
-        label = ("yes" if half else "no", "yes" if time else "no", "person" if person else
-                 "sequence")  # fmt: skip
+        label = (
+            *("yes" if on else "no" for on in (half, time)),
+            "person" if person else "sequence",
+        )
         rows[label] = {
-            "least": value.min(), "greatest": value.max(), "conventions around 5.0841":
-            int(between.sum()),
-        }  # fmt: skip
-    found = pd.DataFrame(rows).T.astype({"conventions around 5.0841": int})
-    found.index.names = ["factor 1/2", "time step", "mean over"]
+            "least": value.min(),
+            "greatest": value.max(),
+            "around": int(between.sum()),
+            "which": "; ".join(str(Convention(*at)) for at in between.index[between]) or "–",
+        }
+    found = pd.DataFrame.from_dict(rows, orient="index")
+    found.index = pd.MultiIndex.from_tuples(rows, names=["factor 1/2", "time step", "mean over"])
     return found
 
 
@@ -163,7 +167,7 @@ def _nearest(table: pd.DataFrame) -> str:
 
 
 def _reached(means: pd.DataFrame) -> str:
-    number = means["conventions around 5.0841"]
+    number = means["around"]
     ways = int(number.sum())
     if not ways:
         return (

@@ -15,8 +15,10 @@ from nnode.data.prepare import prepare
 from nnode.models.build import build_model
 from nnode.models.system import System
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver
+from nnode.study.crowd_conventions import Convention, Tracks, recording_file
 from nnode.study.crowd_data import chosen, prepare_horizon, sequences
 from nnode.study.crowd_fit import system_of
+from nnode.study.printed_crowd import PARAMETERS
 from nnode.study.printed_traffic import RECORDINGS
 from nnode.study.traffic_problem import Problem, model_options, recording
 
@@ -103,6 +105,32 @@ def test_crowd_costs_follow_from_the_parameters(
             found.append(float(sequence_costs(solver(system, batch), batch).mean()))
     assert min(found) == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
     assert 25 * min(found) == pytest.approx(told.loc[label, "here (m²)"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("how", "first"), [(Convention(), 0), (Convention("central", 25, "corridor"), 7)], ids=str
+)
+def test_open_conventions_follow_from_the_recording(
+    how: Convention, first: int, real_data: Path, tmp_path: Path
+) -> None:
+    table = pd.read_csv(
+        PUBLISHED.parent / "crowd" / "crowd_conventions.csv", index_col=[0, 1, 2, 3]
+    )
+    told = table.loc[(how.velocity, how.samples, how.destination, first)]
+    batch = Tracks.of(recording_file(str(real_data), str(tmp_path))).cut(how, first)
+    system, solver = (
+        system_of("sf", list(PARAMETERS.values())),
+        TorchdiffeqSolver("euler", "discrete"),
+    )
+    with torch.no_grad():
+        found = float(sequence_costs(solver(system, batch), batch).mean())
+    assert 25 * found == pytest.approx(told["printed"], rel=1e-6)
+    assert batch.agent.sum(1).double().mean().item() == pytest.approx(told["people"])
+    if how == Convention():
+        # the study's own costs, of another reader
+        costs = pd.read_csv(PUBLISHED.parent / "crowd" / "crowd_costs.csv", index_col=0)
+        row = costs.loc["SF, printed parameters", "here (m²)"]
+        assert told["printed"] == pytest.approx(row, rel=1e-9)
 
 
 @pytest.mark.parametrize("study", ["traffic", "crowd"])
