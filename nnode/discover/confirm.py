@@ -11,6 +11,8 @@ Source: Maurer, Hothorn & Lehmacher 1995 (fixed sequences of tests).
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from nnode.data.clusters import better, least_number
@@ -51,15 +53,22 @@ class Comparing:
     def __init__(
         self, domain: str, sequences: list[Sequence], base: System, label: np.ndarray
     ) -> None:
-        self._whole = engine_of(domain, sequences, whole=True)
-        self._windows = engine_of(domain, sequences, label)
-        for engine in (self._whole, self._windows):
-            engine.settle(base, row_of(base))
+        self._domain, self._sequences, self._base, self._label = domain, sequences, base, label
+        self._whole = engine_of(domain, sequences, label, whole=True)
+        self._whole.settle(base, row_of(base))
 
     @property
     def floor(self) -> float:
         """Mean square error of positions that is noise of the measurement, m²."""
         return self._whole.noise_floor()
+
+    @cached_property
+    def _windows(self) -> Engine:
+        if self._domain == "crowd":
+            return self._whole
+        found = engine_of(self._domain, self._sequences, self._label)
+        found.settle(self._base, row_of(self._base))
+        return found
 
     def squares(self, system: System) -> np.ndarray:
         """``(S,)`` mean square errors of positions, m²."""

@@ -20,7 +20,7 @@ AGAIN, STEP, EVERY = 12.0, 0.01, 10
 
 
 def crowds(
-    jupedsim: ModuleType, path: Path, *, number: int = 12, people: int = 6, seed: int = 0
+    jupedsim: ModuleType, path: Path, *, number: int = 18, people: int = 6, seed: int = 0
 ) -> Path:
     """A database of crowds that start from rest, and walk to the right end of a corridor.
 
