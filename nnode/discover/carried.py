@@ -163,7 +163,8 @@ class Curve:
             fall = np.exp(-self.lags / tau)
             mean = (weight * fall).sum() / weight.sum()
             away = fall - mean
-            height = float((weight * away * common).sum() / (weight * away**2).sum())
+            known = max(float((weight * away**2).sum()), 1e-300)
+            height = float((weight * away * common).sum()) / known
             height = max(height, 0.0)
             own = level - height * float(mean)
             left = float((weight * (common - own - height * fall) ** 2).sum())

@@ -75,7 +75,7 @@ class Individuals:
     def interval(self) -> tuple[float, float]:
         """Of 95 % of the strength."""
         half = float(stats.t.ppf(0.975, max(len(self.left_out) - 1, 1))) * self.error
-        low, high = (float(np.sqrt(max(self.variance + s * half, 0.0))) for s in (-1, 1))
+        low, high = (float(np.sqrt(np.maximum(self.variance + s * half, 0.0))) for s in (-1, 1))
         return self.effect.spread(low), self.effect.spread(high)
 
     def detectable(self, alpha: float, power: float = 0.8) -> float:
@@ -185,7 +185,9 @@ def _at(
         ]
     )
     error = float(np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum()))
-    p_value = float(stats.t.sf(own / error, count - 1)) if error > 0 and count > 1 else 1.0
+    if count < 3:  # as for all intervals
+        error = float("nan")
+    p_value = float(stats.t.sf(own / error, count - 1)) if error > 0 else 1.0
     return Individuals(
         effect=effect,
         options=options,

@@ -138,8 +138,8 @@ def _independence(d: Diagnosis) -> str:
     c = d.clusters
     return (
         f"One cluster are {c.why}; {c.simultaneous}. Every interval, test and fold goes by "
-        f"cluster. Of {c.open} open clusters no two-sided p-value can be below "
-        f"{amount(d.screen.floor, 2)}."
+        f"cluster. With {c.open} open {'cluster' if c.open == 1 else 'clusters'} no two-sided "
+        f"p-value can be below {amount(d.screen.floor, 2)}."
     )
 
 

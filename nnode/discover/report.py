@@ -145,9 +145,9 @@ def _verdict(d: Diagnosis) -> str:
         case "not_testable":
             c = d.clusters
             return (
-                "Not testable with these data: what can be tested is independent clusters, and "
-                f"there are {c.open} open and {c.sealed} sealed ones ({c.why} are one); about "
-                f"{c.enough} in all would do. Nothing is named."
+                f"Not testable with these data: there {'is' if c.open == 1 else 'are'} "
+                f"{_count(c.open, 'open cluster')} and {c.sealed} sealed (one cluster are "
+                f"{c.why}), and about {c.enough} in all would do. Nothing is named."
             )
         case "unknown":
             on = _listed(d.unknown.variables) if d.unknown else "variables that were not found"

@@ -97,9 +97,10 @@ class Sealed:
         self.whole = self._corrected = self._unbiased(found.fit)
         path = self._path(engine, found)
         scores, passed = self.comparing.scores, 0
-        before, square = scores(self.base), self.before.mean()
+        before, square = scores(self.base), np.nanmean(self.before)
         for fit in path:
-            after, error = scores(fit.system), self.comparing.squares(fit.system).mean()
+            after = scores(fit.system)
+            error = np.nanmean(self.comparing.squares(fit.system))
             p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
             self.tried.append(_Tried(p_value, float(square), float(error)))
             if not self.tried[-1].good:
@@ -173,7 +174,7 @@ class Sealed:
         p_value, means = 1.0, {}
         if found is not None:
             self._later[one.effect.name] = found
-            means = {model: float(costs.mean()) for model, costs in found.costs.items()}
+            means = {model: float(np.nanmean(costs)) for model, costs in found.costs.items()}
             own, *others = (found.scores[model] for model in (MODELS[1], MODELS[0], MODELS[2]))
             if not too_few(min(len(own), self.clusters)):
                 p_value = max(improvement(other, own) for other in others)
@@ -193,7 +194,7 @@ class Sealed:
             lags=one.lags,
             common=one.common,
             later=means,
-            confirmed=p_value,
+            confirmed=float("nan") if found is None else p_value,
             found=not hindered,
             named=not reason,
             reason=reason,
@@ -221,7 +222,7 @@ class Sealed:
             used, floor = list(range(len(self.sealed))), self.comparing.floor
             before = self.before
             after = before if extended is self.base else self.comparing.squares(extended)
-        first, last = float(before.mean()), float(after.mean())
+        first, last = float(np.nanmean(before)), float(np.nanmean(after))
         closed = (first - last) / (first - floor) if first > floor else float("nan")
         each = [
             {"name": self.sealed[i].name, "before": float(a), "after": float(b)}
@@ -234,7 +235,7 @@ def _hindered(one: Individuals, alpha: float, structure: bool, enough: bool) -> 
     """Why agents' own numbers are not found in the open clusters; empty where they are."""
     if not enough:
         return "there are too few clusters to test it"
-    if one.p_value > alpha or one.interval()[0] <= 0:
+    if one.p_value > alpha or not one.interval()[0] > 0:
         return "what an agent's numbers have in common over time does not stand out"
     if structure:
         return "something without a name is left, which numbers of agents would absorb"

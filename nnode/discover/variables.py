@@ -333,7 +333,9 @@ class _Look:
         inverse = np.linalg.inv(whole + penalty)
         amounts = inverse @ total
         shape = self.variable.heights(np.eye(number))
-        cov = shape @ inverse @ (self.parts.T @ self.parts) @ inverse @ shape.T
+        rest = score - np.einsum("gmn,n->gm", gram, amounts)
+        rest = rest * np.sqrt(count / max(count - 1, 1))
+        cov = shape @ inverse @ (rest.T @ rest) @ inverse @ shape.T
         return Curves(
             variable=self.variable,
             amounts=amounts,
