@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions
 from nnode.discover import pages
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.result import DataFault
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, Script, environment
 from tests.discover import stand_in
@@ -297,29 +295,16 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("by_hand")
-def test_faults_alone_are_the_verdict_where_nothing_is_missing(tmp_path: Path, monkeypatch) -> None:
+def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
     frame.to_csv(table, index=False)
-
-    def nothing(*arguments: Any, faults: dict[str, Any], stages: Any) -> Any:
-        found = stand_in.diagnose(*arguments, faults=faults)
-        known = faults["lane/1"][0]
-        # what the diagnosis reports itself: one fault that the reader knows, one of its own
-        again = DataFault(known.kind, known.sequence, ["1"], known.time)
-        mine = DataFault("overlap", "lane/2", ["0"], 3.0)
-        diagnosis = replace(found.diagnosis, verdict="none", data_faults=[again, mine])
-        return replace(found, diagnosis=diagnosis)
-
-    monkeypatch.setattr(app, "diagnose", nothing)
     report = app.diagnose_table(table, "traffic", model={"term": "lin"})
-    assert report["verdict"] == "data_fault"
-    faults = [(f["kind"], f["sequence"], f["agents"]) for f in report["data_faults"]]
-    assert ("overlap", "lane/2", ["0"]) in faults
-    assert sum(sequence == "lane/1" for _, sequence, _ in faults) == len(faults) - 1
-    assert all(agent.startswith("v1-") for _, s, agents in faults if s == "lane/1"
-               for agent in agents)  # fmt: skip
+    assert report["verdict"] == "named"
+    faults = {(fault["sequence"], *fault["agents"]) for fault in report["data_faults"]}
+    assert ("lane/1", "v1-1") in {fault[:2] for fault in faults}
+    assert "lane/1" not in report["split"]["open"] + report["split"]["sealed"]
 
 
 @pytest.mark.slow

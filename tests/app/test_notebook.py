@@ -18,7 +18,7 @@ from tests.discover.platoons import LENGTH, V0, platoons
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
     rows = []
-    for number, one in enumerate(platoons(number=6, seconds=8.0)):
+    for number, one in enumerate(platoons(number=14, seconds=8.0)):
         for k, time in enumerate(one.time):
             for i, x in enumerate(one.x[k, :, 0]):
                 rows.append((number, time, f"{number}/{i}", x))

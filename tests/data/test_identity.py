@@ -9,12 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from nnode.data.clusters import clusters
 from nnode.data.identity import given_anew, identify
 from nnode.data.options import Agents, Faults, SplitOptions, TableOptions
 from nnode.data.prepare import prepare
 from nnode.data.quality import LIMITS
 from nnode.data.sequence import Sequence
-from nnode.data.split import components, split
+from nnode.data.split import split
 
 DT = 0.1
 
@@ -52,7 +53,7 @@ def groups(sequences: list[Sequence], domain: str, mode: str = "auto") -> int:
         {"name": s.name, "recording": "run", "start": s.time[0], "end": s.time[-1], "agents": own}
         for s, own in zip(sequences, named, strict=True)
     ]
-    return len(set(components(index, 0.0)))
+    return len(set(clusters(index, 0.0).tolist()))
 
 
 both = pytest.mark.parametrize("domain", ["traffic", "crowd"])

@@ -36,7 +36,7 @@ def _case(folder: Path, domain: str, table: Path, walls: Path | None, model: Any
     inputs = read_inputs(data, folder / "data")
     full = model_options(model, "measured")
     system = build_model(full)
-    found = stand_in.diagnose(system, inputs.sequences, options, faults=inputs.faults)
+    found = stand_in.diagnose(system, inputs.sequences, options)
     return Case(table, walls, full, inputs, options, found)
 
 

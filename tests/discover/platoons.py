@@ -1,4 +1,4 @@
-"""Small platoons with known effects, by Runge and Kutta's method at a twentieth of the sampling
+"""Small platoons with known effects, by Runge and Kutta's method at a fifth of the sampling
 interval, written without the package's models."""
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from nnode.data.sequence import Sequence
 
-V0, LENGTH, DT, SUBSTEPS = 28.0, 6.0, 0.2, 20
+V0, LENGTH, DT, SUBSTEPS = 28.0, 6.0, 0.2, 5
 
 #: Of positions with the leader's, the law's speeds and the leader's speed: m/s of the followers.
 Effect = Callable[[np.ndarray, np.ndarray, float], np.ndarray]

@@ -12,16 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.deviation import simulate
 from nnode.discover.found import Found
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.result import (
     Absence,
+    Agents,
     Alternative,
+    Clusters,
     Coefficient,
+    Confirmation,
     Diagnosis,
+    FirstScreen,
     Gap,
     NamedEffect,
     Place,
@@ -62,7 +65,6 @@ def diagnose(
     sequences: list[Sequence],
     options: DiscoverOptions,
     *,
-    faults: dict[str, list[Fault]],
     stages: object = None,
 ) -> Found:
     """Results that a right diagnosis of :mod:`tests.discover.recorded` would come to."""
@@ -97,6 +99,7 @@ def diagnose(
         else [],
         p_value=0.001,
         gain=0.63,
+        confirmed=0.01,
     )
     costs = _costs((base, extended), [sequences[i] for i in sealed])
     before, after = costs.mean(0)
@@ -108,7 +111,26 @@ def diagnose(
             verdict="named",
             domain=system.domain,
             model="stand-in",
+            clusters=Clusters(
+                open=len(sequences) - number,
+                sealed=number,
+                least=11,
+                least_sealed=5,
+                enough=17,
+                why="sequences of a recording that share an agent",
+                simultaneous="no two clusters of a recording were there at one time",
+            ),
+            screen=FirstScreen(
+                p_value=0.001,
+                effect=name,
+                clusters=len(sequences) - number,
+                floor=0.001,
+                leads=[{"name": name, "share": 0.5, "p_value": 0.001, next(iter(values)): -0.3}],
+            ),
+            confirmation=Confirmation(0.01, number, True),
             effects=[effect],
+            leads=[],
+            agents=[drivers()] if traffic else [],
             data_faults=[],
             not_testable=["reaction_delay"] if traffic else [],
             absences=[
@@ -149,6 +171,27 @@ def diagnose(
         extended=extended,
         open=[i for i in range(len(sequences)) if i not in sealed],
         sealed=sealed,
+    )
+
+
+def drivers() -> Agents:
+    """Drivers who were found to differ, which sealed sequences did not confirm."""
+    return Agents(
+        name="driver_heterogeneity",
+        strength=0.05,
+        low=0.02,
+        high=0.07,
+        unit="1",
+        p_value=0.02,
+        lasts=8.0,
+        share={"recording": None, "sequence": 0.2, "agent": 0.5, "mood": 0.3},
+        lags=[2.0, 4.0, 8.0],
+        common=[0.004, 0.003, 0.0025],
+        later={"without numbers": 0.31, "own numbers": 0.32, "constant velocity": 0.9},
+        confirmed=0.4,
+        found=True,
+        named=False,
+        reason="the last part of the sealed sequences is not predicted better by own numbers",
     )
 
 

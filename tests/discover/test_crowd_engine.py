@@ -96,7 +96,7 @@ def test_rows_are_independent_of_each_other(engine: CrowdEngine) -> None:
 
 def test_the_true_model_leaves_white_noise(engine: CrowdEngine) -> None:
     residual = engine.residuals(model(), ROW[None])[0].numpy()
-    assert len(residual) == len(engine.sequence) == len(engine.block) == len(engine.unit)
+    assert len(residual) == len(engine.sequence) == len(engine.cluster) == len(engine.unit)
     each = residual.reshape(len(engine.windows.person), -1)
     np.testing.assert_allclose((each**2).mean(0), 1.0, atol=0.35)
     squares = engine.squares(model(), ROW)
@@ -256,7 +256,7 @@ def test_a_hidden_effect_scores_best_and_is_measured(
     fit = refine(engine, start)
     engine.settle(fit.system, row_of(fit.system))
     fit = refine(engine, fit.system)
-    screen = Screen(fit, engine.block)
+    screen = Screen(fit, engine.cluster)
     effects = [e for e in CATALOGUE.of("crowd") if not e.individual and e.kin != "place"]
     scores = screen.scores([t for e in effects for t in traces(engine, fit, e)])
     assert scores[0].effect.name == name

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -12,7 +14,10 @@ from nnode.models import System
 from nnode.models.build import build_model
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 
-OPTIONS = DiscoverOptions(effects=["relative_speed", "speed_zone"], sealed=0.25)
+OPTIONS = DiscoverOptions(effects=["relative_speed", "speed_zone"])
+
+#: Sixteen clusters: five of them are sealed, as many as it takes to confirm something.
+MANY: dict[str, Any] = {"number": 16, "seconds": 12.0, "driver": 0.1}
 
 
 def law() -> System:
@@ -23,7 +28,7 @@ def law() -> System:
 def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes() -> None:
     given = law()
     before = {name: value.clone() for name, value in given.state_dict().items()}
-    sequences = platoons(relative_speed(0.4), number=8, driver=0.2)
+    sequences = platoons(relative_speed(0.4), **MANY)
     found = diagnose(given, sequences, OPTIONS)
     d = found.diagnosis
     assert d.verdict == "named"
@@ -36,10 +41,18 @@ def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes() -> 
     assert kappa.low < 0.4 < kappa.high
     assert kappa.unit == "1"
     assert [one.name for one in d.absences] == ["speed_zone"]
-    # two sequences were sealed, and every one is predicted better
+    assert d.leads == d.agents == d.data_faults == []
+    # eleven open clusters: no two-sided p-value is below 2^-10
+    assert (d.clusters.open, d.clusters.sealed) == (d.screen.clusters, 5) == (11, 5)
+    assert d.screen.floor == 2**-10
+    assert d.screen.floor <= effect.p_value
+    assert (d.screen.effect, d.screen.p_value) == ("relative_speed", effect.p_value)
+    # five sequences were sealed, every one is predicted better: the least p that they allow
+    assert d.confirmation.confirmed
+    assert d.confirmation.p_value == effect.confirmed == 2**-5
     assert sorted(d.split["open"] + d.split["sealed"]) == sorted(s.name for s in sequences)
     assert [one["name"] for one in d.sealed] == d.split["sealed"]
-    assert len(d.split["sealed"]) == 2
+    assert len(d.split["sealed"]) == 5
     assert all(one["after"] < one["before"] for one in d.sealed)
     gap = d.gap
     assert gap.closed == pytest.approx((gap.before - gap.after) / (gap.before - gap.noise_floor))
@@ -52,9 +65,10 @@ def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes() -> 
 
 
 def test_nothing_is_named_where_the_law_is_right() -> None:
-    found = diagnose(law(), platoons(number=8, driver=0.2), OPTIONS)
+    found = diagnose(law(), platoons(**MANY), OPTIONS)
     d = found.diagnosis
-    assert (d.verdict, d.effects, d.unknown) == ("none", [], None)
+    assert (d.verdict, d.effects, d.leads, d.unknown) == ("none", [], [], None)
+    assert (d.confirmation.confirmed, d.confirmation.p_value) == (None, None)
     assert {one.name for one in d.absences} == {"relative_speed", "speed_zone"}
     kappa = next(one for one in d.absences if one.name == "relative_speed")
     assert kappa.testable

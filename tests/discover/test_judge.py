@@ -10,20 +10,21 @@ import torch
 
 from nnode.discover import judge
 from nnode.discover.figures.marks import flexible_curve
-from nnode.discover.judge import POWER, WIDE, _absence
+from nnode.discover.judge import _absence
+from nnode.discover.power import Way
 from nnode.discover.result import Absence, Coefficient
-from nnode.discover.score import Score, Screen
+from nnode.discover.score import Evidence, Score, Screen
 from nnode.discover.variables import Curves, Variable
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.following import ReactionDelay, RelativeSpeed
 
 
 def curves(heights: list[float], errors: list[float], removed: float, name: str = "gap") -> Curves:
-    """A curve of a variable with knots at 0, 10, 20, ..."""
+    """A curve of a variable with knots at 0, 10, 20, ..., compared on 16 clusters."""
     knots = tuple(10.0 * k for k in range(len(heights)))
     variable = Variable(name, "m", lambda s: s.x[..., 0], knots, lambda s: torch.ones_like(s.x))
     return Curves(
-        variable, np.zeros(1), np.array(heights), np.array(errors), np.zeros(1), cast(Any, None),
+        variable, np.zeros(1), np.array(heights), np.array(errors), np.zeros(16), cast(Any, None),
         0.001, np.zeros(1), removed,
     )  # fmt: skip
 
@@ -37,8 +38,8 @@ def test_a_place_is_the_stretch_of_one_sign_around_the_highest_knot() -> None:
     assert found.deviation == pytest.approx((4 * 2.0 + 4 * 4.0 + 16 * 1.0) / 24)
     assert found.error == pytest.approx(24**-0.5)
     assert found.share == pytest.approx(0.25)
-    # the two-sided tail of 8 standard errors, for six knots that were looked at
-    assert found.p_value == pytest.approx(6 * 1.2441921e-15, rel=1e-6)
+    # Student's two-sided tail of 8 standard errors, 15 degrees, for six knots that were looked at
+    assert found.p_value == pytest.approx(6 * 8.61093038e-7, rel=1e-6)
     assert found.curve["deviation"] == [0.1, 2.0, 4.0, 1.0, 0.0, -3.0]
     assert found.curve["at"] == [0.0, 10.0, 20.0, 30.0, 40.0, 50.0]
 
@@ -94,34 +95,61 @@ def test_scores_are_on_the_scale_of_a_standard_normal_variable() -> None:
     assert standardised(10.0) == pytest.approx(found)
 
 
+class Known:
+    """What is likely to be found, with 16 clusters.
+
+    Args:
+        sizes: that are detectable, by the size that was tried.
+    """
+
+    def __init__(self, sizes: dict[float, float]) -> None:
+        self.sizes, self.screen = sizes, self
+
+    def detectable(self, score: Score, one: Evidence, expected: float) -> float:
+        return self.sizes[one.size]
+
+    def costs(self, name: str) -> np.ndarray:
+        return np.ones(16)
+
+
+def evidence(size: float) -> Evidence:
+    return Evidence({}, size, np.zeros(16), np.ones(16))
+
+
 @pytest.mark.parametrize(
-    ("probes", "testable", "detectable"),
+    ("sizes", "testable", "detectable"),
     [
         # the long delay shakes the platoon: that says nothing of short ones
-        ([(0.3, 0.1), (0.8, 1e-4)], False, (3 + POWER) * 0.1),
-        ([(0.3, 0.3), (0.8, 1e-4)], False, 0.8),
-        ([(0.3, 0.01), (0.8, 1e-4)], True, 0.3),
+        ({0.3: 0.38, 0.8: 1e-3}, False, 0.38),
+        ({0.3: 1.1, 0.8: 1e-3}, False, 0.8),
+        ({0.3: 0.04, 0.8: 1e-3}, True, 0.3),
     ],
 )
 def test_a_delay_is_bounded_where_it_was_tried(
-    probes: list[tuple[float, float]], testable: bool, detectable: float
+    sizes: dict[float, float], testable: bool, detectable: float
 ) -> None:
-    score = Score(ReactionDelay, {}, 1.0, 0.5, 0.0, {"T": 1e-4}, {"T": 1e-4}, probes)
-    found = _absence(score, critical=3.0)
+    each = [evidence(size) for size in sizes]
+    score = Score(ReactionDelay, {}, 1.0, 0.5, 0.0, {"T": 1e-4}, {"T": 1e-4}, each)
+    found = _absence(score, cast(Way, Known(sizes)))
     assert found.testable == testable
     assert found.detectable == pytest.approx(detectable)
     assert (found.bound is not None) == testable
     assert ("0.3 s" in found.reason) != testable
 
 
-def test_an_effect_is_tested_where_one_of_usual_size_would_stand_out() -> None:
-    def of(error: float) -> Absence:
-        score = Score(RelativeSpeed, {}, 1.0, 0.5, 0.0, {"kappa": 0.01}, {"kappa": error})
-        return _absence(score, critical=3.0)
+def test_an_effect_is_tested_where_one_of_usual_size_would_be_named() -> None:
+    def of(detectable: float, error: float = 0.05) -> Absence:
+        one = [evidence(0.0)]
+        score = Score(RelativeSpeed, {}, 1.0, 0.5, 0.0, {"kappa": 0.01}, {"kappa": error}, one)
+        return _absence(score, cast(Way, Known({0.0: detectable})))
 
-    assert of(0.05).testable
-    assert of(0.05).bound == pytest.approx(0.01 + WIDE * 0.05)
-    assert not of(0.1).testable
+    assert of(0.19).testable
+    # Student's quantile with 15 degrees
+    assert of(0.19).bound == pytest.approx(0.01 + 2.13145 * 0.05, rel=1e-5)
+    assert not of(0.21).testable
+    assert of(0.21).bound is None
+    assert of(float("inf")).detectable is None
+    assert not of(0.0, error=0.0).testable
 
 
 def test_what_is_left_is_drawn_in_the_unit_of_its_variable() -> None:

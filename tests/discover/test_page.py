@@ -17,7 +17,7 @@ from nnode.discover.inputs import Inputs
 from nnode.discover.pages import draw, page_blocks
 from nnode.discover.pages_figures import Figures, telling
 from nnode.discover.report import sentence
-from nnode.discover.result import DataFault
+from nnode.discover.result import Confirmation, DataFault
 from nnode.models import build_model
 from nnode.models.build import add_effects
 from nnode.pages.page import Heading, Text
@@ -62,6 +62,7 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
     order = [
         "What is missing",
         "Faults of the measurement",
+        "Do agents differ?",
         "The model's own parameters",
         "Where model and measurement part",
         "What is left",
@@ -78,6 +79,8 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
         "car 1 jumps",
         "made by hand",
         "5 sequences were sealed",
+        "Of 3 open clusters no two-sided p-value can be below 0.001.",
+        "driver_heterogeneity: not named: the last part of the sealed sequences",
     ):
         assert words in page, words
 
@@ -125,12 +128,28 @@ def plain(case: Case, **changes: object) -> list[str]:
 
 def test_a_page_of_nothing_found(traffic: Case) -> None:
     words = plain(traffic, effects=[], verdict="none", unknown=None, places=[], absences=[],
-                  not_testable=[], sealed=[], base={}, notes=[])  # fmt: skip
+                  not_testable=[], sealed=[], base={}, notes=[], agents=[])  # fmt: skip
     assert "No effect of the catalogue was added to the model." in words
     assert "None: every sequence was used." in words
     assert "No structure that a flexible fit would find." in words
     assert "None was left to look for." in words
     assert not any("network" in text for text in words)
+    assert "Do agents differ?" not in words
+    assert "Found, not confirmed" not in words
+
+
+def test_what_was_not_confirmed_is_a_lead(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    no = Confirmation(0.4, 5, False, "the sealed clusters are not predicted better with it")
+    words = plain(traffic, effects=[], verdict="unconfirmed", leads=d.effects, confirmation=no)
+    assert "No effect of the catalogue was added to the model." in words
+    lead = "A lead to follow, not a finding: the sealed clusters are not predicted better with it."
+    assert words[words.index("Found, not confirmed") + 1] == lead
+
+
+def test_where_nothing_can_be_tested_the_first_screen_is_described(traffic: Case) -> None:
+    words = plain(traffic, effects=[], verdict="not_testable")
+    assert words[words.index("What one would look at first") + 1].startswith("A description of")
 
 
 def test_a_network_is_told_to_hide_effects(traffic: Case) -> None:
@@ -146,8 +165,10 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
     case = deepcopy(traffic)
     people = {case.inputs.sequences[0].name: [0.1, 0.0, -0.1, 0.0]}
     add_effects(case.found.extended, [{"name": "driver_heterogeneity", "people": people}])
-    words = plain(case)
+    (own,) = case.found.diagnosis.agents
+    words = plain(case, agents=[replace(own, named=True, reason="")])
     assert any("driver_heterogeneity has a number for every agent" in text for text in words)
+    assert any("with numbers from its first part" in text for text in words)
     assert any("for all others it does not act" in text for text in words)
 
 

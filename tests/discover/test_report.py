@@ -28,7 +28,14 @@ from nnode.discover.report import (
     sentence,
     write_report,
 )
-from nnode.discover.result import Alternative, Coefficient, DataFault, Gap, Verdict
+from nnode.discover.result import (
+    Alternative,
+    Coefficient,
+    Confirmation,
+    DataFault,
+    Gap,
+    Verdict,
+)
 from nnode.models import build_model
 from nnode.models.build import add_effects
 from nnode.models.effects.traffic import SpeedZone
@@ -51,7 +58,12 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     assert set(effect) >= {"coefficients", "where", "alternatives", "formula", "source", "p_value"}
     assert set(effect["coefficients"]["alpha"]) == {"value", "low", "high", "unit"}
     assert report["not_testable"] == ["reaction_delay"]
-    assert report["data_faults"] == []
+    assert report["data_faults"] == report["leads"] == []
+    assert report["clusters"]["open"] + report["clusters"]["sealed"] == 5
+    assert set(report["screen"]) >= {"p_value", "clusters", "floor", "leads"}
+    assert report["confirmation"]["confirmed"] is True
+    (drivers,) = report["agents"]
+    assert drivers["share"] == {"recording": None, "sequence": 0.2, "agent": 0.5, "mood": 0.3}
     assert {"name", "before", "after"} == set(report["sealed"][0])
 
 
@@ -90,7 +102,11 @@ def test_an_estimate_has_the_digits_that_its_interval_leaves(
         ("none", "Nothing is missing from the model stand-in that these data could show"),
         ("unknown", "Beyond speed_zone the model stand-in lacks something that is not in the"),
         ("indistinguishable", "cannot tell whether it is speed_zone or rather inertia"),
-        ("data_fault", "The measurement is at fault, not the model: 1 fault in 1 sequence;"),
+        (
+            "unconfirmed",
+            "Not confirmed: in the open data the model stand-in seems to lack inertia, ",
+        ),
+        ("not_testable", "there are 3 open and 2 sealed ones (sequences of a recording that share"),
     ],
 )
 def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str) -> None:
@@ -100,21 +116,44 @@ def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str
         d,
         verdict=verdict,
         effects=[replace(effect, alternatives=[Alternative("inertia", 1.0, 0.5)])],
-        data_faults=[DataFault("jump", "lane/1", ["v1"], 3.0)],
+        leads=[replace(effect, name="inertia")] if verdict == "unconfirmed" else [],
+        confirmation=Confirmation(0.4, 5, False, "the sealed clusters are no better"),
         gap=Gap(5.0, 1.0, 0.5, 8 / 9),
     )
     assert words in sentence(d)
     assert sentence(d).endswith(".")
     if verdict == "named":
         assert "(89 % of what can be closed above the noise floor of 0.5 m²)" in sentence(d)
+    if verdict == "unconfirmed":
+        assert sentence(d).endswith("clusters are no better. It is not added to the model.")
+    if verdict == "not_testable":
+        assert sentence(d).endswith("about 17 in all would do. Nothing is named.")
 
 
-def test_numbers_of_agents_are_no_prediction(traffic: Case) -> None:
+def test_faults_of_the_measurement_stand_beside_the_verdict(traffic: Case) -> None:
+    plain = traffic.found.diagnosis
+    jumps = [DataFault("jump", f"lane/{i}", ["v1"], 3.0) for i in (1, 1, 2)]
+    d = replace(plain, data_faults=jumps)
+    assert sentence(d) == (
+        f"{sentence(plain)} Beside that the measurement holds 3 faults in 2 sequences, which were "
+        "left out."
+    )
+
+
+def test_what_was_not_confirmed_is_said_beside_what_was(traffic: Case) -> None:
     d = traffic.found.diagnosis
     (effect,) = d.effects
-    assert "half of his own time" not in sentence(d)
+    d = replace(d, leads=[replace(effect, name="inertia")])
+    assert "lacks speed_zone" in sentence(d)
+    assert sentence(d).endswith(" inertia was found too, but not confirmed.")
+
+
+def test_numbers_of_agents_come_from_the_first_part_of_their_time(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    (effect,) = d.effects
+    assert "the first" not in sentence(d)
     d = replace(d, effects=[effect, replace(effect, name="driver_heterogeneity")])
-    assert sentence(d).endswith("taken from the other half of his own time.")
+    assert sentence(d).endswith("each agent's number being taken from the first.")
 
 
 @pytest.mark.parametrize("name", ["traffic", "crowd"])

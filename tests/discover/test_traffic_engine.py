@@ -9,9 +9,8 @@ import torch
 from nnode.data.sequence import Sequence
 from nnode.discover.compare import compare, heldout
 from nnode.discover.engine import row_of
-from nnode.discover.fit import Fit, evaluated, refine, sums
-from nnode.discover.individual import Individuals, individuals, sharpened
-from nnode.discover.score import Screen, traces
+from nnode.discover.fit import Fit, refine, sums
+from nnode.discover.score import traces
 from nnode.discover.search import search, settled
 from nnode.discover.smooth import noise_variance, smooth, velocity
 from nnode.discover.traffic import FORGET, LARGE, TrafficEngine, drawn_in
@@ -19,7 +18,6 @@ from nnode.discover.variables import curves, weighed
 from nnode.models import System
 from nnode.models.build import add_effects, build_model
 from nnode.models.effects import CATALOGUE
-from nnode.models.extend import extended
 from tests.discover.platoons import LENGTH, V0, delayed, platoons, relative_speed
 
 
@@ -71,7 +69,9 @@ def test_windows_share_out_what_is_compared() -> None:
     forgotten = int(FORGET / long[0].dt + 1e-9)
     assert len(whole.sequence) == 2 * (samples - 1) * (vehicles - 1)
     assert len(engine.sequence) == 2 * (samples - 1 - forgotten) * (vehicles - 1)
-    assert set(engine.block[engine.sequence == 1]).isdisjoint(engine.block[engine.sequence == 0])
+    assert set(engine.cluster[engine.sequence == 1]).isdisjoint(
+        engine.cluster[engine.sequence == 0]
+    )
 
 
 def test_large_residuals_are_drawn_in() -> None:
@@ -138,7 +138,7 @@ def test_a_hidden_effect_is_named_and_measured(reacting: list[Sequence]) -> None
     found = search(engine, base, CATALOGUE.of("traffic"))
     assert [step.chosen.name for step in found.steps] == ["relative_speed"]
     i = found.fit.names.index("terms.1.kappa")
-    low, high = found.fit.intervals(engine.sequence)[i]
+    low, high = found.fit.intervals(engine.cluster)[i]
     assert found.fit.row[i] == pytest.approx(0.4, abs=0.05)
     assert low < 0.4 < high
 
@@ -163,79 +163,13 @@ def test_curves_find_the_variable_of_an_effect() -> None:
     assert best.gain.low > 0
 
 
-def paced(own: np.ndarray) -> list[Sequence]:
-    """Sequences whose drivers have the paces ``(S, 4)``."""
-    made = []
-    for s, pace in enumerate(own):
-        (one,) = platoons(lambda x, law, lead, pace=pace: law * (1 + pace), number=1, seed=s)
-        made.append(Sequence(name=f"r/{s}", recording="r", time=one.time + 100 * s, x=one.x))
-    return made
-
-
-def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, Individuals, float]:
-    """What is found of different drivers, and the p-value of that."""
-    engine = TrafficEngine(sequences)
-    fit = settled(engine, model())
-    found = individuals(engine, fit, CATALOGUE.effects["driver_heterogeneity"])  # type: ignore[arg-type]
-    assert found is not None
-    (score,) = Screen(fit, engine.block).scores([], [found])
-    return engine, fit, found, score.p_value
-
-
-def test_drivers_who_differ_are_recognised() -> None:
-    pace = np.random.default_rng(5).normal(0, 0.1, (12, 4))
-    engine, fit, found, p_value = who_differs(paced(pace))
-    assert p_value < 0.01
-    assert found.interval[0] > 0.04
-    linear = np.array([found.people[f"r/{s}"][:4] for s in range(12)])
-    assert np.corrcoef(linear.ravel(), pace.ravel())[0, 1] > 0.8
-    # around the motion that the numbers lead to, they come nearer to the truth
-    system, _ = extended(fit.system, found.effect(people=found.people))
-    near = sharpened(engine, system, found)
-    own = np.array([near.people[f"r/{s}"][:4] for s in range(12)])
-    away = pace - pace.mean()
-    errors = [np.abs(each - each.mean() - away).mean() for each in (own, linear)]
-    assert errors[0] < errors[1]
-
-
-@pytest.mark.parametrize(
-    "what", ["the hour", pytest.param("the place in the platoon", marks=pytest.mark.thorough)]
-)
-def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
-    alarms = 0
-    for seed in range(6, 12):
-        rng = np.random.default_rng(seed)
-        common = rng.normal(0, 0.1, (12, 1) if what == "the hour" else (1, 4))
-        *_, p_value = who_differs(paced(np.broadcast_to(common, (12, 4))))
-        alarms += p_value <= 0.05
-    # one of twenty is expected; two of six would be a chance of 3 %
-    assert alarms <= 1
-
-
 # -- statistics ------------------------------------------------------------------------------
-
-
-def test_false_alarms_of_the_largest_score_are_held(plain: list[Sequence]) -> None:
-    """Residuals that depend on each other within a block, many directions, nothing hidden."""
-    engine = TrafficEngine(plain)
-    fit = evaluated(engine, model())
-    rng = np.random.default_rng(2)
-    found = [trace for name in ("relative_speed", "speed_zone", "free_flow_speed", "inertia")
-             for trace in traces(engine, fit, CATALOGUE.effects[name])]  # fmt: skip
-    alarms = 0
-    for trial in range(60):
-        common = rng.normal(size=int(engine.block.max()) + 1)[engine.block]
-        fit.residual = rng.normal(size=len(fit.residual)) + 0.3 * common
-        scores = Screen(fit, engine.block, seed=trial).scores(found)
-        alarms += min(score.p_value for score in scores) <= 0.05
-    # 3 expected; above 8 would be a chance of 0.5 %
-    assert alarms <= 8
 
 
 def test_heldout_cost_is_that_of_a_refit(reacting: list[Sequence]) -> None:
     engine = TrafficEngine(reacting)
     fit = settled(engine, model())
-    losses = heldout(fit, engine.sequence)
+    losses = heldout(fit, engine.cluster)
     rest = TrafficEngine(reacting[1:])
     rest.filter = engine.filter
     again = refine(rest, model(), tolerance=1e-8)

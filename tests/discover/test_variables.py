@@ -34,7 +34,8 @@ def _wavy(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def wavy() -> tuple[TrafficEngine, Fit]:
-    engine = TrafficEngine(platoons(_wavy, driver=0.1))
+    # as many clusters as it takes to be sure of one curve among many
+    engine = TrafficEngine(platoons(_wavy, number=16, driver=0.1))
     return engine, settled(engine, model())
 
 
