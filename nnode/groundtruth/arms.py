@@ -11,7 +11,7 @@ from nnode.errors import ConfigError
 from nnode.groundtruth import crowd_catalogue, faults, traffic_catalogue
 from nnode.groundtruth.case import ARMS, Case
 
-#: Kinds of data in which nothing is hidden; ``recording`` is one of traffic alone.
+#: Kinds of data in which nothing is hidden; ``recording`` is one of traffic alone, ``slow`` of crowds.
 NULLS = ("white", "autocorrelated", "windows", "heterogeneous")
 
 _COMMIT = re.compile(r"[0-9a-f]{40}([0-9a-f]{24})?")
@@ -80,7 +80,7 @@ def _crowd() -> dict[str, list[Hides]]:
     return {
         "single": [Hides((name,)) for name in crowd_catalogue.CATALOGUE],
         "pair": [Hides(pair) for pair in CROWD_PAIRS],
-        "nothing": [Hides((), variant) for variant in NULLS],
+        "nothing": [Hides((), variant) for variant in (*NULLS, "slow")],
         "outside": [Hides((name,)) for name in crowd_catalogue.OUTSIDE],
         "near_miss": [
             Hides(("obstacle",), "smooth"),

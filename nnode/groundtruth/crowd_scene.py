@@ -33,10 +33,11 @@ _GROUP_SIZES, _GROUP_SHARES = (1, 2, 3), (0.45, 0.4, 0.15)
 _CROSSING = 0.25
 #: Destinations lie so far ahead of the corridor's middle, m; of those who cross, nearer.
 _AHEAD, _AHEAD_CROSSING = 25.0, 13.0
-#: Walkers' disturbances are correlated over this time, s; where nothing is hidden and they are to
-#: last, longer than a window of the diagnosis is.
-_CORRELATION, _LASTING = (0.3, 0.6), (1.0, 2.0)
-_LAST = ("autocorrelated", "windows")
+#: Walkers' disturbances are correlated over this time, s. Of people in a corridor (Jülich, what the
+#: social force leaves) the correlation falls below 1/e within 0.1 s, and crosses zero after 0.2 s.
+_CORRELATION = (0.3, 0.6)
+#: The same where they last longer than a window of the diagnosis.
+_SLOW = (1.0, 2.0)
 #: Distance of people who all walk the same way, m.
 _LOOSE = 2.0
 
@@ -116,7 +117,7 @@ def set_scene(case: Case) -> Scene:
     steps = (round(BURN_IN / case.dt) + case.n_steps) * SUBSTEPS
     shape = (case.n_sequences, case.n_agents)
     rng = case.generator("walkers")
-    correlation = float(rng.uniform(*(_LASTING if case.variant in _LAST else _CORRELATION)))
+    correlation = float(rng.uniform(*(_SLOW if case.variant == "slow" else _CORRELATION)))
     kick = ornstein_uhlenbeck(
         rng,
         (*shape, 2, steps + 1),
