@@ -204,7 +204,7 @@ def _relative(effect: type[Effect], name: str, error: float) -> float:
 
 
 def places(found: list[Curves], excess: float) -> list[Place]:
-    """Where each curve stands out, the one that explains most first.
+    """Where each curve is largest of where it stands out, the one that explains most first.
 
     Args:
         found: with what they remove.
@@ -214,9 +214,10 @@ def places(found: list[Curves], excess: float) -> list[Place]:
     number = sum(len(one.heights) for one in found)
     for one in found:
         chance = tail(one, number)
-        best = int(np.argmin(chance))
-        if chance[best] > STANDS_OUT or one.removed <= 0:
+        known = chance <= STANDS_OUT
+        if not known.any() or one.removed <= 0:
             continue
+        best = int(np.argmax(np.where(known, np.abs(one.heights), 0.0)))
         sign = np.sign(one.statistic)
         alike = (sign == sign[best]) & (np.abs(one.statistic) > WIDE)
         first = last = best

@@ -11,7 +11,7 @@ from nnode.errors import ConfigError
 from nnode.groundtruth import crowd_catalogue, faults, traffic_catalogue
 from nnode.groundtruth.case import ARMS, Case
 
-#: Kinds of data in which nothing is hidden; ``recording`` is one of traffic alone, ``slow`` of crowds.
+#: Kinds of data in which nothing is hidden; ``recording`` is one of traffic, ``slow`` of crowds.
 NULLS = ("white", "autocorrelated", "windows", "heterogeneous")
 
 _COMMIT = re.compile(r"[0-9a-f]{40}([0-9a-f]{24})?")
