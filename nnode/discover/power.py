@@ -54,13 +54,14 @@ class Way:
         parts = rng.choice([-1.0, 1.0], (number, RUNS)) * rest[:, None] - size * grams
         name = score.effect.name
         passed = self.screen.statistic(one, parts) > self.screen.critical(name, self.alpha)
-        costs = self.screen.costs(name)[:, None]
+        costs = _with_effect(self.screen.costs(name)[:, None], parts, grams, size)
         others = -(parts.sum(0) - parts) / np.maximum(total - grams, 1e-300)
         gain = _gain(others, parts, grams, costs)
         passed &= _t(gain) > stats.t.ppf(1 - self.better, number - 1)
         amount = -parts.sum(0) / total
         error = np.sqrt((number - 1) / number * ((others - others.mean(0)) ** 2).sum(0))
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
+        costs = self.screen.costs(name)
         return float((passed & self._confirmed(rng, rest, one.grams, costs, size, amount)).mean())
 
     def _confirmed(
@@ -78,7 +79,7 @@ class Way:
         chosen = rng.integers(0, len(grams), (self.sealed, RUNS))
         drawn = grams[chosen]
         parts = rng.choice([-1.0, 1.0], chosen.shape) * rest[chosen] - size * drawn
-        gain = _gain(amount, parts, drawn, costs[:, 0][chosen])
+        gain = _gain(amount, parts, drawn, _with_effect(costs[chosen], parts, drawn, size))
         if self.sealed > 12:
             return _t(gain) > stats.t.ppf(1 - self.confirmed, self.sealed - 1)
         totals = every_sign(self.sealed) @ gain
@@ -96,6 +97,14 @@ class Way:
             return float(sizes[0])
         share = (POWER - powers[k - 1]) / (powers[k] - powers[k - 1])
         return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** share)
+
+
+def _with_effect(
+    costs: np.ndarray, parts: np.ndarray, grams: np.ndarray, size: float
+) -> np.ndarray:
+    """Costs of clusters to whose residuals an effect of a size was added, with its scores."""
+    found: np.ndarray = costs - 2 * size * parts - size**2 * grams
+    return np.maximum(found, 0.0)
 
 
 def _gain(

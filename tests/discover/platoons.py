@@ -77,6 +77,67 @@ def platoons(
     return found
 
 
+def streams(
+    *,
+    number: int = 8,
+    vehicles: int = 5,
+    seconds: float = 40.0,
+    window: float = 10.0,
+    noise: float = 0.02,
+    mood: float = 0.0,
+    lasts: float = 6.0,
+    pace: float = 0.0,
+    seed: int = 0,
+) -> list[Sequence]:
+    """Platoons that drive for long, cut into windows that keep names and clock.
+
+    Args:
+        mood: standard deviation, m/s, of an Ornstein-Uhlenbeck disturbance of every follower's
+            speed, of ``lasts`` s correlation.
+        pace: of the drivers' own paces, relative to the law.
+    """
+    rng = np.random.default_rng(seed)
+    half = DT / SUBSTEPS / 2
+    samples, warm = round(seconds / DT) + 1, round(15 / DT)
+    time = half * np.arange(2 * SUBSTEPS * (samples + warm) + 2)
+    each = [_leader(rng, time) for _ in range(number)]
+    lead, speed = (np.stack(parts) for parts in zip(*each, strict=True))
+    gap = LENGTH * V0 / (V0 - speed[:, :1])
+    x = lead[:, :1] - gap * np.arange(vehicles - 1, 0, -1.0)
+    push, own = mood * rng.normal(size=x.shape), 1 + pace * rng.normal(size=x.shape)
+    keep = np.exp(-2 * half / lasts)
+    rows = []
+
+    def rate(x: np.ndarray, i: int) -> np.ndarray:
+        return push + own * V0 * (1 - LENGTH / np.diff(np.append(x, lead[:, [i]], 1), axis=1))
+
+    for k in range(samples + warm):
+        if k >= warm:
+            rows.append(np.append(x, lead[:, [2 * SUBSTEPS * k]], 1))
+        for sub in range(SUBSTEPS):
+            i = 2 * (SUBSTEPS * k + sub)
+            k1 = rate(x, i)
+            k2 = rate(x + half * k1, i + 1)
+            k3 = rate(x + half * k2, i + 1)
+            k4 = rate(x + 2 * half * k3, i + 2)
+            x = x + 2 * half / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            push = keep * push + mood * np.sqrt(1 - keep**2) * rng.normal(size=x.shape)
+    place = np.array(rows) + noise * rng.normal(size=(samples, number, vehicles))
+    size = round(window / DT)
+    return [
+        Sequence(
+            name=f"r/{s}-{first // size}",
+            recording="r",
+            time=(seconds + 50) * s + DT * np.arange(first, first + size + 1),
+            x=place[first : first + size + 1, s, :, None],
+            agents=tuple(f"{s}-{n}" for n in range(vehicles)),
+            kind=("car", "truck", *["car"] * (vehicles - 2)),
+        )
+        for s in range(number)
+        for first in range(0, samples - size, size)
+    ]
+
+
 def relative_speed(kappa: float) -> Effect:
     """W + kappa (speed ahead - W), from the leader backwards."""
 
