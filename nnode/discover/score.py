@@ -7,9 +7,14 @@ is hidden. Each effect's statistic is compared with its own distribution under s
 least of these p-values over all effects with the distribution of the least: a search over many
 intervals, whose largest statistic is large by chance, does not raise the bar for the others.
 
+Residuals are not free of systematic errors: measured positions are smoothed, people are simulated
+among the measured paths of others who have reacted to them. Where nothing is hidden that makes
+some effects a twentieth of their least usual size, which many data would tell from nothing. So what
+is tested is whether an effect exceeds a tenth of that size.
+
 Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Hemerik, Goeman & Finos 2020
 (of scores that are free of nuisance parameters); Westfall & Young 1993 (least p-value over
-hypotheses).
+hypotheses); Murphy & Myors 1999 (tests of a minimal effect).
 """
 
 from __future__ import annotations
@@ -20,13 +25,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import stats
 
 from nnode.data.clusters import signs
 from nnode.discover.engine import Engine
 from nnode.discover.fit import Fit, sums
 from nnode.discover.fit import grams as grams_of
 from nnode.discover.leverage import blown_up, orthonormal
+from nnode.discover.standard import PRIOR, joint, standardised, usual_of
 from nnode.models.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
@@ -34,10 +39,8 @@ FLIPS = 1999
 #: A strength of which the plausible range allows less than this share speaks for something
 #: else; the linear estimate of a strong effect may overshoot.
 FORBIDDEN = 0.2
-#: So many usual clusters are added to the clusters that give an error.
-PRIOR = 12.0
-#: Median of the square of a standard normal variable.
-MEDIAN = 0.4549
+#: Effects up to this share of their least usual size are taken for none.
+MINIMAL = 0.1
 
 
 @dataclass
@@ -63,12 +66,14 @@ class Evidence:
         options: of the probe.
         size: of an effect with a memory, whose trace is that of a finite strength; otherwise 0.
         parts, grams: ``(G,)`` scores and their information.
+        minimal: amount that is taken for none.
     """
 
     options: dict[str, Any]
     size: float
     parts: np.ndarray
     grams: np.ndarray
+    minimal: float
 
 
 @dataclass
@@ -205,9 +210,11 @@ class Screen:
 
     def statistic(self, one: Evidence, parts: np.ndarray) -> np.ndarray:
         """``(R,)`` the statistic where the scores of a direction were ``parts`` ``(G, R)``."""
-        usual = self._usual(one.parts[:, None], one.grams[:, None])
+        usual = usual_of(one.parts[:, None], one.grams[:, None], self.variance)
         sizes = np.repeat(one.grams[:, None], parts.shape[1], 1)
-        return self._standardised(parts, sizes, np.ones((1, len(parts))), usual)[0]
+        amount = -parts.sum(0) / max(float(one.grams.sum()), 1e-300)
+        parts = parts + sizes * _less(amount, one.minimal)
+        return standardised(parts, sizes, np.ones((1, len(parts))), usual)[0]
 
     def costs(self, name: str) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters that tell of an effect."""
@@ -230,7 +237,10 @@ class Screen:
         z, label = self.beyond(trace.columns), self.label(trace.effect.name)
         parts = self.parts(z, label)
         grams = grams_of(z, label)
-        chance = self._joint(parts, grams, self._flips(trace.effect.name))
+        minimal = minimal_of(trace.effect, z.shape[1])
+        less = _less(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
+        beyond = parts + grams @ less
+        chance = joint(beyond, grams, self._flips(trace.effect.name), self.variance)
         statistic = float(chance[0])
         amount, error, gain = self._estimate(parts, grams)
         (probe,) = trace.probes
@@ -247,7 +257,8 @@ class Screen:
         self._by_chance(trace.effect.name, chance)
         size = max(map(abs, probe.steps.values())) if trace.effect.memory else 0.0
         evidence = [
-            Evidence(probe.options, size, parts[:, i], grams[:, i, i]) for i in range(z.shape[1])
+            Evidence(probe.options, size, parts[:, i], grams[:, i, i], minimal[i])
+            for i in range(z.shape[1])
         ]
         return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors, evidence)
 
@@ -272,8 +283,10 @@ class Screen:
         if not size.size:
             return []
         first, last = first[usable], last[usable]
-        usual = self._usual(parts, np.einsum("bii->bi", grams))
-        flipped = self._standardised(each, sizes, self._flips(trace.effect.name), usual)
+        usual = usual_of(parts, np.einsum("bii->bi", grams), self.variance)
+        (minimal,) = minimal_of(trace.effect, 1)
+        beyond = each + sizes * _less(-each.sum(0) / size, minimal)
+        flipped = standardised(beyond, sizes, self._flips(trace.effect.name), usual)
         self._by_chance(trace.effect.name, flipped.max(1))
         total = each.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
@@ -292,66 +305,9 @@ class Screen:
             Score(
                 trace.effect, options, float(flipped[0].max()), 1.0, float(gain[i]),
                 {name: float(amount)}, {name: float(error)},
-                [Evidence(options, 0.0, each[:, i], sizes[:, i])],
+                [Evidence(options, 0.0, each[:, i], sizes[:, i], minimal)],
             )
         ]  # fmt: skip
-
-    def _usual(self, parts: np.ndarray, sizes: np.ndarray) -> float:
-        """Variance of a cluster's score in units of its information.
-
-        The residuals' own variance if they were independent; more where they last. The median
-        does not mind some clusters in which there is an effect.
-        """
-        known = sizes > 1e-9 * max(float(sizes.max()), 1e-300)
-        if not known.any():
-            return self.variance
-        found = float(np.median(parts[known] ** 2 / sizes[known])) / MEDIAN
-        return max(found, self.variance)
-
-    def _standardised(
-        self, parts: np.ndarray, sizes: np.ndarray, signs: np.ndarray, usual: float
-    ) -> np.ndarray:
-        """``(F, C)`` absolute sums on the scale of a standard normal variable.
-
-        What the effect itself explains is no part of the error; otherwise no statistic could
-        exceed the root of the number of clusters. Where few of them carry the information, the
-        error is drawn towards the usual one.
-
-        Args:
-            parts, sizes: ``(G, C)`` scores and their information.
-            signs: ``(F, G)``.
-            usual: see :meth:`_usual`.
-        """
-        total, squares, size = signs @ parts, (parts**2).sum(0), sizes.sum(0)
-        empty = ~(size > 0)
-        if empty.all():
-            return np.zeros(total.shape)
-        sizes, size = np.where(empty, 1.0, sizes), np.where(empty, float(len(sizes)), size)
-        amount = total / size
-        rest = squares - 2 * amount * (signs @ (parts * sizes)) + amount**2 * (sizes**2).sum(0)
-        blocks = size**2 / (sizes**2).sum(0)
-        variance = (blocks * np.maximum(rest, 0) + PRIOR * usual * size) / (blocks + PRIOR)
-        return _wallace(total**2 / variance, blocks + PRIOR - 1)
-
-    def _joint(self, parts: np.ndarray, grams: np.ndarray, signs: np.ndarray) -> np.ndarray:
-        """``(F,)`` a statistic of the k sums ``(G, k)`` together under flips."""
-        k = parts.shape[1]
-        if k == 1:
-            sizes = grams[:, :, 0]
-            return self._standardised(parts, sizes, signs, self._usual(parts, sizes))[:, 0]
-        total = signs @ parts
-        amount = total @ np.linalg.pinv(grams.sum(0), rcond=1e-10)
-        rest = signs[:, :, None] * parts - np.einsum("bij,fj->fbi", grams, amount)
-        whole = grams.sum(0)
-        size = np.trace(grams, axis1=1, axis2=2)
-        blocks = float(size.sum() ** 2 / (size**2).sum())
-        spread = np.einsum("fbi,fbj->fij", rest, rest)
-        usual = self._usual(parts, np.einsum("bii->bi", grams))
-        spread = (blocks * spread + PRIOR * usual * whole) / (blocks + PRIOR)
-        spread += 1e-12 * np.trace(whole) * np.eye(k)
-        squares = np.einsum("fi,fi->f", total, np.linalg.solve(spread, total[..., None])[..., 0])
-        degrees = np.array(blocks + PRIOR - 1)
-        return _normal(_wallace(squares, degrees) ** 2, k)
 
     def _estimate(
         self, parts: np.ndarray, grams: np.ndarray
@@ -365,27 +321,21 @@ class Screen:
         return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
 
 
+def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
+    """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
+    not say what size is usual."""
+    found = [MINIMAL * (one.usual or 0.0) for one in effect.strengths.values()]
+    return np.array(found or [0.0] * number)[:number]
+
+
+def _less(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
+    """What is taken off amounts to bring them nearer to none."""
+    found: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
+    return found
+
+
 def at_least(values: np.ndarray) -> np.ndarray:
     """``(F,)`` share of the values that are at least as large as each, but for rounding."""
     order = np.sort(values)
     below = np.searchsorted(order, values * (1 - 1e-12), side="left")
     return 1 - below / len(values)
-
-
-def _wallace(squares: np.ndarray, degrees: np.ndarray) -> np.ndarray:
-    """Squares of Student's t on the scale of a normal variable.
-
-    Source: Wallace 1959, Annals of Mathematical Statistics 30.
-    """
-    factor = (8 * degrees + 1) / (8 * degrees + 3)
-    found: np.ndarray = factor * np.sqrt(degrees * np.log1p(squares / degrees))
-    return found
-
-
-def _normal(squares: np.ndarray, k: int) -> np.ndarray:
-    """Sums of k squares on the scale of a standard normal variable."""
-    if k == 1:
-        return np.sqrt(np.maximum(squares, 0))
-    tail = stats.chi2.sf(np.maximum(squares, 0), k)
-    found: np.ndarray = np.sqrt(stats.chi2.isf(np.maximum(tail, 1e-300), 1))
-    return found

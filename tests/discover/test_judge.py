@@ -13,7 +13,8 @@ from nnode.discover.figures.marks import flexible_curve
 from nnode.discover.judge import _absence
 from nnode.discover.power import Way
 from nnode.discover.result import Absence, Coefficient
-from nnode.discover.score import Evidence, Score, Screen
+from nnode.discover.score import Evidence, Score
+from nnode.discover.standard import standardised as scaled
 from nnode.discover.variables import Curves, Variable
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.following import ReactionDelay, RelativeSpeed
@@ -82,9 +83,7 @@ def test_scores_are_on_the_scale_of_a_standard_normal_variable() -> None:
     signs = np.ones((1, 25))
 
     def standardised(factor: float) -> np.ndarray:
-        found = Screen._standardised(
-            cast(Any, None), factor * parts, factor**2 * sizes, signs, usual=9.0
-        )
+        found = scaled(factor * parts, factor**2 * sizes, signs, usual=9.0)
         return np.asarray(found[0])
 
     found = standardised(1.0)
@@ -113,7 +112,7 @@ class Known:
 
 
 def evidence(size: float) -> Evidence:
-    return Evidence({}, size, np.zeros(16), np.ones(16))
+    return Evidence({}, size, np.zeros(16), np.ones(16), 0.0)
 
 
 @pytest.mark.parametrize(

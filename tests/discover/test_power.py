@@ -58,7 +58,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     if score.p_value > ALPHA or test.p_value >= BETTER or low <= 0 <= high:
         return False
     # sealed clusters are like the open ones
-    picked = np.concatenate([np.flatnonzero(LABEL == k) for k in rng.integers(0, OPEN, sealed)])
+    picked = np.concatenate([np.flatnonzero(k == LABEL) for k in rng.integers(0, OPEN, sealed)])
     label = np.repeat(np.arange(sealed), EACH)
     there = drawn(rng, label) - size * columns[picked, 1]
     before = sums((there + columns[picked, 0] * fit.row[0]) ** 2, label)
