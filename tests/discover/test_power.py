@@ -21,6 +21,7 @@ OPEN, EACH, ALPHA = 30, 12, 0.05
 #: What one parameter of a model and the effect do to the residuals of open and sealed clusters.
 RNG = np.random.default_rng(8)
 LABEL = np.repeat(np.arange(OPEN), EACH)
+ROWS = np.arange(OPEN * EACH).reshape(OPEN, EACH)
 PARAMETER, EFFECT = RNG.normal(size=(2, OPEN * EACH))
 KNOWN = RNG.uniform(0.5, 1.5, OPEN)[LABEL]
 
@@ -58,7 +59,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     if score.p_value > ALPHA or test.p_value >= BETTER or low <= 0 <= high:
         return False
     # sealed clusters are like the open ones
-    picked = np.concatenate([np.flatnonzero(k == LABEL) for k in rng.integers(0, OPEN, sealed)])
+    picked = ROWS[rng.integers(0, OPEN, sealed)].ravel()
     label = np.repeat(np.arange(sealed), EACH)
     there = drawn(rng, label) - size * columns[picked, 1]
     before = sums((there + columns[picked, 0] * fit.row[0]) ** 2, label)

@@ -1,0 +1,121 @@
+"""Which clusters are kept for the end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nnode.data.sequence import Sequence
+from nnode.discover.division import Division, divide
+from nnode.discover.options import DiscoverOptions
+from nnode.errors import DataError
+
+
+def recorded(*agents: str, every: float = 20.0) -> list[Sequence]:
+    """Short sequences of a recording, each with the agents whose letters are given."""
+    found = []
+    for number, names in enumerate(agents):
+        x = np.zeros((3, len(names), 1)) + np.arange(len(names))[:, None]
+        found.append(
+            Sequence(
+                name=f"r/{number}",
+                recording="r",
+                time=every * number + np.arange(3),
+                x=x,
+                agents=tuple(names),
+            )
+        )
+    return found
+
+
+def alone(number: int) -> list[Sequence]:
+    return recorded(*[chr(200 + 2 * i) + chr(201 + 2 * i) for i in range(number)])
+
+
+def assert_sound(found: Division, sequences: list[Sequence]) -> None:
+    """Every sequence once, no cluster on both sides, at least half of them open."""
+    assert sorted(found.open + found.sealed) == list(range(len(sequences)))
+    assert not set(found.label[found.open]) & set(found.label[found.sealed])
+    assert 0 < len(found.sealed) <= len(sequences) / 2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_five_of_sixteen_clusters_are_sealed_as_it_takes_to_confirm(seed: int) -> None:
+    sequences = alone(16)
+    found = divide(sequences, DiscoverOptions(seed=seed))
+    assert_sound(found, sequences)
+    assert (found.number(found.open), found.number(found.sealed), found.note) == (11, 5, "")
+    again = divide(sequences, DiscoverOptions(seed=seed))
+    assert (again.open, again.sealed) == (found.open, found.sealed)
+
+
+def test_another_seed_seals_other_clusters() -> None:
+    drawn = {tuple(divide(alone(16), DiscoverOptions(seed=seed)).sealed) for seed in range(5)}
+    assert len(drawn) > 1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_whole_clusters_are_sealed_but_never_more_than_half_of_the_sequences(seed: int) -> None:
+    # clusters of 1 to 6 sequences in no order, and one that holds half of them all
+    sizes = [1, 4, 2, 6, 1, 3, 5, 2, 24]
+    names = [chr(200 + cluster) for cluster, size in enumerate(sizes) for _ in range(size)]
+    order = np.random.default_rng(seed).permutation(len(names))
+    sequences = recorded(*[names[i] + chr(400 + int(i)) for i in order])
+    for share in (0.1, 0.3, 0.6, 0.9):
+        found = divide(sequences, DiscoverOptions(seed=seed, sealed=share))
+        assert_sound(found, sequences)
+        assert found.number([*found.open, *found.sealed]) == len(sizes)
+        assert found.number(found.sealed) <= max(round(share * len(sizes)), 1)
+        assert found.note == ""
+
+
+def test_one_cluster_alone_gives_a_block_of_time_and_says_so() -> None:
+    # everybody is in two sequences: all of them hang together
+    sequences = recorded(*[chr(200 + i) + chr(201 + i) for i in range(20)])
+    found = divide(sequences, DiscoverOptions())
+    assert found.number(found.open) == found.number(found.sealed) == 1
+    assert "sealed are not independent of the others" in found.note
+    first, last = min(found.sealed), max(found.sealed)
+    assert found.sealed == list(range(first, last + 1))
+    who = {agent for i in found.sealed for agent in sequences[i].agents}
+    assert not who & {agent for i in found.open for agent in sequences[i].agents}
+
+
+def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
+    # two lanes side by side, whose sequences begin a second after each other
+    sequences = [
+        Sequence(
+            name=f"r/{i}{lane}",
+            recording="r",
+            time=20.0 * i + lane + np.arange(3),
+            x=np.zeros((3, 2, 1)) + np.arange(2)[:, None],
+            agents=(f"{i}{lane}a", f"{i}{lane}b"),
+        )
+        for i in range(16)
+        for lane in range(2)
+    ]
+    for together, number in ((False, 32), (True, 16)):
+        found = divide(sequences, DiscoverOptions(), together=together)
+        assert_sound(found, sequences)
+        assert found.number([*found.open, *found.sealed]) == number
+        assert found.why.endswith("or are there at one time") == together
+    assert len(found.sealed) == 10
+
+
+def test_the_gap_between_sequences_without_names_is_an_option() -> None:
+    sequences = [
+        Sequence(
+            name=f"r/{i}", recording="r", time=6.0 * i + np.arange(3),
+            x=np.zeros((3, 2, 1)) + np.arange(2)[:, None],
+        )
+        for i in range(16)
+    ]  # fmt: skip
+    found = divide(sequences, DiscoverOptions(gap=3.0))
+    assert found.number(found.open) == 11
+    assert "are closer than 3 s in time" in found.why
+    assert divide(sequences, DiscoverOptions()).note  # 4 s apart, so one chain
+
+
+def test_two_sequences_are_too_few() -> None:
+    with pytest.raises(DataError, match="at least 3 sequences without a fault, there are 2"):
+        divide(alone(2), DiscoverOptions())
