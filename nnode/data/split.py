@@ -130,7 +130,8 @@ def _by_block(index: Index, share: float, gap: float, rng: np.random.Generator) 
     return _checked(
         result,
         share,
-        "every other sequence shares an agent with the held-out block"
+        "every other sequence shares an agent with the held-out block (data.agents=sequence says "
+        "that identifiers mean something within their sequence alone)"
         if held
         else "the recordings hold too few sequences for a block of that share",
     )

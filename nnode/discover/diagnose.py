@@ -143,7 +143,8 @@ def diagnose(
     absent += [
         agents_absent(one, options.alpha / len(seen)) for one, agent in both if not agent.found
     ]
-    extended = sealed.with_numbers(engine, final, own)
+    changed = bool(found.steps or own)
+    extended = sealed.with_numbers(engine, final, own) if changed else base_system
     gap, each = sealed.gap(extended, own)
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
