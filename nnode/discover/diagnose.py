@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, cast
 
 import numpy as np
@@ -213,13 +214,16 @@ def _clusters(start: _Start, options: DiscoverOptions, effects: int) -> Clusters
     division = start.division
     least = least_number(options.alpha, hypotheses=max(effects, 1))
     least_sealed = least_number(LEVEL, sided=1)
-    enough = max(least_sealed / options.sealed, least / (1 - options.sealed))
+    enough = next(
+        number for number in count(2)
+        if least_sealed <= (held := round(options.sealed * number)) <= number - least
+    )  # fmt: skip
     return Clusters(
         open=int(start.engine.cluster.max()) + 1,
         sealed=0 if division.note else division.number(division.sealed),
         least=least,
         least_sealed=least_sealed,
-        enough=int(np.ceil(enough - 0.5)),
+        enough=enough,
         why=division.why,
         simultaneous=start.tested.plain(),
         note=division.note,
