@@ -15,8 +15,12 @@ V0, LENGTH, DT, SUBSTEPS = 28.0, 6.0, 0.2, 5
 Effect = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
-def _leader(rng: np.random.Generator, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    waves = [(rng.uniform(0.8, 2.0), rng.uniform(8, 30), rng.uniform(0, 6)) for _ in range(4)]
+def _leader(
+    rng: np.random.Generator, time: np.ndarray, calm: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    waves = [
+        (calm * rng.uniform(0.8, 2.0), rng.uniform(8, 30), rng.uniform(0, 6)) for _ in range(4)
+    ]
     speed = 17 + sum(a * np.sin(2 * np.pi * time / p + q) for a, p, q in waves)
     step = time[1] - time[0]
     place = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2) * step])
@@ -31,17 +35,19 @@ def platoons(
     seconds: float = 20.0,
     noise: float = 0.02,
     driver: float = 0.0,
+    calm: float = 1.0,
     seed: int = 0,
 ) -> list[Sequence]:
-    """Platoons behind a leader whose speed varies; ``driver`` is the standard deviation (m/s) of
-    an Ornstein-Uhlenbeck disturbance of every follower's speed with 3 s correlation."""
+    """Platoons behind a leader whose speed varies, ``calm`` times as much; ``driver`` is the
+    standard deviation (m/s) of an Ornstein-Uhlenbeck disturbance of every follower's speed with
+    3 s correlation."""
     rng = np.random.default_rng(seed)
     half = DT / SUBSTEPS / 2  # the leader is known at half steps
     samples, warm = round(seconds / DT) + 1, round(15 / DT)
     found = []
     for s in range(number):
         time = half * np.arange(2 * SUBSTEPS * (samples + warm) + 2)
-        lead, speed = _leader(rng, time)
+        lead, speed = _leader(rng, time, calm)
         gap = LENGTH * V0 / (V0 - speed[0])
         x = lead[0] - gap * np.arange(vehicles - 1, 0, -1.0)
         push = driver * rng.normal(size=vehicles - 1)

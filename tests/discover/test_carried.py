@@ -79,7 +79,7 @@ def test_an_agent_s_own_is_what_does_not_fall_with_the_lag() -> None:
         assert curve is not None
         # twelve parts: lags of one step up to the sixth, and wider ones
         assert curve.lags[:6] == pytest.approx([2.0, 4.0, 6.0, 8.0, 10.0, 12.0])
-        assert curve.lags[-1] <= 22.0
+        assert curve.lags[-1] <= 22.0 + 1e-6
         found.append(curve.fitted(curve.same, curve.between))
     error = np.std(found, 0, ddof=1) / np.sqrt(len(found))
     own, mood, tau = (np.mean(found, 0) - (0.04**2, 0.05**2, LASTS)) / error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -77,6 +78,25 @@ def test_nothing_is_named_where_the_law_is_right() -> None:
     assert d.base["lin.v0"]["after"] == pytest.approx(V0, rel=0.05)
     assert d.base["lin.L"]["after"] == pytest.approx(LENGTH, rel=0.05)
     assert d.gap.after == d.gap.before
+
+
+@pytest.mark.parametrize(("calm", "testable"), [(1.0, True), (0.05, False)])
+def test_a_desired_speed_can_be_tested_where_it_would_bind(calm: float, testable: bool) -> None:
+    sequences = platoons(**MANY, calm=calm)
+    options = DiscoverOptions(effects=["free_flow_speed"], structure=False)
+    d = diagnose(law(), sequences, options).diagnosis
+    assert d.verdict == "none"
+    (cap,) = d.absences
+    assert cap.testable == testable
+    assert d.not_testable == ([] if testable else ["free_flow_speed"])
+    if testable:
+        # nobody keeps to so low a speed; whether to a higher one the data do not tell
+        speeds = np.concatenate([np.diff(s.x[:, :-1, 0], axis=0).ravel() / 0.2 for s in sequences])
+        assert cap.bound is not None
+        assert np.quantile(speeds, 0.4) < cap.bound < np.quantile(speeds, 0.95)
+    else:
+        assert (cap.bound, cap.detectable) == (None, None)
+        assert cap.reason == "it acts too rarely in these data to be named"
 
 
 def test_two_sequences_are_too_few() -> None:

@@ -18,6 +18,7 @@ from nnode.discover.standard import standardised as scaled
 from nnode.discover.variables import Curves, Variable
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.following import ReactionDelay, RelativeSpeed
+from nnode.models.effects.traffic import FreeFlowSpeed
 
 
 def curves(heights: list[float], errors: list[float], removed: float, name: str = "gap") -> Curves:
@@ -149,6 +150,25 @@ def test_an_effect_is_tested_where_one_of_usual_size_would_be_named() -> None:
     assert of(0.21).bound is None
     assert of(float("inf")).detectable is None
     assert not of(0.0, error=0.0).testable
+
+
+def test_a_cap_is_absent_down_to_the_weakest_that_would_be_named() -> None:
+    class Caps(Known):
+        def power(self, score: Score, one: Evidence, size: float) -> float:
+            assert size == 1.0  # it is there or not
+            return self.sizes[one.options["v_max"]]
+
+    def of(powers: dict[float, float]) -> Absence:
+        # the higher the cap the less it does
+        caps = [Evidence({"v_max": v}, 0.0, np.zeros(16), np.ones(16) / v) for v in powers]
+        score = Score(FreeFlowSpeed, {}, 1.0, 0.5, 0.0, {}, {}, caps)
+        return _absence(score, cast(Way, Caps(powers)))
+
+    found = of({12.0: 1.0, 15.0: 0.85, 18.0: 0.6})
+    assert (found.testable, found.detectable, found.bound) == (True, 15.0, 15.0)
+    rarely = of({12.0: 0.79, 15.0: 0.3})
+    assert (rarely.testable, rarely.detectable, rarely.bound) == (False, None, None)
+    assert rarely.reason == "it acts too rarely in these data to be named"
 
 
 def test_what_is_left_is_drawn_in_the_unit_of_its_variable() -> None:
