@@ -44,6 +44,7 @@ def calibrated(seed: int, noise: float) -> tuple[Fit, list[Sequence], CrowdEngin
     return refine(engine, system), data, engine
 
 
+@pytest.mark.thorough
 def test_a_bias_by_disturbances_is_taken_out() -> None:
     before, after = [], []
     for seed in range(3):
