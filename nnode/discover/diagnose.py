@@ -216,7 +216,7 @@ def _clusters(start: _Start, options: DiscoverOptions, effects: int) -> Clusters
     least_sealed = least_number(LEVEL, sided=1)
     enough = next(
         number for number in count(2)
-        if least_sealed <= (held := round(options.sealed * number)) <= number - least
+        if least_sealed <= round(options.sealed * number) <= number - least
     )  # fmt: skip
     return Clusters(
         open=int(start.engine.cluster.max()) + 1,
