@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -160,7 +161,7 @@ def test_a_cap_is_absent_down_to_the_weakest_that_would_be_named() -> None:
 
     def of(powers: dict[float, float]) -> Absence:
         # the higher the cap the less it does
-        caps = [Evidence({"v_max": v}, 0.0, np.zeros(16), np.ones(16) / v) for v in powers]
+        caps = [replace(evidence(0.0), options={"v_max": v}, grams=np.ones(16) / v) for v in powers]
         score = Score(FreeFlowSpeed, {}, 1.0, 0.5, 0.0, {}, {}, caps)
         return _absence(score, cast(Way, Caps(powers)))
 

@@ -79,7 +79,7 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
         "car 1 jumps",
         "made by hand",
         "5 sequences were sealed",
-        "Of 3 open clusters no two-sided p-value can be below 0.001.",
+        "3 open clusters no two-sided p-value can be below 0.001.",
         "driver_heterogeneity: not named: the last part of the sealed sequences",
     ):
         assert words in page, words

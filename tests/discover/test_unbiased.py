@@ -35,8 +35,11 @@ def hurried(seed: int, sequences: int = 12, people: int = 6) -> walkers.Extra:
     return extra
 
 
-def calibrated(seed: int, noise: float) -> tuple[Fit, list[Sequence], CrowdEngine]:
-    data = walkers.crowd(hurried(seed), seed=seed, sequences=12, noise=noise)
+def calibrated(
+    seed: int, noise: float, sequences: int = 12
+) -> tuple[Fit, list[Sequence], CrowdEngine]:
+    extra = hurried(seed, sequences)
+    data = walkers.crowd(extra, seed=seed, sequences=sequences, noise=noise)
     law = SocialForce(walkers.A, 0.0, 0.0, B=walkers.B)
     system = Crowd([Relaxation(walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)])
     engine = CrowdEngine(data)
@@ -62,7 +65,7 @@ def test_a_bias_by_disturbances_is_taken_out() -> None:
 
 
 def test_the_same_seed_gives_the_same_numbers_and_bounds_hold() -> None:
-    fit, data, _ = calibrated(1, 0.01)
+    fit, data, _ = calibrated(1, 0.01, sequences=5)
     found = unbiased(fit, data, seed=7)
     assert np.array_equal(found.row, unbiased(fit, data, seed=7).row)
     assert not np.array_equal(found.row, unbiased(fit, data, seed=8).row)
@@ -75,6 +78,6 @@ def test_crowds_that_cannot_be_calibrated_change_nothing(monkeypatch: pytest.Mon
     def fails(*given: Any, **more: Any) -> Fit:
         raise SimulationError("it blows up")
 
-    fit, data, _ = calibrated(1, 0.01)
+    fit, data, _ = calibrated(1, 0.01, sequences=5)
     monkeypatch.setattr(module, "refine", fails)
     assert unbiased(fit, data) is fit
