@@ -117,10 +117,13 @@ def test_windows_of_crowds_hold_the_same_people_on_one_clock(tmp_path):
     assert sequences[0].group == sequences[1].group
 
 
-@pytest.mark.parametrize("variant", ["autocorrelated", "windows"])
-def test_disturbances_that_last_outlast_a_window_and_blame_nobody(tmp_path, variant):
+@pytest.mark.parametrize(
+    ("variant", "low", "high"),
+    [("autocorrelated", 0.3, 0.6), ("windows", 0.3, 0.6), ("slow", 1.0, 2.0)],
+)
+def test_disturbances_that_last_blame_nobody(tmp_path, variant, low, high):
     truth = generate(small(arm="nothing", variant=variant, n_sequences=6), tmp_path)
-    assert truth["noise"]["correlation"] >= 1.0
+    assert low <= truth["noise"]["correlation"] <= high
     assert truth["noise"]["amplitude"] > 0
     assert not [f for s in read(tmp_path) for f in find_faults(s, "crowd")]
 

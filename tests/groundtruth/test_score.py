@@ -108,13 +108,17 @@ def test_kin_is_what_the_catalogue_says_and_nothing_else():
 
 
 def test_unconfirmed_effects_are_leads_and_no_names():
-    row = score(truth("relative_speed"), report("relative_speed", verdict="unconfirmed"))
+    def found(name: str) -> dict[str, Any]:
+        lead = {"name": name, "coefficients": {}, "alternatives": []}
+        return report(verdict="unconfirmed", leads=[lead])
+
+    row = score(truth("relative_speed"), found("relative_speed"))
     assert (row["exact"], row["class_right"], row["right"]) == (False, False, False)
     assert (row["named"], row["leads"], row["found"]) == ("nothing", "relative_speed", 0)
     assert row["lead_exact"]
-    wrong = score(truth("relative_speed"), report("speed_zone", verdict="unconfirmed"))
+    wrong = score(truth("relative_speed"), found("speed_zone"))
     assert (wrong["lead_exact"], wrong["false_names"]) == (False, [])
-    idle = score(truth(arm="nothing"), report("speed_zone", verdict="unconfirmed"))
+    idle = score(truth(arm="nothing"), found("speed_zone"))
     assert (idle["right"], idle["leads"]) == (True, "speed_zone")
 
 
