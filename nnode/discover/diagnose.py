@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any, cast
 
@@ -22,12 +22,12 @@ from nnode.discover.individual import individuals
 from nnode.discover.judge import absences, agents_absent, named, named_agents, places, structure
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.power import Way
-from nnode.discover.result import Clusters, Diagnosis, FirstScreen, Verdict
+from nnode.discover.result import Clusters, Diagnosis, FirstScreen, Place, Verdict
 from nnode.discover.sealed import Sealed
 from nnode.discover.search import BETTER, Search, search, settled
 from nnode.discover.simultaneous import Simultaneous, simultaneous
 from nnode.discover.traffic import TrafficEngine
-from nnode.discover.variables import Curves, curves, weighed
+from nnode.discover.variables import Curves, Variable, curves, weighed
 from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.system import System
 from nnode.progress import Stages
@@ -65,12 +65,22 @@ class _Clock:
 
 
 @dataclass
-class _Start:
-    """The calibrated model in the residuals of the open sequences."""
+class _Look:
+    """What was found in the open sequences.
+
+    Attributes:
+        tested: whether what is simultaneous is independent, in what the search leaves.
+        first: curves in the residuals of ``base``, the calibrated model; ``located``: in words.
+    """
 
     division: Division
     engine: Engine
     base: Fit
+    base_system: System
+    variables: list[Variable]
+    first: list[Curves]
+    located: list[Place]
+    found: Search
     tested: Simultaneous
 
 
@@ -99,27 +109,16 @@ def diagnose(
     check_model(system)
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
-    stages.begin("calibrating")
-    start = _calibrated(system, sequences, options)
-    division, engine, base = start.division, start.engine, start.base
-    base_system = copy.deepcopy(base.system)
-    clock.lap("calibrate")
-    stages.begin("locating")
-    variables = engine.variables() if options.structure else []
-    first = weighed(engine, base, curves(engine, base, variables), SURE)
-    located = places(first, _excess(engine, base))
-    clock.lap("locate")
-    stages.begin("naming")
     wanted = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
     effects = [effect for effect in wanted if not issubclass(effect, IndividualEffect)]
-    numbers = _clusters(start, options, len(effects))
+    look = _looked_for(system, sequences, options, effects, clock, stages)
+    if look.tested.together:
+        again = _looked_for(system, sequences, options, effects, clock, stages, together=True)
+        look = replace(again, tested=look.tested)
+    division, engine, base, found = look.division, look.engine, look.base, look.found
+    base_system = look.base_system
+    numbers = _clusters(look, options, len(effects))
     enough = numbers.open >= numbers.least
-    found = search(
-        engine, base, effects, alpha=options.alpha, most=options.max_effects if enough else 0,
-        seed=options.seed, variables=variables, levels=_levels(engine, effects),
-        within=stages.within,
-    )  # fmt: skip
-    clock.lap("name")
     stages.begin("comparing on sealed sequences")
     sealed = Sealed(
         domain, base_system, [sequences[i] for i in division.open],
@@ -127,9 +126,9 @@ def diagnose(
         numbers.sealed, options.seed,
     )  # fmt: skip
     found, leads = sealed.confirmed(engine, found)
-    last = first
+    last = look.first
     if found.fit is not base:
-        last = weighed(engine, found.fit, curves(engine, found.fit, variables), SURE)
+        last = weighed(engine, found.fit, curves(engine, found.fit, look.variables), SURE)
     left = [one for one in last if one.removed > LEFT]
     assert found.screen is not None
     absent = absences(found, Way(found.screen, options.alpha, BETTER, numbers.sealed, LEVEL))
@@ -171,7 +170,7 @@ def diagnose(
         data_faults=[],
         not_testable=[one.name for one in absent if not one.testable],
         absences=absent,
-        places=located,
+        places=look.located,
         unknown=structure(left) if left else None,
         gap=gap,
         base=_shift(base_system, extended),
@@ -192,40 +191,70 @@ def diagnose(
     )
 
 
-def _calibrated(system: System, sequences: list[Sequence], options: DiscoverOptions) -> _Start:
-    """The model calibrated on open sequences; where agents who are there at one time behave alike,
-    once more on open sequences that share no time with sealed ones."""
-    domain, tested = str(system.domain), Simultaneous(0, float("nan"), 1.0)
-    for together in (False, True):
-        division = divide(sequences, options, together=together)
-        chosen = [sequences[i] for i in division.open]
-        engine = engine_of(domain, chosen, division.label[division.open])
-        start = copy.deepcopy(system).double()
-        base = settled(engine, engine.near(start) if isinstance(engine, TrafficEngine) else start)
-        if not together:
-            tested = simultaneous(engine, base, options.seed)
-            if not tested.together:
-                break
-    return _Start(division, engine, base, tested)
+def _looked_for(
+    system: System,
+    sequences: list[Sequence],
+    options: DiscoverOptions,
+    effects: list[type[Effect]],
+    clock: _Clock,
+    stages: Stages,
+    together: bool = False,
+) -> _Look:
+    """Calibrate, locate, and search for the population's effects.
+
+    Args:
+        together: what is simultaneous is one cluster.
+    """
+    domain = str(system.domain)
+    stages.begin("calibrating")
+    division = divide(sequences, options, together=together)
+    chosen = [sequences[i] for i in division.open]
+    engine = engine_of(domain, chosen, division.label[division.open])
+    start = copy.deepcopy(system).double()
+    base = settled(engine, engine.near(start) if isinstance(engine, TrafficEngine) else start)
+    base_system = copy.deepcopy(base.system)
+    clock.lap("calibrate")
+    stages.begin("locating")
+    variables = engine.variables() if options.structure else []
+    first = weighed(engine, base, curves(engine, base, variables), SURE)
+    located = places(first, _excess(engine, base))
+    clock.lap("locate")
+    stages.begin("naming")
+    enough = int(engine.cluster.max()) + 1 >= _least(options, len(effects))
+    found = search(
+        engine, base, effects, alpha=options.alpha, most=options.max_effects if enough else 0,
+        seed=options.seed, variables=variables, levels=_levels(engine, effects),
+        within=stages.within,
+    )  # fmt: skip
+    # what a missing effect leaves is common to all clusters: only what the search leaves tells
+    tested = simultaneous(engine, found.fit, options.seed)
+    clock.lap("name")
+    return _Look(
+        division, engine, base, base_system, variables, first, located, found, tested
+    )  # fmt: skip
 
 
-def _clusters(start: _Start, options: DiscoverOptions, effects: int) -> Clusters:
+def _least(options: DiscoverOptions, effects: int) -> int:
+    """Open clusters that it takes to name any effect."""
+    return least_number(options.alpha, hypotheses=max(effects, 1))
+
+
+def _clusters(look: _Look, options: DiscoverOptions, effects: int) -> Clusters:
     """How many there are, and how many it takes."""
-    division = start.division
-    least = least_number(options.alpha, hypotheses=max(effects, 1))
+    division, least = look.division, _least(options, effects)
     least_sealed = least_number(LEVEL, sided=1)
     enough = next(
         number for number in count(2)
         if least_sealed <= round(options.sealed * number) <= number - least
     )  # fmt: skip
     return Clusters(
-        open=int(start.engine.cluster.max()) + 1,
+        open=int(look.engine.cluster.max()) + 1,
         sealed=0 if division.note else division.number(division.sealed),
         least=least,
         least_sealed=least_sealed,
         enough=enough,
         why=division.why,
-        simultaneous=start.tested.plain(),
+        simultaneous=look.tested.plain(),
         note=division.note,
     )
 
