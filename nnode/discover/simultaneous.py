@@ -2,7 +2,9 @@
 
 The mean residuals of two clusters of a site over the seconds that they have in common are
 multiplied. Where they have nothing to do with each other, the sum of these products is as large
-when each cluster is shifted along its own time, which keeps how long its residuals last.
+when each cluster is shifted along its own time, which keeps how long its residuals last. What all
+sequences have in common as functions of the time since their start is the model's and is taken out
+first; where all start at one time nothing can be told from it.
 
 Source: surrogates by circular shifts, as in Theiler et al. 1992 for other statistics.
 """
@@ -107,6 +109,10 @@ def _series(engine: Engine, fit: Fit) -> list[tuple[str, int, np.ndarray]]:
     second and component from then on; 0 where there is none."""
     second = np.floor(engine.clock / BIN).astype(int)
     kinds = int(engine.component.max()) + 1
+    begun = np.array([s.time[0] for s in engine.sequences])[engine.sequence]
+    since = np.floor((engine.clock - begun) / BIN).astype(int) * kinds + engine.component
+    usual = np.bincount(since, fit.residual) / np.maximum(np.bincount(since), 1)
+    residual = fit.residual - usual[since]
     found = []
     for label in range(int(engine.cluster.max()) + 1):
         own = engine.cluster == label
@@ -114,7 +120,7 @@ def _series(engine: Engine, fit: Fit) -> list[tuple[str, int, np.ndarray]]:
         at = (second[own] - first) * kinds + engine.component[own]
         number = (int(second[own].max()) - first + 1) * kinds
         count = np.bincount(at, minlength=number)
-        mean = np.bincount(at, fit.residual[own], number) / np.maximum(count, 1)
+        mean = np.bincount(at, residual[own], number) / np.maximum(count, 1)
         one = engine.sequences[int(engine.sequence[own][0])]
         found.append((one.site or one.recording, first, mean.reshape(-1, kinds)))
     return found

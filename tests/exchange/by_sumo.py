@@ -25,7 +25,7 @@ def platoons(
     home: Path,
     folder: Path,
     *,
-    number: int = 16,
+    number: int = 24,
     cars: int = 5,
     seconds: float = 30.0,
     spread: float = 0.0,

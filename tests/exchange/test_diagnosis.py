@@ -105,13 +105,15 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
         script, tmp_path / "run", "model=lin", "model.leader=measured", "data=sumo",
         f"data.path={path}", "data.window=null",
     )  # fmt: skip
-    (effect,) = report["effects"]
+    # what no law of the catalogue is exactly right about leaves structure without noise: it is found,
+    # and confirmed or said not to be
+    (effect,) = report["effects"] + report["leads"]
     kin = {"asymmetric_response", "relative_speed"}
     assert effect["name"] in kin
     assert {other["name"] for other in effect["alternatives"]} <= kin
     found = {name: c["value"] for name, c in effect["coefficients"].items()}
     assert found.get("kappa_close", found.get("kappa")) == pytest.approx(KAPPA, abs=0.1)
-    assert report["gap"]["closed"] > 0.9
+    assert (report["gap"]["closed"] > 0.9) == bool(report["effects"])
 
 
 def test_the_stretch_of_longer_times_is_found(
