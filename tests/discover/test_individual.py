@@ -61,13 +61,11 @@ def test_drivers_who_differ_are_recognised() -> None:
         "the hour",
         pytest.param(
             "the place in the platoon",
-            marks=[
-                pytest.mark.thorough,
-                pytest.mark.xfail(strict=True, reason="a place is taken for the drivers in it"),
-            ],
+            marks=pytest.mark.xfail(strict=True, reason="a place is taken for the drivers in it"),
         ),
     ],
 )
+@pytest.mark.thorough
 def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
     alarms = 0
     for seed in range(6, 12):
@@ -94,7 +92,7 @@ def test_numbers_act_where_they_stand_in_the_sum() -> None:
     assert float((found - expected).norm() / expected.norm()) < 0.06
 
 
-CASES = 8
+CASES = 6
 
 
 def test_a_mood_is_no_number_of_one_s_own() -> None:

@@ -64,6 +64,7 @@ def test_a_bias_by_disturbances_is_taken_out() -> None:
     assert sum(after) < 0.5 * sum(before)
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_numbers_and_bounds_hold() -> None:
     fit, data, _ = calibrated(1, 0.01, sequences=5)
     found = unbiased(fit, data, seed=7)
