@@ -141,7 +141,9 @@ def diagnose(
     both = list(zip(seen, agents, strict=True))
     own = [one for one, agent in both if agent.named]
     absent += [
-        agents_absent(one, options.alpha / len(seen)) for one, agent in both if not agent.found
+        agents_absent(one, options.alpha / len(seen), enough)
+        for one, agent in both
+        if not agent.found
     ]
     changed = bool(found.steps or own)
     extended = sealed.with_numbers(engine, final, own) if changed else base_system

@@ -182,12 +182,12 @@ def _information(one: Evidence) -> float:
     return float(one.grams.sum())
 
 
-def agents_absent(one: Individuals, alpha: float) -> Absence:
+def agents_absent(one: Individuals, alpha: float, enough: bool) -> Absence:
     """What the open clusters say of numbers that nobody was found to have of his own."""
     (name,) = one.effect.strengths
     strength = one.effect.strengths[name]
     detectable, (_, high) = one.detectable(alpha), one.interval()
-    testable = math.isfinite(detectable) and 0 < detectable <= strength.expected
+    testable = enough and 0 < detectable <= strength.expected
     return Absence(
         one.effect.name, testable, name, strength.unit,
         detectable if math.isfinite(detectable) else None,
