@@ -105,8 +105,8 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
         script, tmp_path / "run", "model=lin", "model.leader=measured", "data=sumo",
         f"data.path={path}", "data.window=null",
     )  # fmt: skip
-    # without noise every law that is not exactly right leaves structure: what is found is confirmed,
-    # or said not to be
+    # without noise every law that is not exactly right leaves structure: what is found is
+    # confirmed, or said not to be
     (effect,) = report["effects"] + report["leads"]
     kin = {"asymmetric_response", "relative_speed"}
     assert effect["name"] in kin
