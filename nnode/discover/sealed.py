@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,33 +96,31 @@ class Sealed:
         if not found.steps:
             return found, []
         self.whole = self._corrected = self._unbiased(found.fit)
-        path = self._path(engine, found)
+        best: Fit | None = None
         scores, passed = self.comparing.scores, 0
         before, square = scores(self.base), np.nanmean(self.before)
-        for fit in path:
+        for fit in self._path(engine, found, self.whole):
             after = scores(fit.system)
             error = np.nanmean(self.comparing.squares(fit.system))
             p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
             self.tried.append(_Tried(p_value, float(square), float(error)))
             if not self.tried[-1].good:
                 break
-            before, square, passed = after, error, passed + 1
+            before, square, passed, best = after, error, passed + 1, fit
         if passed == len(found.steps):
             return found, []
         leads = found.steps[passed:]
         system = self._without(engine, found.fit, leads).system if passed else self.base
         kept = settled(engine, copy.deepcopy(system), rounds=1)
-        self._corrected = path[passed - 1] if passed else kept
+        self._corrected = best or kept
         return replace(found, fit=kept, steps=found.steps[:passed]), leads
 
-    def _path(self, engine: Engine, found: Search) -> list[Fit]:
-        """The models with the first, the first two, ... effects; all of them corrected."""
-        path = []
+    def _path(self, engine: Engine, found: Search, whole: Fit) -> Iterator[Fit]:
+        """The models with the first, the first two, ... effects, each made when it is asked for;
+        all of them corrected."""
         for number in range(1, len(found.steps)):
-            fit = self._without(engine, found.fit, found.steps[number:])
-            path.append(self._unbiased(fit))
-        assert self.whole is not None
-        return [*path, self.whole]
+            yield self._unbiased(self._without(engine, found.fit, found.steps[number:]))
+        yield whole
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         system = fit.system
