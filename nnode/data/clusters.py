@@ -132,9 +132,8 @@ def _varies(sequences: ListLike[Sequence], covariate: str) -> bool:
     for s in sequences:
         values = getattr(s, covariate)
         if values is not None and len(values):
-            seen.setdefault(s.recording, set()).update(
-                np.asarray(values).tolist() if covariate == "length" else values
-            )
+            known = (v for v in np.asarray(values).tolist() if v != "" and v == v)  # not NaN
+            seen.setdefault(s.recording, set()).update(known)
     return any(len(values) > 1 for values in seen.values())
 
 

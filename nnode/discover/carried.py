@@ -1,12 +1,13 @@
 """What numbers of agents, estimated in parts of their time, have in common at every lag.
 
-Source: Searle, Casella & McCulloch 1992 (variance components by products).
+Source: Searle, Casella & McCulloch 1992 (variance components by products); Bell & McCaffrey 2002
+(the share that a mean takes along).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,7 @@ def seen_in(engine: Engine, fit: Fit, z: np.ndarray) -> Seen:
     alone = len(engine.people[0]) == 1
     least = NONE * float(np.einsum("umm->um", gram).max(initial=0.0))
     identity = _Identity(engine)
+    places: list[int] = []
     rows: list[tuple[int, int, int, int, float, np.ndarray, float]] = []
     for k, unit in enumerate(present // PARTS):
         known = np.flatnonzero(np.diag(gram[k]) > least)
@@ -87,9 +89,31 @@ def seen_in(engine: Engine, fit: Fit, z: np.ndarray) -> Seen:
             b, n = people[m]
             own = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
             rows.append((*own, np.array([v]), 1 / (noise * float(w))))
+            places.append(engine.sequences[b].n_agents - n)
     columns = list(zip(*rows, strict=True)) or [()] * 7
     agent, sequence, cluster_of, recording, when, values, info = (np.array(c) for c in columns)
-    return Seen(agent, sequence, cluster_of, recording, when, values, info)
+    seen = Seen(agent, sequence, cluster_of, recording, when, values, info)
+    return seen if alone else _beyond_places(seen, np.array(places, dtype=int))
+
+
+def _beyond_places(seen: Seen, place: np.ndarray) -> Seen:
+    """Numbers beyond what all at a place of the platoon have in common.
+
+    The mean of a place takes a part of every cluster's numbers along; the rest is enlarged by it
+    (as CR2 does, see :mod:`~nnode.discover.leverage`). Places that one cluster alone tells of are
+    left out.
+    """
+    value, known = seen.value.copy(), np.zeros(len(place), dtype=bool)
+    weight = seen.weight if len(place) else seen.info
+    for p in np.unique(place):
+        at = np.flatnonzero(place == p)
+        share = np.bincount(seen.cluster[at], weight[at])[seen.cluster[at]] / weight[at].sum()
+        away = seen.value[at] - weight[at] @ seen.value[at] / weight[at].sum()
+        known[at] = share < 1 - 1e-9
+        value[at] = away / np.sqrt(np.maximum(1 - share, 1e-9))[:, None]
+    kept = np.flatnonzero(known)
+    parts = {f.name: getattr(seen, f.name)[kept] for f in fields(seen)}
+    return Seen(**{**parts, "value": value[kept]})
 
 
 class _Identity:

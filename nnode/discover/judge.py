@@ -174,7 +174,7 @@ def _without_strength(score: Score, way: Way) -> Absence:
     value = None if weakest is None else float(weakest.options[name])
     return Absence(
         effect.name, value is not None, name, setting.unit, value, value,
-        "" if value is not None else "it acts too rarely in these data to be named",
+        "" if value is not None else "it acts too rarely, or in too few clusters, to be named",
     )  # fmt: skip
 
 

@@ -43,6 +43,8 @@ STEP = 0.4
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
 #: Whitened residuals beyond this count less.
 LARGE = 6.0
+#: Change of an agent's number by which derivatives are taken.
+SMALL = 1e-4
 #: Most past samples that a filter looks at.
 ORDER = 6
 
@@ -185,20 +187,14 @@ class TrafficEngine:
             rates: of a state M speeds ``(B, N, 1)``, m/s.
         """
         linear = self.linear(system, row)
-        return self._respond(linear, linear.system, rates)
-
-    def _respond(
-        self, linear: Response, system: System, rates: Callable[[State], list[Tensor]]
-    ) -> Tensor:
-        """:meth:`response` to speeds that see a model's rates along a run."""
         scene, lead = linear.scene, linear.scene.leader[..., None]
 
         def one(t: Tensor, y: Tensor, rate: Tensor) -> Tensor:
             x = torch.where(lead, scene.measured_at(t), y[..., :1])
             speed = torch.where(lead, scene.measured_rate_at(t), rate[..., :1])
-            return torch.stack(rates(State(t, x, None, scene, system, speed)))
+            return torch.stack(rates(State(t, x, None, scene, linear.system, speed)))
 
-        base = linear.rates(system)
+        base = linear.rates(linear.system)
         with torch.no_grad():
             found = torch.func.vmap(one)(linear.time, linear.states, base).transpose(0, 1)
         rest = found.new_zeros(*found.shape[:-1], base.shape[-1] - 1)
@@ -262,16 +258,22 @@ class TrafficEngine:
         """``(N, n)``: derivatives of the residuals with respect to the number of the vehicle at
         each place of the platoon, in all sequences at once."""
         linear = self.linear(system, row)
-        plain = linear.system
-        if effect.name in {one.name for one in effects_of(plain)}:
-            plain = without(plain, effect.name)  # its own numbers are no part of what it acts on
         ((values, number),) = effect.directions(options)
-        places = np.eye(self.batch.agent.shape[1])
-        each = [
-            effect(people=dict.fromkeys(self.names, (number * own).tolist()), **values)
-            for own in places
-        ]
-        return self._respond(linear, plain, lambda state: [own(state) for own in each])
+        present = [one for one in effects_of(linear.system) if isinstance(one, effect)]
+        now = present[0].people if present else {}
+        plain = without(linear.system, effect.name) if present else linear.system
+        size = self.batch.agent.shape[1]
+
+        def rates(place: int | None) -> Tensor:
+            people = {name: [*now.get(name, []), *[0.0] * size][:size] for name in self.names}
+            for own in people.values():
+                if place is not None:
+                    own[place] += number * SMALL
+            return linear.rates(extended(plain, effect(people=people, **values))[0])
+
+        base = rates(None)
+        sources = [(rates(place) - base) / SMALL for place in range(size)]
+        return self._columns(linear, linear.moved(torch.stack(sources)))
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""

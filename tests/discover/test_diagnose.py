@@ -96,7 +96,7 @@ def test_a_desired_speed_can_be_tested_where_it_would_bind(calm: float, testable
         assert np.quantile(speeds, 0.4) < cap.bound < np.quantile(speeds, 0.95)
     else:
         assert (cap.bound, cap.detectable) == (None, None)
-        assert cap.reason == "it acts too rarely in these data to be named"
+        assert cap.reason == "it acts too rarely, or in too few clusters, to be named"
 
 
 def test_two_sequences_are_too_few() -> None:

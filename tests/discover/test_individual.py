@@ -55,16 +55,7 @@ def test_drivers_who_differ_are_recognised() -> None:
     assert all(len(set(shared[f"r/{s}"][:4])) == 1 for s in range(12))
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        "the hour",
-        pytest.param(
-            "the place in the platoon",
-            marks=pytest.mark.xfail(strict=True, reason="a place is taken for the drivers in it"),
-        ),
-    ],
-)
+@pytest.mark.parametrize("what", ["the hour", "the place in the platoon"])
 @pytest.mark.thorough
 def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
     alarms = 0
@@ -77,7 +68,6 @@ def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> 
     assert alarms <= 1
 
 
-@pytest.mark.xfail(strict=True, reason="numbers are taken to act behind all other effects")
 def test_numbers_act_where_they_stand_in_the_sum() -> None:
     """What a driver's own pace does comes before the reaction to the speed ahead."""
     engine = TrafficEngine(platoons(relative_speed(0.4), number=3, driver=0.1))

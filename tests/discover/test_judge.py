@@ -169,7 +169,7 @@ def test_a_cap_is_absent_down_to_the_weakest_that_would_be_named() -> None:
     assert (found.testable, found.detectable, found.bound) == (True, 15.0, 15.0)
     rarely = of({12.0: 0.79, 15.0: 0.3})
     assert (rarely.testable, rarely.detectable, rarely.bound) == (False, None, None)
-    assert rarely.reason == "it acts too rarely in these data to be named"
+    assert rarely.reason == "it acts too rarely, or in too few clusters, to be named"
 
 
 def test_what_is_left_is_drawn_in_the_unit_of_its_variable() -> None:
