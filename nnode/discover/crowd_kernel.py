@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from nnode.models.crowd import SMOOTHING
-from nnode.solvers.fused._math import exp
+from nnode.simulate._math import exp
 
 _SMALL = SMOOTHING**2
 # sums may be reordered: they are over a handful of neighbours

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
+from nnode.laws.lane import Lane
+from nnode.models.formula import lane_of, rates_of
 from nnode.models.scene import Scene
 from nnode.models.term import Interval, State, Term, physical_parameters, short_names
 
@@ -140,6 +142,11 @@ class Traffic(System):
             raise ValueError(f"leader={leader} is unknown, expected constant or measured")
         self.leader = leader
 
+    @property
+    def lane(self) -> Lane | None:
+        """The model's formula; None where a term is code without one."""
+        return lane_of(self._terms())
+
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
         place = scene.measured_at(t) if self.leader == "measured" else None
         return self.rates_behind(t, y, scene, place)
@@ -150,6 +157,12 @@ class Traffic(System):
         lead = scene.leader[..., None]
         if place is not None:
             x = torch.where(lead, place, x)
+        # a law alone is what it computes anyway
+        lane = self.lane if len(self.terms) > 1 else None
+        if lane is not None:
+            y = torch.cat([x, memory], -1)
+            rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
+            return rate if place is None else rate.masked_fill(lead, 0.0)
         rate, own = self._rates(State(t, x, None, scene), memory)
         if place is not None:
             # the leader's state is never read: its place is known at every time

@@ -6,11 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from nnode.laws.lane import Rule
 from nnode.models.scene import Scene
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ class Term(nn.Module):
         source: where the formula stands.
         memory: number M of additional states of each agent that the term owns.
         fast: parameters that these states' time constants are proportional to, with the factor.
+        rule: what it does, as formulas, from which everything is made that computes it; None:
+            ``forward`` is code of its own, which runs in PyTorch.
     """
 
     name: ClassVar[str]
@@ -84,10 +87,12 @@ class Term(nn.Module):
     source: ClassVar[str]
     memory: ClassVar[int] = 0
     fast: ClassVar[dict[str, float]] = {}
+    rule: ClassVar[Rule | None] = None
 
     def __init__(self) -> None:
         super().__init__()
         self.units: dict[str, str] = {}
+        self.scalars: list[str] = []
         self.bounds: dict[str, Interval] = {}
 
     def declare(
@@ -96,9 +101,15 @@ class Term(nn.Module):
         """Add a scalar parameter, in float64, with its unit and admissible set."""
         start = torch.tensor(float(value), dtype=torch.float64)
         self.register_parameter(name, nn.Parameter(start))
+        self.scalars.append(name)
         self.units[name] = unit
         if bounds is not None:
             self.bounds[name] = bounds
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        """What its formula depends on: terms with the same have the same formula."""
+        return type(self), tuple(self.scalars)
 
     def bound_all(self, prefix: str, bounds: Interval) -> None:
         """Give every parameter whose name starts with ``prefix`` the same admissible set."""
@@ -121,6 +132,10 @@ class Term(nn.Module):
 
     def forward(self, state: State) -> Tensor:
         raise NotImplementedError  # pragma: no cover - every term defines its own
+
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        """``(B, N)`` values of what agents have from the data, by the names of the rule's."""
+        return {}
 
     def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
         """``(B, N, M)`` the additional states at the start, of positions and velocities then."""

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from nnode.laws.expression import Expr, apply, call, substitute, symbol
+from nnode.laws.lane import Lane, Rule, begun, of_rule
+from nnode.laws.tensors import Code, computed
+from nnode.models.formula import Law, lane_of, own_values, parameters_of, rule_of, values_of
 from nnode.models.network import FeedForward
-from nnode.models.term import Interval, State, Term
+from nnode.models.term import Interval, State
 
 #: Log is evaluated at this gap (m) where a simulated gap is smaller: its logarithm must exist.
 SMALLEST_GAP = 1e-3
 
 
-class FollowTheLeader(Term):
+class FollowTheLeader(Law):
     """Speed W(gap) of every follower; the leader drives at v0.
 
     dx_i/dt = W(x_{i+1} - x_i) for followers, dx_N/dt = v0. Every law of this family owns
@@ -26,9 +32,31 @@ class FollowTheLeader(Term):
         self.declare("v0", v0, unit="m/s")
         self.v0: Tensor
 
+    @property
+    def speaks(self) -> bool:
+        own = type(self)
+        coded = own.speed is not FollowTheLeader.speed and own.forward is FollowTheLeader.forward
+        return rule_of(self) is not None or coded
+
+    def code(self) -> dict[str, Code]:
+        return {} if rule_of(self) is not None else {"speed": self.speed}
+
+    def lane(self, owner: str) -> Lane:
+        rule = rule_of(self)
+        if rule is None:  # the speed is code: a formula can call it
+            leader, rate = symbol(f"{owner}__v0"), call("speed", symbol("gap"))
+            v0 = {f"{owner}__v0": ("terms.0.v0", 0, None)}
+            return begun(owner, rate, 1, leader, v0, {f"{owner}__v0": "m/s"})
+        parameters, owned, units = parameters_of(self, owner, 0)
+        return of_rule(owner, rule, 1, parameters, symbol(f"{owner}__v0"), owned, units)
+
     def speed(self, gap: Tensor) -> Tensor:
         """W: gap in m to speed in m/s, elementwise."""
-        raise NotImplementedError  # pragma: no cover - every law defines its own
+        lane = lane_of([self])
+        assert lane is not None, "a law without a formula defines its speed"
+        own = dict(zip(lane.owned, values_of(lane, own_values([self], lane)), strict=True))
+        found: Tensor = computed([substitute(lane.law, lane.fixed)], {**own, "gap": gap})[0]
+        return found
 
     def forward(self, state: State) -> Tensor:
         x, scene = state.x[..., 0], state.scene
@@ -52,10 +80,8 @@ class Linear(LighthillWhithamRichards):
 
     name = "lin"
     formula = "v0 (1 - L / gap)"
+    rule = Rule(rate="v0 - v0*L/gap")
     source = "Göttlich & Totzeck, section 5.1.1"
-
-    def speed(self, gap: Tensor) -> Tensor:
-        return self.v0 - self.v0 * self.L / gap
 
 
 class Logarithmic(LighthillWhithamRichards):
@@ -63,10 +89,11 @@ class Logarithmic(LighthillWhithamRichards):
 
     name = "log"
     formula = "v0 log(gap / L)"
+    rule = Rule(
+        rate="v0*log(max(gap, least)/L)",
+        constants={"least": (SMALLEST_GAP, "m")},
+    )
     source = "Göttlich & Totzeck, section 5.1.1"
-
-    def speed(self, gap: Tensor) -> Tensor:
-        return self.v0 * torch.log(gap.clamp(min=SMALLEST_GAP) / self.L)
 
 
 class NetworkSpeed(FollowTheLeader):
@@ -81,6 +108,7 @@ class NetworkSpeed(FollowTheLeader):
     name = "network_speed"
     formula = "NN(gap)"
     source = "Göttlich & Totzeck, section 5.1.2 and Definition 2"
+    rule = Rule(rate="NN(gap)")  # written out by its lane()
 
     def __init__(
         self,
@@ -94,6 +122,29 @@ class NetworkSpeed(FollowTheLeader):
         if box is not None:
             self.bound_all("network.", Interval(-box, box))
 
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, self.network.sizes)
+
+    def lane(self, owner: str) -> Lane:
+        """A sum of softplus neurons of the gap."""
+        first, second = (f"terms.0.network.layers.{i}." for i in (0, 1))
+        owned: dict[str, Any] = {}
+
+        def weight(label: str, name: str, place: int, axes: int) -> Expr:
+            owned[f"{owner}__{label}"] = (name, place, axes)
+            return symbol(f"{owner}__{label}")
+
+        total = weight("b", second + "bias", 0, 1)
+        for u in range(self.network.sizes[1]):
+            inside = weight(f"w{u}", first + "weight", u, 2) * symbol("gap")
+            inside = inside + weight(f"c{u}", first + "bias", u, 1)
+            total = total + weight(f"o{u}", second + "weight", u, 2) * apply("softplus", inside)
+        units = {**dict.fromkeys(owned, "*"), f"{owner}__v0": "m/s"}
+        owned[f"{owner}__v0"] = ("terms.0.v0", 0, None)
+        return begun(owner, total, 1, symbol(f"{owner}__v0"), owned, units)
+
     def speed(self, gap: Tensor) -> Tensor:
+        # layer by layer, not neuron by neuron
         out: Tensor = self.network(gap[..., None])[..., 0]
         return out

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch, Domain
+from nnode.models.formula import beyond
 from nnode.models.scene import Scene
 from nnode.models.system import System
-from nnode.models.term import Interval, Term
+from nnode.models.term import Interval, State, Term
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,13 @@ class Effect(Term):
         for name, setting in self.settings.items():
             value = values.get(name, setting.value)
             self.declare(name, value, unit=setting.unit, bounds=setting.range)
+
+    def forward(self, state: State) -> Tensor:
+        """By its rule; an effect without one defines its own."""
+        return beyond(self, state)[..., :1]
+
+    def memory_rate(self, state: State) -> Tensor:
+        return beyond(self, state)[..., 1:]
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.errors import ConfigError
+from nnode.laws.lane import Rule
 from nnode.models.effects.base import (
     CATALOGUE,
     Effect,
@@ -19,6 +20,7 @@ from nnode.models.effects.base import (
     Setting,
     Strength,
 )
+from nnode.models.scene import Scene
 from nnode.models.system import System, Traffic
 from nnode.models.term import Interval, State
 from nnode.models.traffic import FollowTheLeader, LighthillWhithamRichards
@@ -26,13 +28,10 @@ from nnode.models.traffic import FollowTheLeader, LighthillWhithamRichards
 #: A zone begins and ends over this distance, m, and a period over this time, s: their edges
 #: can then be calibrated.
 EDGE = {"m": 12.0, "s": 1.0}
+#: 1 inside [a, b], 0 outside, linear over the edge in between.
+_INSIDE = "clip(({at} - a)/edge + 0.5, 0, 1)*clip((b - {at})/edge + 0.5, 0, 1)"
 #: So many cells of a road or a time are looked at one by one.
 CELLS = 32
-
-
-def law_of(state: State) -> FollowTheLeader:
-    """The law of the gap that an effect modifies; see :func:`law_in`."""
-    return law_in(state.system)
 
 
 def law_in(system: System | None) -> FollowTheLeader:
@@ -72,12 +71,6 @@ def for_followers(state: State, change: Tensor) -> Tensor:
     return torch.where(state.scene.follower, change, 0.0)[..., None]
 
 
-def inside(place: Tensor, a: Tensor, b: Tensor, edge: float) -> Tensor:
-    """1 inside [a, b], 0 outside, linear over ``edge`` in between."""
-    rise = ((place - a) / edge + 0.5).clamp(0, 1)
-    return rise * ((b - place) / edge + 0.5).clamp(0, 1)
-
-
 def _cells(low: float, high: float) -> list[Probe]:
     """Probes of neighbouring cells of [low, high]."""
     width = (high - low) / CELLS
@@ -98,6 +91,11 @@ class SpeedZone(Effect):
     name = "speed_zone"
     domain = "traffic"
     formula = "W alpha for x in [a, b]"
+    rule = Rule(
+        rate="W + (alpha - 1)*share*W",
+        where={"share": _INSIDE.format(at="x")},
+        constants={"edge": (EDGE["m"], "m")},
+    )
     source = "variable speed limits: Hegyi, De Schutter & Hellendoorn 2005"
     strengths = {"alpha": _FACTOR}
     settings = {"a": Setting(0.0, Interval(), "m"), "b": Setting(100.0, Interval(), "m")}
@@ -105,10 +103,6 @@ class SpeedZone(Effect):
     consecutive = True
     kin = "where or when"
     separated_by = "platoons that pass the place at other times"
-
-    def forward(self, state: State) -> Tensor:
-        share = inside(state.x[..., 0], self.a, self.b, EDGE["m"])
-        return for_followers(state, (self.alpha - 1) * share * rate_of(state))
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -126,6 +120,11 @@ class SpeedPeriod(Effect):
     name = "speed_period"
     domain = "traffic"
     formula = "W alpha for t in [a, b]"
+    rule = Rule(
+        rate="W + (alpha - 1)*share*W",
+        where={"share": _INSIDE.format(at="clock")},
+        constants={"edge": (EDGE["s"], "s")},
+    )
     source = "weather and light: Hranac et al. 2006 (FHWA-HOP-07-073)"
     strengths = {"alpha": _FACTOR}
     settings = {"a": Setting(0.0, Interval(), "s"), "b": Setting(60.0, Interval(), "s")}
@@ -133,10 +132,6 @@ class SpeedPeriod(Effect):
     consecutive = True
     kin = "where or when"
     separated_by = "platoons at the same time in other places"
-
-    def forward(self, state: State) -> Tensor:
-        share = inside(state.scene.start + state.t, self.a, self.b, EDGE["s"])
-        return for_followers(state, (self.alpha - 1) * share[:, None] * rate_of(state))
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -157,6 +152,7 @@ class VehicleClass(Effect):
     covariate = "kind"
     domain = "traffic"
     formula = "W phi for vehicles of one class"
+    rule = Rule(rate="W + (phi - 1)*belongs*W", inputs={"belongs": "1"})
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"phi": _FACTOR}
     rank = 12
@@ -167,11 +163,9 @@ class VehicleClass(Effect):
         super().__init__(**values)
         self.kind = kind
 
-    def forward(self, state: State) -> Tensor:
-        belongs = state.scene.kinds.get(self.kind)
-        if belongs is None:
-            return torch.zeros_like(state.x)
-        return for_followers(state, (self.phi - 1) * belongs * rate_of(state))
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        nobody = torch.zeros_like(scene.agent)
+        return {"belongs": scene.kinds.get(self.kind, nobody).to(scene.length.dtype)}
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -196,20 +190,22 @@ class LeaderLength(Effect):
     covariate = "length"
     domain = "traffic"
     formula = "W(gap - beta (l_{i+1} - mean l))"
+    rule = Rule(
+        rate="W + law(gap=gap - beta*longer) - law()",
+        inputs={"longer": "m"},
+    )
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"beta": Strength(0.0, 0.1, Interval(-2.0, 3.0), "1", usual=0.5)}
     rank = 33
     kin = "who"
     separated_by = "vehicles of more different lengths"
 
-    def forward(self, state: State) -> Tensor:
-        length = state.scene.length
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        length = scene.length
         known = torch.isfinite(length)
         mean = torch.where(known, length, 0.0).sum() / known.sum().clamp(min=1)
         longer = torch.where(known, length - mean, 0.0)
-        ahead = torch.cat([longer[:, 1:], torch.zeros_like(longer[:, :1])], 1)
-        gap, law = gaps(state.x), law_of(state)
-        return for_followers(state, law.speed(gap - self.beta * ahead) - law.speed(gap))
+        return {"longer": torch.cat([longer[:, 1:], torch.zeros_like(longer[:, :1])], 1)}
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -226,13 +222,11 @@ class FreeFlowSpeed(Effect):
     name = "free_flow_speed"
     domain = "traffic"
     formula = "min(W, v_max)"
+    rule = Rule(rate="W - max(W - v_max, 0)")
     source = "Newell 2002"
     strengths = {}
     settings = {"v_max": Setting(30.0, Interval(1.0, 60.0), "m/s")}
     rank = 20
-
-    def forward(self, state: State) -> Tensor:
-        return for_followers(state, -(rate_of(state) - self.v_max).clamp(min=0))
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -249,18 +243,12 @@ class MultiAnticipation(Effect):
     name = "multi_anticipation"
     domain = "traffic"
     formula = "W + c (W(gap_{i+1}) - W(gap_i))"
+    rule = Rule(rate="choose(second, W + c*(law(gap=gap_1) - law()), W)")
     source = "Lenz, Wagner & Sollacher 1999"
     strengths = {"c": Strength(0.0, 0.05, Interval(-1.0, 1.0), "1", usual=0.2)}
     rank = 30
     kin = "reaction to the vehicle ahead"
     separated_by = "leaders that brake and accelerate strongly, cameras that see longer platoons"
-
-    def forward(self, state: State) -> Tensor:
-        speed = law_of(state).speed(gaps(state.x))
-        ahead = torch.cat([speed[:, 1:], speed[:, -1:]], 1)
-        follows = state.scene.follower
-        second = follows & torch.cat([follows[:, 1:], torch.zeros_like(follows[:, :1])], 1)
-        return torch.where(second, self.c * (ahead - speed), 0.0)[..., None]
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -276,14 +264,10 @@ class LeaderSpeed(Effect):
     name = "leader_speed"
     domain = "traffic"
     formula = "v0 + weight (measured speed - v0) for the leader"
+    rule = Rule(leader="W + weight*(measured - W)")
     source = "the model option leader=measured"
     strengths = {"weight": Strength(0.0, 0.1, Interval(-0.5, 1.5), "1", usual=0.5)}
     rank = 5
-
-    def forward(self, state: State) -> Tensor:
-        speed = state.scene.measured_rate_at(state.t)[..., 0]
-        change = self.weight * (speed - rate_of(state))
-        return torch.where(state.scene.leader, change, 0.0)[..., None]
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -302,6 +286,7 @@ class DriverHeterogeneity(IndividualEffect):
     name = "driver_heterogeneity"
     domain = "traffic"
     formula = "W (1 + eta_i), eta_i ~ N(0, sigma²)"
+    rule = Rule(rate="W + eta*W", inputs={"eta": "1"})
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 1.0), "1", usual=0.1)}
     rank = 13
@@ -312,9 +297,8 @@ class DriverHeterogeneity(IndividualEffect):
         super().__init__(people, **values)
         self.idle("sigma")  # it describes the drivers and is not in the equation
 
-    def forward(self, state: State) -> Tensor:
-        eta, _ = self.known(state.scene, state.x)
-        return for_followers(state, eta * rate_of(state))
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        return {"eta": self.known(scene, scene.length)[0]}
 
 
 @CATALOGUE.add
@@ -325,23 +309,15 @@ class TimeGap(Effect):
     name = "time_gap"
     domain = "traffic"
     formula = "W with L + h ẋ_{i+1} in place of L"
+    rule = Rule(
+        rate="W + law(gap=gap*L/max(L + h*dx_1, least)) - law()",
+        constants={"least": (0.1, "m")},
+    )
     source = "constant time headway: Pipes 1953; Treiber, Hennecke & Helbing 2000"
     strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s", usual=0.2)}
     rank = 40
     kin = "reaction to the vehicle ahead"
     separated_by = "a wider range of speeds"
-
-    def forward(self, state: State) -> Tensor:
-        law, rate, gap = law_of(state), rate_of(state), gaps(state.x)
-        assert isinstance(law, LighthillWhithamRichards)
-        plain = law.speed(gap)
-        speed, found = rate[:, -1], [rate[:, -1]]
-        for i in range(rate.shape[1] - 2, -1, -1):
-            wider = (law.L + self.h * speed).clamp(min=0.1)
-            own = rate[:, i] + law.speed(gap[:, i] * law.L / wider) - plain[:, i]
-            speed = torch.where(state.scene.follower[:, i], own, rate[:, i])
-            found.append(speed)
-        return for_followers(state, torch.stack(found[::-1], 1) - rate)
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:

@@ -14,7 +14,7 @@ from nnode.data.sequence import Batch
 from nnode.models.crowd import InteractionForce, NetworkForce, Relaxation, SocialForce
 from nnode.models.scene import Scene
 from nnode.models.system import Crowd, System
-from nnode.solvers.fused._plan import run_all
+from nnode.simulate.threads import run_all
 from nnode.solvers.fused.crowd_cache import load
 from nnode.solvers.fused.crowd_laws import LANES, SIZE
 from nnode.solvers.fused.neighbours import check_cutoff, cutoff_distance

@@ -1,6 +1,6 @@
 """Compiled crowd code that later processes find again.
 
-The file is copied to the cache folder, see :mod:`nnode.solvers.fused._cache`, and loaded from
+The file is copied to the cache folder, see :mod:`nnode.simulate._cache`, and loaded from
 there.
 """
 
@@ -11,22 +11,14 @@ from pathlib import Path
 from types import ModuleType
 
 import nnode.models.crowd
-from nnode.solvers.fused import (
-    _cache,
-    _math,
-    _polynomials,
-    _rows,
-    crowd_laws,
-    crowd_network,
-    crowd_rows,
-    neighbours,
-)
-from nnode.solvers.fused._cache import keep
+from nnode.simulate import _cache, _math, _polynomials, lane_rows
+from nnode.simulate._cache import keep
+from nnode.solvers.fused import crowd_laws, crowd_network, crowd_rows, neighbours
 
 _COMPILED_IN = (
     _math,
     _polynomials,
-    _rows,
+    lane_rows,
     crowd_laws,
     crowd_network,
     crowd_rows,

@@ -10,7 +10,7 @@ from typing import Any
 
 from numba import njit
 
-from nnode.solvers.fused._math import real
+from nnode.simulate._math import real
 from nnode.solvers.fused.crowd_laws import LOOP, ROWS, SIZE
 from nnode.solvers.fused.crowd_network import meet, meet_pull
 from nnode.solvers.fused.crowd_rows import (

@@ -32,8 +32,8 @@ from numba import njit, types
 from numba.extending import overload
 
 from nnode.models.crowd import SMOOTHING
-from nnode.solvers.fused._math import exp, real, torch_softplus
-from nnode.solvers.fused._rows import add
+from nnode.simulate._math import exp, real, torch_softplus
+from nnode.simulate.lane_rows import add
 
 #: Numbers in a row; ten rows of float32 stay in the first-level cache.
 SIZE = 512

@@ -21,8 +21,8 @@ import numpy as np
 from numba import njit
 from numba.extending import overload
 
-from nnode.solvers.fused._math import real, torch_softplus
-from nnode.solvers.fused._rows import add
+from nnode.simulate._math import real, torch_softplus
+from nnode.simulate.lane_rows import add
 from nnode.solvers.fused.crowd_laws import LANES, LOOP, SIZE
 from nnode.solvers.fused.crowd_rows import copy, interact, interact_pull, pieces
 

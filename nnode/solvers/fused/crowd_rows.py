@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from nnode.solvers.fused._math import real
+from nnode.simulate._math import real
 from nnode.solvers.fused.crowd_laws import LANES, LOOP, SIZE, law, law_pull
 
 

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
+from nnode.simulate import lanes
 from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.fused import crowd, fallback, neighbours, traffic
+from nnode.solvers.fused import crowd, fallback, neighbours
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +27,8 @@ class FusedSolver:
     that of ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint,
     from which it differs by O(dt).
 
-    Follow-the-leader laws that :mod:`nnode.solvers.fused.laws` knows and the crowd models
-    run compiled. Any other model, such as one with an effect, goes through
+    Lanes whose law and effects are formulas (see :mod:`nnode.laws.lane`) and the crowd models
+    run compiled. Any other model, such as a crowd's with an effect, goes through
     :mod:`nnode.solvers.fused.fallback`: the same gradient, at the speed of PyTorch. The solver
     warns of it once.
 
@@ -80,8 +81,9 @@ class FusedSolver:
             SimulationError: a simulated state is not a finite number.
         """
         n = self._substeps(system, batch)
-        if traffic.supports(system, batch):
-            y = traffic.simulate(system, batch, n, self.threads)[:, 0]
+        lane = lanes.supports(system, batch)
+        if lane is not None:
+            y = lanes.simulate(system, lane, batch, n, self.threads)[:, 0]
             found = Trajectory(*system.observe(y, batch))
         else:
             found = self._other(system, batch, n, list(system.parameters()))
@@ -108,11 +110,11 @@ class FusedSolver:
         """
         n = self._substeps(system, batch)
         stacked = _stack(system, parameters)
-        if traffic.supports(system, batch):
-            y = traffic.simulate(system, batch, n, self.threads, stacked)
+        lane = lanes.supports(system, batch)
+        if lane is not None:
+            y = lanes.simulate(system, lane, batch, n, self.threads, stacked)
             runs = [system.observe(y[:, r], batch)[0] for r in range(y.shape[1])]
-            measured = getattr(system, "leader", "") == "measured"
-            return Trajectory(torch.stack(runs, 1) if measured else y, None)
+            return Trajectory(torch.stack(runs, 1), None)
         found = []
         for r in range(len(next(iter(stacked.values())))):
             own = {name: value[r] for name, value in stacked.items()}

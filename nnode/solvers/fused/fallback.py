@@ -19,9 +19,9 @@ from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
+from nnode.models.formula import rule_of
 from nnode.models.system import System, Traffic
 from nnode.models.term import Term
-from nnode.solvers.fused.laws import kernel_of
 from nnode.solvers.rates import Rates
 
 #: Jacobians of one batched call may hold so many numbers.
@@ -156,8 +156,8 @@ def reason(system: System) -> str:
         without = [t for t in terms if type(t) not in (Relaxation, SocialForce, NetworkForce)]
         alone = "a relaxation with one force, a network of one hidden layer at most,"
     else:
-        without = [term for term in terms if kernel_of(term) is None]
-        alone = "one law"
+        without = [term for term in terms if rule_of(term) is None]
+        alone = "models that begin with a law of the gap"
     names = ", ".join(term.name for term in without)
     if names:
         return f"it does not cover {names}"

@@ -109,7 +109,7 @@ def test_models_are_not_touched(ragged) -> None:  # type: ignore[no-untyped-def]
 
 SAID = {
     "sway": "it does not cover sway",
-    "two_laws": "it covers one law",
+    "two_laws": "it covers models that begin with a law",
     "measured": "it does not cover sway",
     "crowd": "it does not cover sway",
 }

@@ -10,8 +10,9 @@ import torch
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.models import Linear, Logarithmic, NetworkSpeed, Traffic
+from nnode.simulate import lanes
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
-from nnode.solvers.fused import fallback, traffic
+from nnode.solvers.fused import fallback
 from tests.solvers.fused.compare import difference, gradient, single
 
 DT = 0.01
@@ -24,7 +25,7 @@ def network(hidden: int) -> NetworkSpeed:
 LAWS = {
     "lin": lambda: Linear(18.0, 4.0),
     "log": lambda: Logarithmic(18.0, 6.0),
-    **{f"n{h}": partial(network, h) for h in (1, 2, 4, 10)},
+    **{f"n{h}": partial(network, h) for h in (2, 4)},
 }
 
 
@@ -136,12 +137,22 @@ def test_refusals(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
         FusedSolver(DT)(Traffic([Linear()]), collate([crowd(2)]))
 
 
-def test_subclasses_have_no_kernel(platoon) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.thorough
+@pytest.mark.parametrize("hidden", [1, 10])
+def test_other_networks(hidden: int, ragged) -> None:  # type: ignore[no-untyped-def]
+    batch, model = single(ragged), Traffic([network(hidden)])
+    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
+    found, own = gradient(model, FusedSolver(DT), batch)
+    torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-9)
+    assert difference(own, wanted) < 1e-10
+
+
+def test_code_of_one_s_own_is_not_taken_for_the_formula(platoon) -> None:  # type: ignore[no-untyped-def]
     class Slower(Linear):
         def speed(self, gap: torch.Tensor) -> torch.Tensor:
             return super().speed(gap) / 2
 
     batch = collate([platoon([10.0])])
-    assert traffic.supports(Traffic([Linear()]), batch)
-    assert not traffic.supports(Traffic([Slower()]), batch)
-    assert not traffic.supports(Traffic([Linear(), Linear()]), batch)
+    assert lanes.supports(Traffic([Linear()]), batch)
+    assert not lanes.supports(Traffic([Slower()]), batch)
+    assert not lanes.supports(Traffic([Linear(), Linear()]), batch)

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from numba.extending import overload
 
-from nnode.solvers.fused._polynomials import (
+from nnode.simulate._polynomials import (
     LOG2,
     LOG2E,
     MANTISSA,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from nnode.solvers.fused import _math
-from nnode.solvers.fused._math import FLAGS
+from nnode.simulate import _math
+from nnode.simulate._math import FLAGS
 
 KINDS = [np.float32, np.float64]
 

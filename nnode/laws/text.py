@@ -1,0 +1,116 @@
+"""Formulas as text: plain, and LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from nnode.laws.expression import Expr, below
+
+#: How tightly an operation binds.
+_SUM, _PRODUCT, _SIGN, _POWER, _ATOM = 1, 2, 3, 4, 5
+
+
+def number(value: float) -> str:
+    """As short as it can be read back."""
+    short = f"{value:.12g}"
+    return short if float(short) == value else repr(value)
+
+
+def plain(node: Expr) -> str:
+    """As :func:`nnode.laws.parse.parse` reads it."""
+    return _written(node, _plain)
+
+
+def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
+    """For a page; ``names`` of symbols that are written otherwise."""
+    names = names or {}
+
+    def one(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
+        return _latex(part, of, names)
+
+    return _written(node, one)
+
+
+_Writer = Callable[[Expr, list[tuple[str, int]]], tuple[str, int]]
+
+
+def _written(node: Expr, writer: _Writer) -> str:
+    found: dict[Expr, tuple[str, int]] = {}
+    for part in below([node]):
+        found[part] = writer(part, [found[a] for a in part.args])
+    return found[node][0]
+
+
+def _in(text: tuple[str, int], least: int, brackets: str = "plain") -> str:
+    left, right = ("\\left(", "\\right)") if brackets == "latex" else ("(", ")")
+    return text[0] if text[1] >= least else f"{left}{text[0]}{right}"
+
+
+def _plain(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
+    match part.op:
+        case "const":
+            return number(part.value), _ATOM if part.value >= 0 else _SIGN
+        case "symbol":
+            return part.value, _ATOM
+        case "add" | "sub":
+            sign = "+" if part.op == "add" else "-"
+            return f"{_in(of[0], _SUM)} {sign} {_in(of[1], _SUM + (part.op == 'sub'))}", _SUM
+        case "mul":
+            if part.args[0] is part.args[1]:
+                return f"{_in(of[0], _ATOM)}**2", _POWER
+            for i in (1, 0):
+                if part.args[i].op == "recip":
+                    under = part.args[i].args[0]
+                    return f"{_in(of[1 - i], _PRODUCT)}/{_in((plain(under), _level(under)), 4)}", 2
+            return f"{_in(of[0], _PRODUCT)}*{_in(of[1], _PRODUCT + 1)}", _PRODUCT
+        case "neg":
+            return f"-{_in(of[0], _PRODUCT)}", _SIGN
+        case "recip":
+            return f"1/{_in(of[0], 4)}", _PRODUCT
+    name = part.value if part.op == "call" else part.op
+    return f"{name}({', '.join(text for text, _ in of)})", _ATOM
+
+
+def _level(node: Expr) -> int:
+    if node.op == "mul" and node.args[0] is node.args[1]:
+        return _POWER
+    return {"add": 1, "sub": 1, "mul": 2, "recip": 2, "neg": 3}.get(node.op, _ATOM)
+
+
+def _latex(part: Expr, of: list[tuple[str, int]], names: Mapping[str, str]) -> tuple[str, int]:
+    match part.op:
+        case "const":
+            return number(part.value), _ATOM if part.value >= 0 else _SIGN
+        case "symbol":
+            return names.get(part.value, _subscript(part.value)), _ATOM
+        case "add" | "sub":
+            sign = "+" if part.op == "add" else "-"
+            right = _in(of[1], _SUM + (part.op == "sub"), "latex")
+            return f"{_in(of[0], _SUM, 'latex')} {sign} {right}", _SUM
+        case "mul":
+            if part.args[0] is part.args[1]:
+                return f"{{{_in(of[0], _ATOM, 'latex')}}}^{{2}}", _POWER
+            for i in (1, 0):
+                if part.args[i].op == "recip":
+                    under = latex(part.args[i].args[0], names)
+                    return f"\\frac{{{of[1 - i][0]}}}{{{under}}}", _ATOM
+            return f"{_in(of[0], _PRODUCT, 'latex')}\\,{_in(of[1], _PRODUCT, 'latex')}", _PRODUCT
+        case "neg":
+            return f"-{_in(of[0], _PRODUCT, 'latex')}", _SIGN
+        case "recip":
+            return f"\\frac{{1}}{{{of[0][0]}}}", _ATOM
+        case "sqrt":
+            return f"\\sqrt{{{of[0][0]}}}", _ATOM
+    name = part.value if part.op == "call" else part.op
+    return f"\\mathrm{{{name}}}\\left({', '.join(text for text, _ in of)}\\right)", _ATOM
+
+
+_GREEK = {"alpha", "beta", "gamma", "kappa", "tau", "phi", "sigma", "lambda", "eta"}
+
+
+def _subscript(name: str) -> str:
+    first, _, rest = name.partition("_")
+    shown = (
+        f"\\{first}" if first in _GREEK else first if len(first) == 1 else f"\\mathrm{{{first}}}"
+    )
+    return shown + (f"_{{{rest}}}" if rest else "")

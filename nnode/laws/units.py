@@ -1,0 +1,146 @@
+"""Whether the parts of a formula have units that go together.
+
+Dimensions are exponents of metre, second and kilogram; ``*`` is any unit, as weights of a network
+have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+from nnode.errors import ConfigError
+from nnode.laws.expression import Expr, below
+
+Dimension = tuple[Fraction, Fraction, Fraction]
+NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
+_BASE = ("[length]", "[time]", "[mass]")
+_NAMES = ("m", "s", "kg")
+
+
+@cache
+def _registry() -> Any:
+    import pint  # takes a third of a second: only who checks units waits for it
+
+    return pint.UnitRegistry()
+
+
+@cache
+def dimension(unit: str) -> Dimension | None:
+    """Of a unit such as ``m/s²``; None for ``*``.
+
+    Raises:
+        ConfigError: it is no unit of length, time and mass.
+    """
+    if unit == "*":
+        return None
+    try:
+        found = _registry().Unit("dimensionless" if unit == "1" else unit).dimensionality
+    except Exception as error:
+        raise ConfigError(f"{unit} is no unit; expected one such as m/s² or kg/(m s)") from error
+    if set(found) - set(_BASE):
+        raise ConfigError(f"the unit {unit} is not made of metre, second and kilogram")
+    length, time, mass = (Fraction(found.get(b, 0)).limit_denominator(8) for b in _BASE)
+    return length, time, mass
+
+
+@cache
+def in_si(value: str) -> tuple[float, str]:
+    """A quantity such as ``120 km/h`` in SI units, and its unit's name as written in them.
+
+    Raises:
+        ConfigError: it is no number with a unit.
+    """
+    try:
+        found = _registry().Quantity(value)
+        return float(found.to_base_units().magnitude), shown(_of_quantity(found))
+    except Exception as error:
+        raise ConfigError(f"{value!r} is no quantity; expected one such as 30 m/s") from error
+
+
+def _of_quantity(quantity: Any) -> Dimension:
+    found = quantity.dimensionality
+    length, time, mass = (Fraction(found.get(b, 0)).limit_denominator(8) for b in _BASE)
+    return length, time, mass
+
+
+def shown(found: Dimension) -> str:
+    """A dimension as a unit."""
+    parts = [
+        name + ("" if power == 1 else f"^{power}")
+        for name, power in zip(_NAMES, found, strict=True)
+        if power
+    ]
+    return " ".join(parts) or "1"
+
+
+def unit_of(node: Expr, units: Mapping[str, str]) -> Dimension | None:
+    """Of a formula, from the units of its symbols; None: any.
+
+    Raises:
+        ConfigError: parts whose units do not go together, with both of them.
+    """
+    found: dict[Expr, Dimension | None] = {}
+    for part in below([node]):
+        found[part] = _one(part, [found[a] for a in part.args], units)
+    return found[node]
+
+
+def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
+    """That a formula has a unit.
+
+    Raises:
+        ConfigError: it has not, or its parts do not go together.
+    """
+    found, expected = unit_of(node, units), dimension(wanted)
+    if found is not None and expected is not None and found != expected and not _zero(node):
+        raise ConfigError(f"{name} = {node!r} has the unit {shown(found)}, expected {wanted}")
+
+
+def _zero(node: Expr) -> bool:
+    return node.is_number(0)
+
+
+def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Dimension | None:
+    match part.op:
+        case "const":
+            return NONE
+        case "symbol":
+            return dimension(units[part.value])
+        case "call":
+            return None
+        case "add" | "sub" | "max" | "min" | "choose":
+            pairs = list(zip(part.args, of, strict=True))[part.op == "choose" :]
+            return _same(part, pairs)
+        case "mul":
+            if None in of:
+                return None
+            a, b = of
+            assert a is not None
+            assert b is not None
+            return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+        case "neg":
+            return of[0]
+        case "recip" | "sqrt":
+            factor = Fraction(-1) if part.op == "recip" else Fraction(1, 2)
+            own = of[0]
+            return own and (factor * own[0], factor * own[1], factor * own[2])
+    if of[0] not in (None, NONE):
+        raise ConfigError(
+            f"{part!r}: the argument {part.args[0]!r} of {part.op} has the unit {shown(of[0])}, "
+            "expected a number without one; divide by a scale of the same unit"
+        )
+    return NONE
+
+
+def _same(part: Expr, pairs: list[tuple[Expr, Dimension | None]]) -> Dimension | None:
+    known = [(a, own) for a, own in pairs if own is not None and not _zero(a)]
+    for a, own in known[1:]:
+        if own != known[0][1]:
+            raise ConfigError(
+                f"{part!r} puts together {known[0][0]!r}, which has the unit "
+                f"{shown(known[0][1])}, and {a!r}, which has the unit {shown(own)}"
+            )
+    return known[0][1] if known else (None if any(o is None for _, o in pairs) else NONE)

@@ -1,0 +1,191 @@
+"""The formula of a model, made from what its terms say of themselves."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nnode.laws.expression import Expr, symbol
+from nnode.laws.lane import Lane, Rule, changed
+from nnode.laws.tensors import Code, LaneRates
+from nnode.models.scene import Scene
+from nnode.models.term import State, Term
+
+
+class Law(Term):
+    """A term that others change."""
+
+    @property
+    def speaks(self) -> bool:
+        """Whether it has a formula, or code that a formula can call."""
+        return rule_of(self) is not None
+
+    def code(self) -> dict[str, Code]:
+        """What calls in its formula stand for, by name."""
+        return {}
+
+    def lane(self, owner: str) -> Lane:
+        """Its formula, by symbols that begin with the owner's name."""
+        raise NotImplementedError  # pragma: no cover - every law defines its own
+
+
+def rule_of(term: Term) -> Rule | None:
+    """What a term says of itself; None where its class, or one between it and the one that says
+    so, is code of its own."""
+    for kind in type(term).__mro__:
+        if "rule" in vars(kind):
+            return kind.rule  # type: ignore[attr-defined]
+        if {"forward", "speed", "memory_rate"} & set(vars(kind)):
+            return None
+    return None
+
+
+def lane_of(terms: Sequence[Term]) -> Lane | None:
+    """The formula of a lane with these terms; None where one is code without a formula."""
+    if not terms or not isinstance(terms[0], Law) or not terms[0].speaks:
+        return None
+    if any(isinstance(e, Law) or rule_of(e) is None for e in terms[1:]):
+        return None
+    key = tuple(term.shape for term in terms)
+    if key not in _KNOWN:
+        _KNOWN[key] = _made(terms)
+    return _KNOWN[key]
+
+
+#: What terms say of their formulas to the formula of all.
+_KNOWN: dict[tuple[Any, ...], Lane] = {}
+
+
+def _made(terms: Sequence[Term]) -> Lane:
+    names = _owners(terms)
+    assert isinstance(terms[0], Law)
+    lane = terms[0].lane(names[0])
+    for i, (term, owner) in enumerate(zip(terms[1:], names[1:], strict=True), start=1):
+        lane = with_effect(lane, term, owner, i)
+    return lane.flat()
+
+
+def with_effect(lane: Lane, term: Term, owner: str, place: int) -> Lane:
+    """A lane's formula with that of one term more.
+
+    Args:
+        place: of the term in the model.
+    """
+    parameters, owned, units = parameters_of(term, owner, place)
+    rule = rule_of(term)
+    assert rule is not None
+    return changed(lane, owner, rule, parameters, owned, units, whose=place)
+
+
+def inputs_of(terms: Sequence[Any], lane: Lane, scene: Scene) -> dict[str, Tensor]:
+    """Symbol to ``(B, N)`` values of what vehicles have from the data, for a lane's formula."""
+    found = {}
+    for name, (place, part) in lane.inputs.items():
+        found[name] = terms[place].inputs(scene)[part]
+    return found
+
+
+def values_of(lane: Lane, parameters: Mapping[str, Tensor]) -> list[Tensor]:
+    """Of the parameters' symbols, in their order, from the model's parameters by name; what stands
+    before the parameters' own axes stays."""
+    found = []
+    for name, place, size in lane.owned.values():
+        value = parameters[name]
+        found.append(value if size is None else value.flatten(value.ndim - size)[..., place])
+    return found
+
+
+def own_values(terms: Sequence[Term], lane: Lane) -> dict[str, Tensor]:
+    """The terms' parameters that a lane's formula needs, by their names in the model."""
+    found = {}
+    for name, _, _ in lane.owned.values():
+        _, place, path = name.split(".", 2)
+        value: Any = terms[int(place)]
+        for part in path.split("."):
+            value = getattr(value, part)  # may be a tensor in place of a parameter
+        found[name] = value
+    return found
+
+
+def _owners(terms: Sequence[Term]) -> list[str]:
+    """The name of each term; of several of one name the second is numbered."""
+    seen: Counter[str] = Counter()
+    found = []
+    for term in terms:
+        seen[term.name] += 1
+        found.append(term.name if seen[term.name] == 1 else f"{term.name}_{seen[term.name]}")
+    return found
+
+
+def parameters_of(
+    term: Term, owner: str, place: int
+) -> tuple[dict[str, Expr], dict[str, Any], dict[str, str]]:
+    """Of a term's scalar parameters: symbols by name, where they are, and their units."""
+    names = term.scalars
+    parameters: dict[str, Expr] = {name: symbol(f"{owner}__{name}") for name in names}
+    owned = {f"{owner}__{name}": (f"terms.{place}.{name}", 0, None) for name in names}
+    units = {f"{owner}__{name}": term.units.get(name, "*") for name in names}
+    return parameters, owned, units
+
+
+def rates_of(
+    terms: Sequence[Term], lane: Lane, y: Tensor, t: Tensor, scene: Scene, measured: bool,
+    more: Mapping[str, Tensor] | None = None,
+) -> Tensor:  # fmt: skip
+    """``(B, N, M)`` rates of a lane's states, by PyTorch.
+
+    Args:
+        measured: whether leaders drive as they were measured.
+        more: further symbols' values.
+    """
+    values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
+    values |= inputs_of(terms, lane, scene) | dict(more or {})
+    values["t"], values["start"] = t, scene.start[:, None].expand(y.shape[:2])
+    lead = None
+    if measured or "measured" in lane.symbols:
+        values["measured"] = scene.measured_rate_at(t)[..., 0]
+        lead = values["measured"] if measured else None
+    code = terms[0].code() if isinstance(terms[0], Law) else None
+    return _rates(lane)(y, values, scene.follower, scene.leader, lead, code)
+
+
+def beyond(term: Term, state: State) -> Tensor:
+    """``(B, N, 1 + M)`` what one effect changes of the sum of the terms before it, and the rates
+    of its states: for models with other terms that are code."""
+    assert state.system is not None
+    before = torch.zeros_like(state.x) if state.rate is None else state.rate
+    law = state.system.terms[0]
+    assert isinstance(law, Law), f"{term.name} needs a model that begins with a law of the gap"
+    if rule_of(term) is None:
+        raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
+    key = (law.shape, term.shape)
+    if key not in _BEYOND:
+        alone = law.lane(law.name)
+        alone = replace(
+            alone,
+            rates={**alone.rates, alone.top: symbol("before")},
+            leader=symbol("before"),
+            units={**alone.units, "before": "m/s"},
+        )
+        _BEYOND[key] = with_effect(alone, term, term.name, 1).flat()
+    y = state.x if state.memory is None else torch.cat([state.x, state.memory], -1)
+    more = {"before": before[..., 0]}
+    found = rates_of([law, term], _BEYOND[key], y, state.t, state.scene, False, more)
+    followers = state.scene.follower | state.scene.leader
+    change = torch.where(followers, found[..., 0] - before[..., 0], 0.0)
+    return torch.cat([change[..., None], found[..., 1:]], -1)
+
+
+#: A law and an effect to the formula of what the effect changes.
+_BEYOND: dict[tuple[Any, ...], Lane] = {}
+
+
+@cache
+def _rates(lane: Lane) -> LaneRates:
+    return LaneRates(lane)

@@ -1,0 +1,64 @@
+"""Values and derivatives of formulas in PyTorch, against Python's own numbers and autograd."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.laws.differentiate import derivatives
+from nnode.laws.parse import parse
+from nnode.laws.tensors import computed
+
+FORMULAS = [
+    "a*(1 - (b/c)**4) - exp(-a)*log(b)",
+    "sqrt(a*b)/c + tanh(c - a) - sin(a)*cos(b)",
+    "softplus(30*a - b)*logistic(c)",
+    "max(a, b)*min(b, c) + clip(a, 0.5, 0.9)",
+    "choose(a - b, a*c, b/c) + abs(a - c)",
+    "(a + b)**1.7 - a**-2 + b**0.5",
+]
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_values_and_derivatives(text: str) -> None:
+    rng = np.random.default_rng(3)
+    node = parse(text)
+    values = {n: torch.tensor(rng.uniform(0.3, 2.0, 50), requires_grad=True) for n in "abc"}
+    found = computed([node], values)[0]
+    names = {
+        **vars(math), "max": max, "min": min, "abs": abs,
+        "softplus": lambda x: x if x > 20 else math.log1p(math.exp(x)),
+        "logistic": lambda x: 1 / (1 + math.exp(-x)),
+        "clip": lambda x, low, high: min(max(x, low), high),
+        "choose": lambda condition, x, y: x if condition > 0 else y,
+    }  # fmt: skip
+    for i in range(50):
+        own = {n: float(v[i].detach()) for n, v in values.items()}
+        assert float(found[i]) == pytest.approx(eval(text, names, own), rel=1e-13)
+    exact = torch.autograd.grad(found.sum(), list(values.values()), allow_unused=True)
+    own_slopes = derivatives(node, list("abc"))
+    for name, wanted in zip("abc", exact, strict=True):
+        if wanted is None:
+            assert name not in own_slopes
+            continue
+        slope = computed([own_slopes[name]], values)[0].expand(50)
+        torch.testing.assert_close(slope, wanted, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("text", "slope"), [("max(a, b)", (1.0, 0.0)), ("min(a, b)", (1.0, 0.0)), ("max(b, a)", (0, 1))]
+)
+def test_ties_go_to_the_first(text: str, slope: tuple[float, float]) -> None:
+    found = derivatives(parse(text), ["a", "b"])
+    one = {"a": torch.ones(1), "b": torch.ones(1)}
+    assert [float(computed([found[n]], one)[0]) for n in "ab"] == list(slope)
+
+
+def test_a_slope_of_zero_wins_over_what_is_not_finite() -> None:
+    # where the other side is chosen, its own slope counts for nothing
+    found = derivatives(parse("choose(a, log(a), 2*b)"), ["a", "b"])
+    at = {"a": torch.zeros(1), "b": torch.ones(1)}
+    assert float(computed([found["b"]], at)[0]) == 2.0
