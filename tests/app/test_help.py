@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from benchmarks import config as benchmarks
 from nnode.app.choices import choices, own_groups
 from nnode.app.cli import check_overrides
 from nnode.app.flags import read_command_line
 from nnode.app.help import examples, help_text, remarks, script_words
-from nnode.config import SCHEMAS, register
+from nnode.config import SCHEMAS
 from tests.app.conftest import ROOT, environment
 
 CONF = ROOT / "conf"
@@ -25,7 +26,7 @@ SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
 
 @pytest.fixture(autouse=True)
 def _hydra() -> Iterator[None]:
-    register()
+    benchmarks.register()
     yield
     assert not GlobalHydra.instance().is_initialized()
 
@@ -65,7 +66,7 @@ def test_a_wrong_example_would_be_found() -> None:
 def test_every_option_says_what_it_means() -> None:
     groups = {"model", "data", "solver", "optimizer", "trainer", "study", "split", "loader"}
     groups |= {"discover", "benchmark", "benchmark_discovery"}
-    for key, schema in SCHEMAS.items():
+    for key, schema in {**SCHEMAS, **benchmarks.SCHEMAS}.items():
         kind = schema if isinstance(schema, type) else type(schema)
         silent = {field.name for field in fields(kind)} - set(remarks(kind)) - groups
         assert not silent, f"{key}: a comment beside {silent} becomes their line of the help"

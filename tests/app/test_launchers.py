@@ -14,10 +14,10 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from benchmarks.config import register
 from nnode.app import launchers, sweep
 from nnode.app.cli import check_overrides
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.config import register
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, environment
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.config import register
+from benchmarks.torture.child import Child, script
 from nnode.app.cli import check_overrides
-from nnode.app.torture_child import Child, script
-from nnode.config import register
 from tests.app.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
