@@ -17,14 +17,14 @@ from benchmarks.truths.regression import PEERS, Library
 from nnode.config import SCHEMAS
 from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
-from nnode.discover.confirm import engine_of
 from nnode.discover.division import divide
-from nnode.discover.engine import Engine, fill, row_of, square_of
-from nnode.discover.fit import Fit, refine
 from nnode.discover.inputs import read_inputs
+from nnode.discover.judge.confirm import engine_of
+from nnode.discover.name.search import settled
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.score import Trace, traces
-from nnode.discover.search import settled
+from nnode.discover.residuals.engine import Engine, fill, row_of, square_of
+from nnode.discover.residuals.fit import Fit, refine
+from nnode.discover.statistics.score import Trace, traces
 from nnode.errors import SimulationError
 from nnode.models import build_model
 from nnode.models.effects import CATALOGUE, Effect

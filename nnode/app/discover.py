@@ -29,7 +29,7 @@ from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.report import (
+from nnode.discover.report.files import (
     CHECKPOINT,
     MODEL,
     REPORT,
@@ -238,7 +238,7 @@ def _write(
 
 def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]]:
     """Draw the figures; returns what writes the page and TensorBoard's events."""
-    from nnode.discover.pages import draw  # loads Matplotlib, which takes a second
+    from nnode.discover.report.page import draw  # loads Matplotlib, which takes a second
 
     config = training_config(job, found)
     return draw(job.inputs, found, job.options, config, _commands(config, folder), folder)

@@ -20,8 +20,8 @@ from nnode.app.given import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions
-from nnode.discover import pages
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.report import page
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, Script, environment
 from tests.discover import stand_in
@@ -262,7 +262,7 @@ def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*_: object) -> None:
         pytest.fail("something was drawn")
 
-    monkeypatch.setattr(pages, "draw", never)
+    monkeypatch.setattr(page, "draw", never)
 
 
 @pytest.mark.usefixtures("by_hand")

@@ -9,7 +9,7 @@ from benchmarks.discovery.peers import _effect
 from benchmarks.discovery.task import diagnose_case
 from benchmarks.truths import Case
 from benchmarks.truths.regression import PEERS
-from nnode.discover.score import Trace
+from nnode.discover.statistics.score import Trace
 from nnode.models.effects import CATALOGUE, Probe
 
 
