@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the benchmarks a
 
 from benchmarks.config import register
 from benchmarks.discovery.run import benchmark_discovery
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 
 if __name__ == "__main__":
     register()

@@ -19,7 +19,7 @@ from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import demo_data
 from nnode.pages.page import Block, TableBlock
 from nnode.study.runner import Task, run_tasks
-from nnode.study.traffic_tasks import fit, scan
+from nnode.study.traffic.tasks import fit, scan
 
 #: Names of entries that tell how long something took, or when.
 _CLOCKS = ("seconds", "time taken", "laps")
@@ -221,7 +221,7 @@ def _small_diagnosis() -> None:
 
 def _lane(raw: Path, table: Path) -> None:
     """The demonstration's first sequences as a tidy table."""
-    from nnode.data.esimas import read_esimas
+    from nnode.data.readers.esimas import read_esimas
 
     found = read_esimas(raw / "esimas" / "sequence_datademo.mat")[:12]
     rows = [

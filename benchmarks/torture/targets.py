@@ -19,13 +19,13 @@ from benchmarks.torture.gadgets import evil_checkpoint, strange_checkpoint
 from benchmarks.torture.inputs import damaged_bytes, damaged_text
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
-from nnode.data.esimas import read_esimas
-from nnode.data.juelich import read_juelich
 from nnode.data.options import JuelichOptions, TableOptions, VehicleTableOptions
+from nnode.data.readers.esimas import read_esimas
+from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.table import read_table
+from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
-from nnode.data.table import read_table
-from nnode.data.vehicles import read_vehicles
 from nnode.models import build_model
 from nnode.study.runner import KEPT, Task, run_tasks
 

@@ -13,7 +13,7 @@ from benchmarks.torture.fuzz import fuzz
 from benchmarks.torture.jobs import jobs
 from benchmarks.torture.report import Row, keep
 from benchmarks.torture.targets import Target
-from nnode.app.overrides import check_overrides
+from nnode.app.cli.overrides import check_overrides
 from tests.app.conftest import ROOT, Script
 
 
