@@ -21,7 +21,6 @@ from nnode.calibrate.optimizers import (
 from nnode.calibrate.options import (
     Device,
     FusedOptions,
-    Precision,
     TorchdiffeqOptions,
     TrainerOptions,
 )
@@ -99,62 +98,6 @@ class PlotForcesConfig:
 
 
 @dataclass
-class BenchmarkOptions:
-    """What ``scripts/benchmark.py`` times, see :mod:`nnode.app.benchmark`."""
-
-    # problems: paper | stress | steps | crowd | people | scale
-    shapes: list[str] = field(
-        default_factory=lambda: ["paper", "stress", "steps", "crowd", "people", "scale"]
-    )
-    engines: list[str] | None = None  # null times all that cover a problem
-    repeats: int = 5  # timings of each, of which the median counts
-    restarts: int = 16  # of the ensemble
-    # of the timings; agreement is checked in float64
-    dtype: Precision = Precision.float32
-    redraw: str | None = None  # a benchmark.json to draw, and time nothing
-
-
-@dataclass
-class BenchmarkConfig:
-    """``scripts/benchmark.py``: all engines on the same problems."""
-
-    benchmark: BenchmarkOptions = field(default_factory=BenchmarkOptions)
-
-
-@dataclass
-class DiscoveryBenchmarkOptions:
-    """Which truths ``scripts/benchmark_discovery.py`` hides, how strongly, in how much data."""
-
-    domains: list[str] = field(default_factory=lambda: ["traffic", "crowd"])  # or one of them
-    # what is hidden: single | pair | nothing | outside | near_miss | no_excitation | fault;
-    # null: all
-    arms: list[str] | None = None
-    effects: list[str] | None = None  # null: all; else only cases that hide one of these
-    # null: all; of nothing: white | autocorrelated | windows | heterogeneous | recording
-    variants: list[str] | None = None
-    seeds: int = 10  # per effect, pair or fault
-    nothing_seeds: int = 400  # per variant of nothing
-    first_seed: int = 0  # of the cases, while rules may still change
-    # full hash of the commit that froze the rules; seeds follow from it
-    seeds_of: str | None = None
-    strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
-    noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
-    sizes: list[int] = field(default_factory=lambda: [20])  # numbers of platoons or crowds
-    structure: bool = True  # look for what has no name too; without, nothing is unknown
-    peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
-    workers: int | None = None  # processes; null: one per core
-
-
-@dataclass
-class DiscoveryBenchmarkConfig:
-    """``scripts/benchmark_discovery.py``: the diagnosis against hidden truths."""
-
-    benchmark_discovery: DiscoveryBenchmarkOptions = field(
-        default_factory=DiscoveryBenchmarkOptions
-    )
-
-
-@dataclass
 class StudyConfig:
     """``scripts/study.py``: the paper's studies on the real recordings."""
 
@@ -170,31 +113,14 @@ class DiscoverConfig:
     discover: DiscoverOptions = field(default_factory=DiscoverOptions)
 
 
-@dataclass
-class TortureConfig:
-    """``scripts/torture.py``: misuse on purpose."""
-
-    # what is tried: kills | disk | folder | fuzz
-    campaigns: list[str] = field(default_factory=lambda: ["kills", "disk", "folder", "fuzz"])
-    kills: int = 200  # over all jobs
-    jobs: list[str] | None = None  # scripts that are tortured; null: all that keep results
-    repeats: int = 4  # second runs in a folder, per job
-    inputs: int = 104000  # malformed files over all targets
-    targets: list[str] | None = None  # what is given them; null: every reader and loader
-    seed: int = 0  # of moments of kills and of malformed files
-
-
 SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
     (None, "evaluate_schema"): EvaluateConfig,
     (None, "export_schema"): ExportConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
-    (None, "benchmark_schema"): BenchmarkConfig,
     (None, "study_schema"): StudyConfig,
-    (None, "benchmark_discovery_schema"): DiscoveryBenchmarkConfig,
     (None, "discover_schema"): DiscoverConfig,
-    (None, "torture_schema"): TortureConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),

@@ -8,8 +8,15 @@ Examples:
 Results: tables, benchmark.json, and benchmark.png where there is enough to draw.
 """
 
-from nnode.app.benchmark import benchmark
-from nnode.app.cli import run
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the benchmarks are not installed
+
+from benchmarks.config import register
+from benchmarks.speed.run import benchmark
+from nnode.app.cli.run import run
 
 if __name__ == "__main__":
+    register()
     run("benchmark", benchmark)

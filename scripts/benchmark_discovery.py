@@ -19,8 +19,15 @@ Results: a page with tables of what was found, missed and invented, over all cas
 holds. The same command goes on where it was stopped.
 """
 
-from nnode.app.benchmark_discovery import benchmark_discovery
-from nnode.app.cli import run
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the benchmarks are not installed
+
+from benchmarks.config import register
+from benchmarks.discovery.run import benchmark_discovery
+from nnode.app.cli.run import run
 
 if __name__ == "__main__":
+    register()
     run("benchmark_discovery", benchmark_discovery)

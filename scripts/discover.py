@@ -16,7 +16,7 @@ Results: report.html, report.json, and the extended model as model.yaml and chec
 docs/discovery.md tells how to read them, and how to write an effect of your own.
 """
 
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 from nnode.app.discover import discover
 
 if __name__ == "__main__":

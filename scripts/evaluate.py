@@ -13,9 +13,9 @@ chosen.
 
 from functools import partial
 
-from nnode.app.cli import run
+from nnode.app.cli.run import run
+from nnode.app.cli.saved import saved_groups
 from nnode.app.evaluate import evaluate_checkpoint
-from nnode.app.saved import saved_groups
 
 if __name__ == "__main__":
     run(

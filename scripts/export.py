@@ -11,7 +11,7 @@ Results: the files, and what of the model has no counterpart there; docs/exchang
 of the run where none are chosen.
 """
 
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 from nnode.app.export import export, groups_of_run
 
 if __name__ == "__main__":

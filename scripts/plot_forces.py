@@ -13,9 +13,9 @@ the six settings of the paper. The histogram of gaps is that of the first checkp
 
 from functools import partial
 
-from nnode.app.cli import run
+from nnode.app.cli.run import run
+from nnode.app.cli.saved import saved_groups
 from nnode.app.forces import plot_forces
-from nnode.app.saved import saved_groups
 
 if __name__ == "__main__":
     run("plot_forces", plot_forces, partial(saved_groups, option="checkpoint", groups=("data",)))

@@ -16,7 +16,7 @@ Results: the sequences, manifest.json, and pictures of those with faults. Train 
 data.prepared=FOLDER, and no other option of the data.
 """
 
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 from nnode.app.prepare import prepare_data
 
 if __name__ == "__main__":

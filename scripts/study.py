@@ -10,7 +10,7 @@ Results: study.html, the same in Markdown, and a CSV of every table and of all p
 command goes on where it was stopped.
 """
 
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 from nnode.app.study import study
 
 if __name__ == "__main__":

@@ -9,8 +9,15 @@ Examples:
 Results: one table and report.json; the exit status is not 0 where anything was lost.
 """
 
-from nnode.app.cli import run
-from nnode.app.torture import torture
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the benchmarks are not installed
+
+from benchmarks.config import register
+from benchmarks.torture.run import torture
+from nnode.app.cli.run import run
 
 if __name__ == "__main__":
+    register()
     run("torture", torture)

@@ -21,8 +21,8 @@ with sweep.csv. Ctrl-C saves, and says how to go on.
 
 from functools import partial
 
-from nnode.app.cli import run
-from nnode.app.saved import saved_groups
+from nnode.app.cli.run import run
+from nnode.app.cli.saved import saved_groups
 from nnode.app.train import train
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.torture.child import Child
 from nnode import progress
-from nnode.app.torture_child import Child
 from nnode.progress import Stages
 
 

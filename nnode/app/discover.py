@@ -14,11 +14,11 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.given import Table, model_options, table_options
-from nnode.app.prepared import with_prepared
-from nnode.app.saved import plain_config
+from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.saved import plain_config
+from nnode.app.cli.typed import changes, group_defaults, shell_override
+from nnode.app.python_inputs import Table, model_options, table_options
 from nnode.app.train import brief, set_threads
-from nnode.app.typed import changes, group_defaults, shell_override
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
@@ -29,7 +29,7 @@ from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.report import (
+from nnode.discover.report.files import (
     CHECKPOINT,
     MODEL,
     REPORT,
@@ -238,7 +238,7 @@ def _write(
 
 def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]]:
     """Draw the figures; returns what writes the page and TensorBoard's events."""
-    from nnode.discover.pages import draw  # loads Matplotlib, which takes a second
+    from nnode.discover.report.page import draw  # loads Matplotlib, which takes a second
 
     config = training_config(job, found)
     return draw(job.inputs, found, job.options, config, _commands(config, folder), folder)

@@ -13,9 +13,9 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.saved import merge_saved, path_given, saved_groups
 from nnode.app.evaluate import choose
-from nnode.app.prepared import with_prepared
-from nnode.app.saved import merge_saved, path_given, saved_groups
 from nnode.app.train import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention

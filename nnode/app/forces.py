@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.prepared import with_prepared
-from nnode.app.saved import merge_saved
+from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.saved import merge_saved
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data

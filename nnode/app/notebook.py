@@ -16,8 +16,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from nnode.app.given import Table, model_options, table_options
-from nnode.app.sweep import RESULT
+from nnode.app.cli.sweep import RESULT
+from nnode.app.python_inputs import Table, model_options, table_options
 from nnode.app.train import train
 from nnode.calibrate.checkpoint import load
 from nnode.calibrate.optimizers import LbfgsOptions

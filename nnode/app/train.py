@@ -13,10 +13,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
-from nnode.app.prepared import with_prepared
-from nnode.app.saved import merge_saved, plain_config, refuse_changes
-from nnode.app.sweep import RESULT
-from nnode.app.typed import shell_override
+from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
+from nnode.app.cli.sweep import RESULT
+from nnode.app.cli.typed import shell_override
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed

@@ -9,7 +9,8 @@ Folds, sign flips, jackknife, paired tests and sealed sets all go by cluster.
   (median) and mostly (82 to 95 %) at most 5 s to go until it leaves the camera's view, so that
   later sequences rarely hold it.
 - Where agents who are there at one time but share nobody behave alike, time is shared too: that is
-  found out from residuals (:mod:`nnode.discover.simultaneous`) and asked for by ``together``.
+  found out from residuals (:mod:`nnode.discover.statistics.simultaneous`) and asked for by
+  ``together``.
 
 Of G clusters, sign flips have 2^G outcomes: no one-sided p-value is below 2^-G, no two-sided one
 below 2^(1 - G).

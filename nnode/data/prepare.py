@@ -17,12 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
 from nnode.data.download import sha256
-from nnode.data.esimas import esimas_files, read_esimas
-from nnode.data.highd import highd_files, read_highd
 from nnode.data.identity import identify
-from nnode.data.juelich import juelich_files, read_juelich
-from nnode.data.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
-from nnode.data.ngsim import read_ngsim
 from nnode.data.options import (
     DataOptions,
     EsimasOptions,
@@ -36,11 +31,16 @@ from nnode.data.options import (
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent
 from nnode.data.quality import Fault, find_faults
+from nnode.data.readers.esimas import esimas_files, read_esimas
+from nnode.data.readers.highd import highd_files, read_highd
+from nnode.data.readers.juelich import juelich_files, read_juelich
+from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
+from nnode.data.readers.ngsim import read_ngsim
+from nnode.data.readers.sumo import read_sumo, sumo_files
+from nnode.data.readers.table import TABLE, WALLS, read_table, table_files
+from nnode.data.readers.vehicles import read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.store import Store, write_store
-from nnode.data.sumo import read_sumo, sumo_files
-from nnode.data.table import TABLE, WALLS, read_table, table_files
-from nnode.data.vehicles import read_vehicles, vehicle_files
 from nnode.errors import ConfigError, DataError
 from nnode.progress import Stages
 from nnode.version import VERSION

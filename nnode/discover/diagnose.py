@@ -13,21 +13,29 @@ import numpy as np
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model
-from nnode.discover.confirm import LEVEL, engine_of
 from nnode.discover.division import Division, divide
-from nnode.discover.engine import Engine, of_residuals, square_of
-from nnode.discover.fit import Fit
 from nnode.discover.found import Found
-from nnode.discover.individual import individuals
-from nnode.discover.judge import absences, agents_absent, named, named_agents, places, structure
+from nnode.discover.judge.confirm import LEVEL, engine_of
+from nnode.discover.judge.sealed import Sealed
+from nnode.discover.judge.verdict import (
+    absences,
+    agents_absent,
+    named,
+    named_agents,
+    places,
+    structure,
+)
+from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.locate.curves import curves, weighed
+from nnode.discover.name.search import BETTER, Search, search, settled
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.power import Way
+from nnode.discover.residuals.engine import Engine, of_residuals, square_of
+from nnode.discover.residuals.fit import Fit
+from nnode.discover.residuals.variables import Curves, Variable
 from nnode.discover.result import Clusters, Diagnosis, FirstScreen, Place, Verdict
-from nnode.discover.sealed import Sealed
-from nnode.discover.search import BETTER, Search, search, settled
-from nnode.discover.simultaneous import Simultaneous, simultaneous
-from nnode.discover.traffic import TrafficEngine
-from nnode.discover.variables import Curves, Variable, curves, weighed
+from nnode.discover.statistics.power import Way
+from nnode.discover.statistics.random_effects import individuals
+from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.system import System
 from nnode.progress import Stages

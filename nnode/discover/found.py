@@ -19,8 +19,9 @@ class Found:
         extended: the same with the accepted effects, calibrated together; without any it may
             be ``base`` itself.
         open, sealed: positions of the sequences that were used, and of those kept for the end.
-        maps: ``before`` and ``after``: :class:`nnode.discover.deviation.Deviation` of ``base``
-            and ``extended``, where the diagnosis has them; they are computed where it has not.
+        maps: ``before`` and ``after``: :class:`nnode.discover.report.deviation.Deviation` of
+            ``base`` and ``extended``, where the diagnosis has them; they are computed where it has
+            not.
     """
 
     diagnosis: Diagnosis

@@ -15,13 +15,13 @@ import pandas as pd
 import pytest
 
 from nnode.app import discover as app
-from nnode.app.cli import check_overrides
-from nnode.app.given import model_options
+from nnode.app.cli.run import check_overrides
+from nnode.app.python_inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions
-from nnode.discover import pages
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.report import page
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, Script, environment
 from tests.discover import stand_in
@@ -31,7 +31,7 @@ from tests.discover.recorded import ALPHA, ZONE, corridor, lane
 CODE = """
 import sys
 from nnode.app import discover
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 from tests.discover import stand_in
 if __name__ == "__main__":
     sys.argv[0] = "scripts/discover.py"
@@ -64,7 +64,7 @@ import shutil
 import sys
 from pathlib import Path
 from nnode.app import discover
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 from tests.discover import stand_in
 
 def script(name, *arguments, root="."):
@@ -262,7 +262,7 @@ def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*_: object) -> None:
         pytest.fail("something was drawn")
 
-    monkeypatch.setattr(pages, "draw", never)
+    monkeypatch.setattr(page, "draw", never)
 
 
 @pytest.mark.usefixtures("by_hand")

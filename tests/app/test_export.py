@@ -13,9 +13,9 @@ import pytest
 import nnode
 from nnode.app.export import TARGETS, checkpoint_of, groups_of_run, targets_of
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.juelich import read_juelich
 from nnode.data.options import JuelichOptions, TableOptions
-from nnode.data.table import read_table
+from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.table import read_table
 from nnode.errors import CheckpointError, ConfigError
 from nnode.models import Linear, Relaxation, SocialForce, Traffic
 from nnode.models.crowd import NetworkForce

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.app.given import named
+from nnode.app.python_inputs import named
 from nnode.errors import ConfigError, DataError
 from tests.discover.platoons import LENGTH, V0, platoons
 

@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from nnode.app import study
-from nnode.app.cli import check_overrides
+from nnode.app.cli.run import check_overrides
 from nnode.config import register
 from nnode.errors import ConfigError
 from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
@@ -27,7 +27,7 @@ CONF = ROOT / "conf"
 CODE = """
 import sys
 from nnode.app import study
-from nnode.app.cli import run
+from nnode.app.cli.run import run
 if __name__ == "__main__":
     sys.argv[0] = "scripts/study.py"
     study.STUDIES["traffic"] = "tests.study.tiny"

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from nnode.discover.pages import draw
+from nnode.discover.report.page import draw
 from tests.browser.chromium import PROGRAM, Browser
 from tests.discover.conftest import Case, traffic  # noqa: F401  a fixture
-from tests.discover.test_page import CONFIG, with_faults
+from tests.discover.report.test_page import CONFIG, with_faults
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="needs a Chromium")
 

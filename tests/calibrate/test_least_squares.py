@@ -12,8 +12,8 @@ from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import least_squares, trajectory_residuals
 from nnode.errors import SimulationError
 from nnode.solvers.fused.engine import FusedSolver
-from nnode.study.crowd_fit import new_system
-from tests.study.corridor import corridor
+from nnode.study.crowd.fit import new_system
+from tests.study.crowd.corridor import corridor
 
 FREE = np.array([np.inf, np.inf])
 

@@ -13,13 +13,13 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
 
-from nnode.data import matlab
-from nnode.data.esimas import read_esimas
-from nnode.data.juelich import read_juelich
-from nnode.data.matlab import Other, read_matlab
 from nnode.data.options import JuelichOptions, TableOptions, VehicleTableOptions
-from nnode.data.table import read_table
-from nnode.data.vehicles import read_vehicles
+from nnode.data.readers import matlab
+from nnode.data.readers.esimas import read_esimas
+from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.matlab import Other, read_matlab
+from nnode.data.readers.table import read_table
+from nnode.data.readers.vehicles import read_vehicles
 from nnode.errors import DataError, NNodeError
 
 
@@ -108,7 +108,7 @@ def test_more_cells_than_names_are_refused(tmp_path: Path) -> None:
 def test_times_and_agents_of_a_sequence_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nnode.data.table.MOST_CELLS", 100)
+    monkeypatch.setattr("nnode.data.readers.table.MOST_CELLS", 100)
     path = tmp_path / "t.csv"
     path.write_text("sequence,time,agent,x\n" + "".join(f"s,{k},a{k},{k}\n" for k in range(11)))
     with pytest.raises(DataError, match="11 times and 11 agents in 11 rows, expected at most"):

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nnode.data.esimas import read_esimas
-from nnode.data.juelich import juelich_files, read_juelich
 from nnode.data.options import JuelichOptions, VehicleTableOptions
 from nnode.data.quality import KINDS, LIMITS, Fault, find_faults, usable
+from nnode.data.readers.esimas import read_esimas
+from nnode.data.readers.juelich import juelich_files, read_juelich
+from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
-from nnode.data.vehicles import read_vehicles
 from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.ngsim import read_ngsim
 from nnode.data.options import NgsimOptions, VehicleTableOptions
+from nnode.data.readers.ngsim import read_ngsim
+from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
 from nnode.data.smooth import smooth
-from nnode.data.vehicles import read_vehicles
 from nnode.errors import ConfigError
 
 DOCS = Path(__file__).parents[2] / "docs" / "data.md"

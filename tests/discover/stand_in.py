@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Sequence
-from nnode.discover.deviation import simulate
 from nnode.discover.found import Found
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.report.deviation import simulate
 from nnode.discover.result import (
     Absence,
     Agents,

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from nnode.discover.able import check_effect, check_model
-from nnode.discover.crowd import CrowdEngine
-from nnode.discover.engine import row_of
-from nnode.discover.fit import evaluated
-from nnode.discover.individual import individuals
+from nnode.discover.crowds.engine import CrowdEngine
+from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.name.search import settled
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.score import traces
-from nnode.discover.search import settled
-from nnode.discover.traffic import TrafficEngine
+from nnode.discover.residuals.engine import row_of
+from nnode.discover.residuals.fit import evaluated
+from nnode.discover.statistics.random_effects import individuals
+from nnode.discover.statistics.score import traces
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Relaxation, SocialForce, System, Traffic
 from nnode.models.build import build_model

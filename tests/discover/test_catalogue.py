@@ -9,7 +9,7 @@ import torch
 
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.catalogue import MARKS, catalogue, main, written
-from nnode.discover.deviation import simulate
+from nnode.discover.report.deviation import simulate
 from nnode.errors import ConfigError
 from nnode.models import build_model
 from nnode.models.build import add_effects

@@ -11,10 +11,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from nnode.app.cli import check_overrides
-from nnode.app.flags import read_command_line
-from nnode.app.help import examples
-from nnode.config import register
+from benchmarks.config import register
+from nnode.app.cli.flags import read_command_line
+from nnode.app.cli.help import examples
+from nnode.app.cli.run import check_overrides
 from tests.discover.platoons import platoons
 from tests.docs.test_tutorials import ROOT, blocks
 

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.jupedsim import read_walkway, walls_of
 from nnode.data.options import Faults, SumoOptions, WalkwayOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.jupedsim import read_walkway, walls_of
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of

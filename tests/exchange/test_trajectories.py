@@ -10,10 +10,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nnode.data.juelich import read_juelich
 from nnode.data.options import JuelichOptions, TableOptions
+from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.table import read_table
 from nnode.data.sequence import Batch, Sequence
-from nnode.data.table import read_table
 from nnode.errors import DataError
 from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy
 from nnode.solvers.base import Trajectory

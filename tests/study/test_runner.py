@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.speed.problems import Shape, pose
 from nnode import progress
-from nnode.app.benchmark_problems import Shape, pose
 from nnode.errors import StudyError
 from nnode.solvers import TorchdiffeqSolver
 from nnode.study import runner

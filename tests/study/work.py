@@ -54,7 +54,7 @@ def fail(kind: str) -> dict[str, Any]:
 def simulate(law: str) -> dict[str, Any]:
     """The end of a small simulation by compiled code."""
     # imported here: all workers read this file
-    from nnode.app.benchmark_problems import Shape, pose
+    from benchmarks.speed.problems import Shape, pose
     from nnode.solvers import FusedSolver
 
     problem = pose(Shape("traffic", (law,), 3, 3, 2, 10, 0.02), law, torch.float64)

@@ -1,0 +1,1 @@
+"""The diagnosis against hidden truths: ``scripts/benchmark_discovery.py``."""

@@ -1,0 +1,1 @@
+"""All engines on the same problems: ``scripts/benchmark.py``."""

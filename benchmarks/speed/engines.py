@@ -1,0 +1,127 @@
+"""The engines that the benchmark compares: each gives states, cost and gradient of a problem."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.speed.problems import Problem
+from nnode.calibrate.cost import sequence_costs
+from nnode.data.sequence import Batch
+from nnode.models.system import System
+from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, substeps
+from nnode.solvers.base import check_finite
+
+#: One simulation with cost and gradient: ``(K, B, N, D)`` positions and the flat gradient, in
+#: the order of ``System.named_parameters``.
+Call = Callable[[], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Something that can solve a problem.
+
+    Attributes:
+        prepare: from a problem to the call that is timed.
+        covers: whether it can solve a problem in reasonable time.
+        exact: whether its gradient is that of the discrete scheme.
+        tolerance: largest relative difference of its gradient to the exact one in float64 at
+            which it is timed at all.
+        state_tolerance: the same for the states, relative to the largest one.
+    """
+
+    prepare: Callable[[Problem], Call]
+    covers: Callable[[Problem], bool]
+    exact: bool = True
+    tolerance: float = 1e-3
+    state_tolerance: float = 1e-3
+
+
+class LoopSolver:
+    """Euler's method as one writes it by hand: a loop of PyTorch operations."""
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+
+    def __call__(self, system: System, batch: Batch) -> Trajectory:
+        n = substeps(batch.dt, self.dt, system.domain)
+        scene, y = system.scene(batch), system.initial(batch)
+        step = batch.dt / n
+        found = [y]
+        for s in range(n * (batch.n_samples - 1)):
+            y = y + step * system(y.new_tensor(s * step), y, scene)
+            if (s + 1) % n == 0:
+                found.append(y)
+        return check_finite(Trajectory(*system.observe(torch.stack(found), batch)), batch)
+
+
+def torch_call(problem: Problem, solver: Solver) -> Call:
+    """One gradient by a solver of this package, as the trainer takes it."""
+    system, batch = problem.system, problem.batch
+
+    def call() -> tuple[np.ndarray, np.ndarray]:
+        system.zero_grad()
+        found = solver(system, batch)
+        sequence_costs(found, batch).sum().backward()
+        parts: list[Tensor] = [
+            torch.zeros_like(p) if p.grad is None else p.grad for p in system.parameters()
+        ]
+        return found.x.detach().numpy(), torch.cat([p.flatten() for p in parts]).numpy()
+
+    return call
+
+
+def _solver(make: Callable[[float], Solver]) -> Callable[[Problem], Call]:
+    return lambda problem: torch_call(problem, make(problem.shape.step))
+
+
+def _jax(arrangement: str) -> Callable[[Problem], Call]:
+    def prepare(problem: Problem) -> Call:
+        from benchmarks.speed.jax_engines import jax_call
+
+        return jax_call(problem, arrangement)
+
+    return prepare
+
+
+def _pairs(problem: Problem) -> bool:
+    # PyTorch keeps every pair of every step of a crowd for the way back: some GB at this bound
+    return problem.shape.agents**2 * problem.shape.sequences <= 260_000
+
+
+def _traffic_in_jax(problem: Problem) -> bool:
+    return problem.shape.domain == "traffic" and find_spec("jax") is not None
+
+
+def _traffic_in_diffrax(problem: Problem) -> bool:
+    return _traffic_in_jax(problem) and find_spec("diffrax") is not None
+
+
+def _every(problem: Problem) -> bool:
+    return True
+
+
+ENGINES: dict[str, Engine] = {
+    # the continuous adjoint differs from the exact gradient in proportion to the step, which is
+    # long in crowds: reported, not judged
+    "odeint_adjoint": Engine(
+        _solver(lambda dt: TorchdiffeqSolver("euler", "adjoint", dt)), _pairs, False, math.inf
+    ),
+    "odeint": Engine(_solver(lambda dt: TorchdiffeqSolver("euler", "discrete", dt)), _pairs),
+    "loop": Engine(_solver(LoopSolver), _pairs),
+    "scan": Engine(_jax("scan"), _traffic_in_jax),
+    "scan_batch_last": Engine(_jax("scan_batch_last"), _traffic_in_jax),
+    "diffrax": Engine(_jax("diffrax"), _traffic_in_diffrax),
+    "diffrax_batch_last": Engine(_jax("diffrax_batch_last"), _traffic_in_diffrax),
+    # Steps of crowds are added without compensation: in float32 each may be off by 6e-8 of the
+    # coordinate, 25 of them by 1.5e-6 (1.5e-4 m at 100 m), before forces amplify it. Found were
+    # 2e-7 to 1.2e-6 for 50 to 10,000 people; an error of 1 m/s^2 in one step is 1.6e-5 at 100 m.
+    "fused_1": Engine(_solver(lambda dt: FusedSolver(dt, 1)), _every, True, 1e-4, 1e-5),
+    "fused_2": Engine(_solver(lambda dt: FusedSolver(dt, 2)), _every, True, 1e-4, 1e-5),
+}

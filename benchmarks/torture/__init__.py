@@ -1,0 +1,1 @@
+"""Misuse on purpose: ``scripts/torture.py``."""

@@ -1,0 +1,1 @@
+"""Crowds in which an effect is hidden."""

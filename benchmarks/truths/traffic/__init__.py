@@ -1,0 +1,1 @@
+"""Platoons in which an effect is hidden."""

@@ -1,0 +1,1 @@
+"""Command lines: options, help, checks, folders, launchers; what every script shares."""

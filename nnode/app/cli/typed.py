@@ -1,0 +1,90 @@
+"""Options as they can be typed: overrides in Hydra's grammar, quoted for the shell."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from nnode.app.cli.saved import make_absolute
+
+#: Texts of these characters need no quotes, unless they would be read as something else.
+_PLAIN = re.compile(r"[\w./:+-]*", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
+_WORDS = ("null", "true", "false")
+#: What must be escaped in the name of a mapping's entry.
+_SPECIAL = re.compile(r"([\\()\[\]{}:=, \t])")
+
+
+def shell_override(key: str, value: object) -> str:
+    """``key=value`` as it can be typed, whatever characters the value has."""
+    return shlex.quote(f"{key}={literal(value)}")
+
+
+def literal(value: object) -> str:
+    """A value in Hydra's grammar: text, number, truth, None, or lists and mappings of them."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_name(k)}: {literal(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(literal(item) for item in value) + "]"
+    if isinstance(value, int | float):
+        return str(value)
+    text = str(value)
+    other = not text or text.lower() in _WORDS or _NUMBER.fullmatch(text)
+    if _PLAIN.fullmatch(text) and not other:
+        return text
+    # a quote is escaped, and so is a backslash that would escape one
+    return "'" + re.sub(r"(\\*)('|$)", _escaped, text) + "'"
+
+
+def _escaped(match: re.Match[str]) -> str:
+    return 2 * match[1] + ("\\'" if match[2] else "")
+
+
+def _name(key: object) -> str:
+    """The name of a mapping's entry."""
+    return _SPECIAL.sub(r"\\\1", str(key))
+
+
+def group_defaults(section: str, group: str) -> dict[str, Any]:
+    """What a configuration group has where nothing is said, ``???`` where something must be.
+
+    Without Hydra these are its schema's values.
+    """
+    from nnode.config import SCHEMAS
+
+    if HydraConfig.initialized():
+        name = HydraConfig.get().job.config_name
+        config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
+    else:
+        config = OmegaConf.structured(SCHEMAS[section, f"{group}_schema"])
+    plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
+    assert isinstance(plain, dict)
+    found = {str(key): value for key, value in plain.items()}
+    if section == "data":
+        make_absolute(found)
+    return found
+
+
+def changes(prefix: str, values: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
+    """The overrides, as they can be typed, that make ``values`` of ``defaults``.
+
+    Options of options are told one by one; a mapping that takes any name is told as a whole.
+    """
+    found = []
+    for key, value in values.items():
+        known = defaults.get(key)
+        if value == known and key in defaults:
+            continue
+        if isinstance(value, Mapping) and isinstance(known, Mapping) and set(value) == set(known):
+            found += changes(f"{prefix}.{key}", value, known)
+        else:
+            found.append(shell_override(f"{prefix}.{key}", value))
+    return found

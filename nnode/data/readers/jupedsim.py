@@ -1,0 +1,226 @@
+"""Reader of one file of walking people: JuPedSim's SQLite database, or PedPy's text.
+
+Both end in the same cutting as the Jülich archive's files. Walls are the edges of a walkable
+area in WKT: the database's own, or that of a text file beside the trajectories.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import shapely
+from shapely.geometry.polygon import orient
+
+from nnode.data.options import WalkwayOptions
+from nnode.data.readers.juelich import cut_people, load_people
+from nnode.data.readers.recordings import table_path
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+#: First bytes of every SQLite database.
+MAGIC = b"SQLite format 3\x00"
+
+#: Keys of the files.
+PEOPLE, GEOMETRY = "trajectories", "geometry"
+
+#: Rows that are converted together.
+_AT_ONCE = 100_000
+
+#: Whole numbers below this are exact as floating-point numbers.
+_WHOLE = 2**53
+
+_COLUMNS = ("id", "frame", "pos_x", "pos_y")
+
+
+def walkway_files(options: WalkwayOptions) -> dict[str, Path]:
+    """The trajectories' path, and that of the walkable area where it has a file of its own."""
+    files = {PEOPLE: table_path(options, "path", options.path)}
+    if options.geometry is not None:
+        files[GEOMETRY] = table_path(options, "geometry", options.geometry)
+    return files
+
+
+def read_walkway(
+    path: Path, options: WalkwayOptions, geometry: Path | None = None
+) -> list[Sequence]:
+    """Read one file and cut it, see :func:`nnode.data.readers.juelich.read_juelich`.
+
+    Args:
+        path: SQLite database as JuPedSim's writer makes it, or text ``id frame x y z``.
+        options: those of the Jülich reader. ``frame_rate`` and ``unit`` are for texts without a
+            header; a database tells its own.
+        geometry: text file with the walkable area as WKT (m); it takes the place of the area
+            that a database holds.
+
+    Returns:
+        Sequences named ``recording/number`` after the file. Where neither file tells an area,
+        walls are those of ``options.walls``.
+
+    Raises:
+        ConfigError: an option out of its range, or one that contradicts the file.
+        DataError: a file that is not of its format, or no sequence at all.
+    """
+    path = Path(path)
+    if path.is_file() and _is_database(path):
+        people, rate, area = _read_database(path)
+        if options.frame_rate not in (None, rate) or options.unit not in (None, "m"):
+            raise ConfigError(
+                f"{path} is in m at {rate:g} frames/s, but data.frame_rate={options.frame_rate}, "
+                f"data.unit={options.unit}; leave both out for a database"
+            )
+    else:
+        people, rate = load_people(path, options)
+        area = None
+    walls = None
+    if geometry is not None:
+        walls = walls_of(_text(geometry), str(geometry))
+    elif area is not None and not options.walls:
+        walls = walls_of(area, f"{path}, table geometry")
+    return cut_people(path, people, rate, options, walls)
+
+
+def walls_of(wkt: str, where: str) -> np.ndarray:
+    """Edges of a walkable area, with the area on the left of each.
+
+    Args:
+        wkt: a polygon, or several of them, in m.
+        where: names the text in errors.
+
+    Returns:
+        ``(W, 4)`` segments x1, y1, x2, y2, those of holes included.
+
+    Raises:
+        DataError: no valid WKT, or something other than areas.
+    """
+    try:
+        shape = shapely.from_wkt(wkt)
+    except shapely.errors.ShapelyError as error:
+        raise DataError(
+            f"{where}: expected the walkable area as WKT, such as 'POLYGON ((0 0, 9 0, 9 4, "
+            f"0 4, 0 0))', found {wkt.strip()[:60]!r}: {error}"
+        ) from error
+    segments: list[np.ndarray] = []
+    for area in _polygons(shape, where):
+        if area.is_empty or not area.is_valid:
+            reason = "it is empty" if area.is_empty else shapely.is_valid_reason(area)
+            raise DataError(f"{where}: the walkable area is no area ({reason}); mend its polygon")
+        whole = orient(area)  # the outer ring turns left, the holes turn right
+        for ring in (whole.exterior, *whole.interiors):
+            corners = np.asarray(ring.coords)[:, :2]
+            edges = np.hstack([corners[:-1], corners[1:]])
+            segments.append(edges[(edges[:, :2] != edges[:, 2:]).any(axis=1)])
+    return np.concatenate(segments)
+
+
+def _polygons(shape: object, where: str) -> Iterator[shapely.Polygon]:
+    if isinstance(shape, shapely.Polygon):
+        yield shape
+    elif isinstance(shape, shapely.MultiPolygon | shapely.GeometryCollection) and shape.geoms:
+        for part in shape.geoms:
+            yield from _polygons(part, where)
+    else:
+        raise DataError(
+            f"{where}: expected a POLYGON, MULTIPOLYGON or a collection of them, found "
+            f"{getattr(shape, 'geom_type', 'nothing')}"
+        )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as text with WKT: {error}") from error
+
+
+def _is_database(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def _read_database(path: Path) -> tuple[pd.DataFrame, float, str | None]:
+    """Rows id, frame, x, y (m), frames per second, and the walkable area as WKT."""
+    # immutable: neither a lock nor a journal is written beside the file, and none is played back
+    address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+    try:
+        with closing(sqlite3.connect(address, uri=True)) as base:
+            base.execute("PRAGMA trusted_schema=OFF")
+            kinds = dict(base.execute("SELECT name, type FROM sqlite_master"))
+            for name in ("trajectory_data", "metadata"):
+                if kinds.get(name) != "table":
+                    # a view would run whatever query the file has brought along
+                    held = ", ".join(n for n, kind in kinds.items() if kind == "table") or "none"
+                    raise DataError(
+                        f"{path} has no table {name}, as JuPedSim's databases have; it has the "
+                        f"tables: {held}"
+                    )
+            rate = _rate(path, base)
+            people = _people(path, base)
+            area = _area(path, base) if kinds.get("geometry") == "table" else None
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise DataError(
+            f"{path} cannot be read as a JuPedSim database: {error}; it is damaged or was written "
+            "by another program"
+        ) from error
+    return people, rate, area
+
+
+def _rate(path: Path, base: sqlite3.Connection) -> float:
+    row = base.execute("SELECT value FROM metadata WHERE key = 'fps'").fetchone()
+    try:
+        rate = float(row[0]) if row else math.nan
+    except (TypeError, ValueError):
+        rate = math.nan
+    if not 0 < rate < math.inf:
+        found = "nothing" if row is None else repr(row[0])
+        raise DataError(
+            f"{path}, table metadata: expected key 'fps' with a positive number of frames per "
+            f"second, found {found}"
+        )
+    return rate
+
+
+def _people(path: Path, base: sqlite3.Connection) -> pd.DataFrame:
+    rows = base.execute(f"SELECT {', '.join(_COLUMNS)} FROM trajectory_data ORDER BY id, frame")
+    parts = []
+    while part := rows.fetchmany(_AT_ONCE):
+        parts.append(_numbers(path, part))
+    if not parts:
+        raise DataError(
+            f"{path}: the table trajectory_data is empty; a simulation's trajectories are in its "
+            "file only after the writer was closed"
+        )
+    table = pd.DataFrame(np.concatenate(parts), columns=["id", "frame", "x", "y"])
+    return table.astype({"id": np.int64, "frame": np.int64})
+
+
+def _numbers(path: Path, rows: list[tuple[object, ...]]) -> np.ndarray:
+    """``(rows, 4)``; SQLite lets any cell hold anything."""
+    table = pd.DataFrame(rows, dtype=object).apply(pd.to_numeric, errors="coerce")
+    values = table.to_numpy(dtype=np.float64)
+    whole = values[:, :2]
+    good = np.isfinite(values).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        good &= ((whole % 1 == 0) & (np.abs(whole) < _WHOLE)).all(axis=1)
+    if not good.all():
+        i = int(np.flatnonzero(~good)[0])
+        raise DataError(
+            f"{path}, table trajectory_data: a row holds (id, frame, pos_x, pos_y) = {rows[i]}; "
+            "expected whole numbers and then coordinates in m"
+        )
+    return values
+
+
+def _area(path: Path, base: sqlite3.Connection) -> str | None:
+    areas = {row[0] for row in base.execute("SELECT wkt FROM geometry")}
+    if len(areas) > 1:
+        raise DataError(
+            f"{path}, table geometry: the walkable area changes, it holds {len(areas)} of them; "
+            "walls are fixed here: set data.geometry to a file with the WKT of the one to take"
+        )
+    return str(areas.pop()) if areas else None

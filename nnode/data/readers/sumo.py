@@ -1,0 +1,211 @@
+"""Reader of SUMO's floating car data: XML with one element per time and vehicle.
+
+The file is streamed: only numbers are kept, never its text. Documents with a type declaration
+are refused, so that no entity is ever expanded.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zlib
+from array import array
+from pathlib import Path
+from typing import IO, cast
+from xml.parsers import expat
+
+import numpy as np
+
+from nnode.data.options import SumoOptions
+from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
+from nnode.data.readers.recordings import table_path
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+#: Lanes within a junction have names that begin with this sign.
+INTERNAL = ":"
+
+
+def sumo_files(options: SumoOptions) -> dict[str, Path]:
+    """The file's path."""
+    path = table_path(options, "path", options.path)
+    return {_stem(path): path}
+
+
+def read_sumo(path: Path, options: SumoOptions) -> list[Sequence]:
+    """Read a file of ``sumo --fcd-output`` and cut it as a vehicle table.
+
+    A vehicle's position is ``pos``, along its ``lane``; positions begin anew on every edge, so
+    that a stay ends where a vehicle leaves it. Lanes within junctions are left out unless
+    ``data.lane`` names them. ``type`` becomes the class, ``length`` the length where SUMO was
+    asked for it; people and containers are not read.
+
+    Args:
+        path: XML, also gzipped.
+        options: lanes, time grid and the way of cutting.
+
+    Returns:
+        Sequences named ``recording/number``, recording being the file's name and the lane.
+
+    Raises:
+        ConfigError: an option out of its range, or ``data.dt`` finer than the file's steps.
+        DataError: no such XML (names the line), one vehicle twice at one time, or no sequence.
+    """
+    path = Path(path)
+    check_cutting(options)
+    content = _Content(path)
+    content.read()
+    rows = content.rows(within=options.lane is not None)
+    times = np.unique(rows.time)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    if step > options.dt * (1 + 1e-6):
+        raise ConfigError(
+            f"data.dt={options.dt:g} s is finer than the steps of {path}, {step:g} s; set "
+            f"data.dt={step:g}, or let SUMO write with --step-length {options.dt:g}"
+        )
+    return cut_vehicles({_stem(path): rows}, options, lane_word="")
+
+
+def _stem(path: Path) -> str:
+    name = path.name
+    for ending in (".gz", ".xml"):
+        name = name.removesuffix(ending)
+    return name
+
+
+class _Names:
+    """Texts as numbers, each text kept once."""
+
+    def __init__(self) -> None:
+        self.codes: dict[str, int] = {}
+        self.column = array("q")
+
+    def add(self, text: str) -> None:
+        self.column.append(self.codes.setdefault(text, len(self.codes)))
+
+    def cells(self) -> np.ndarray:
+        return np.array(list(self.codes), dtype=object)[np.asarray(self.column)]
+
+
+class _Content:
+    """What the elements of a file hold."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.vehicle, self.lane, self.kind = _Names(), _Names(), _Names()
+        self.time, self.x, self.speed, self.length = (array("d") for _ in range(4))
+        self.line = array("q")
+        self.now: float | None = None
+        self.root: str | None = None
+        self.parser = expat.ParserCreate()
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.StartDoctypeDeclHandler = self._doctype
+
+    def read(self) -> None:
+        """Read the file through.
+
+        Raises:
+            DataError: it is not what SUMO writes; names the line.
+        """
+        try:
+            with _open(self.path) as file:
+                self.parser.ParseFile(file)
+        except expat.ExpatError as error:
+            raise DataError(
+                f"{self.path}, line {error.lineno}: no whole XML document "
+                f"({expat.ErrorString(error.code)}); the simulation may still have been writing it"
+            ) from error
+        except (OSError, EOFError, zlib.error) as error:
+            raise DataError(f"{self.path} cannot be read: {error}") from error
+        if not self.time:
+            raise DataError(
+                f"{self.path} holds no vehicle; expected <vehicle> within <timestep>, as "
+                "sumo --fcd-output writes them"
+            )
+
+    def rows(self, within: bool) -> Vehicles:
+        """The vehicles; those on lanes of junctions only where they are asked for.
+
+        Raises:
+            DataError: nobody is left.
+        """
+        lane = self.lane.cells()
+        keep = np.array([within or not name.startswith(INTERNAL) for name in lane])
+        if not keep.any():
+            raise DataError(
+                f"{self.path}: all vehicles are on lanes within junctions, which are left out; "
+                "name those to read in data.lane"
+            )
+        line = np.asarray(self.line)[keep]
+        speed, length = np.asarray(self.speed)[keep], np.asarray(self.length)[keep]
+        kind = self.kind.cells()[keep]
+        return Vehicles(
+            path=self.path,
+            row=lambda i: f"line {line[i]}",
+            vehicle=self.vehicle.cells()[keep],
+            time=np.asarray(self.time)[keep],
+            x=np.asarray(self.x)[keep],
+            lane=lane[keep],
+            speed=None if np.isnan(speed).any() else np.abs(speed),
+            length=None if np.isnan(length).all() else length,
+            kind=kind if (kind != "").any() else None,
+        )
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        if self.root is None:
+            self.root = name
+            if name != "fcd-export":
+                raise self._error(f"expected the root element <fcd-export>, found <{name}>")
+        elif name == "timestep":
+            self.now = self._number(name, attributes, "time")
+        elif name == "vehicle":
+            if self.now is None:
+                raise self._error("a <vehicle> stands outside <timestep>")
+            for key, names in (("id", self.vehicle), ("lane", self.lane)):
+                if not attributes.get(key):
+                    raise self._error(
+                        f"a <vehicle> has no attribute {key!r}; expected id, pos and lane: leave "
+                        "--fcd-output.attributes out, or name them there"
+                    )
+                names.add(attributes[key])
+            self.kind.add(attributes.get("type", ""))
+            self.time.append(self.now)
+            self.x.append(self._number(name, attributes, "pos"))
+            for key, column in (("speed", self.speed), ("length", self.length)):
+                known = key in attributes
+                column.append(self._number(name, attributes, key) if known else math.nan)
+            self.line.append(self.parser.CurrentLineNumber)
+
+    def _end(self, name: str) -> None:
+        if name == "timestep":
+            self.now = None
+
+    def _doctype(self, *_: object) -> None:
+        raise self._error(
+            "a document type declaration, which SUMO never writes and nothing here expands; "
+            "remove it"
+        )
+
+    def _number(self, name: str, attributes: dict[str, str], key: str) -> float:
+        text = attributes.get(key)
+        try:
+            value = math.nan if text is None else float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            found = "no such attribute" if text is None else repr(text[:40])
+            hint = (
+                "; write times in seconds, without --human-readable-time" if key == "time" else ""
+            )
+            raise self._error(f"<{name} {key}=...>: expected a number, found {found}{hint}")
+        return value
+
+    def _error(self, text: str) -> DataError:
+        return DataError(f"{self.path}, line {self.parser.CurrentLineNumber}: {text}")
+
+
+def _open(path: Path) -> IO[bytes]:
+    with path.open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    return cast(IO[bytes], gzip.open(path, "rb") if packed else path.open("rb"))

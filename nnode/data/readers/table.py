@@ -1,0 +1,198 @@
+"""Reader of a tidy table: one row per sequence, time and agent, in SI units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nnode.data.options import TableOptions
+from nnode.data.readers.columns import Table
+from nnode.data.readers.recordings import check_known, table_path, wanted
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+#: Share of the sampling interval by which sampling times may deviate from equal spacing.
+UNEVEN = 0.01
+
+#: A sequence's times times its agents, present or not.
+MOST_CELLS = 10**8
+
+_REQUIRED = ("sequence", "time", "agent", "x")
+_OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
+_WALL = ("x1", "y1", "x2", "y2")
+
+#: Keys of the files of a table.
+TABLE, WALLS = "table", "walls"
+
+
+def table_files(options: TableOptions) -> dict[str, Path]:
+    """The table's path, and that of the walls where there are such."""
+    files = {TABLE: table_path(options, "path", options.path)}
+    if options.walls is not None:
+        files[WALLS] = table_path(options, "walls", options.walls)
+    return files
+
+
+def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> list[Sequence]:
+    """Read a table.
+
+    Args:
+        path: CSV or Parquet with the columns that :class:`TableOptions` lists.
+        options: ``domain`` and ``recording`` are read.
+        walls: CSV or Parquet with a segment per row, x1, y1, x2, y2 (m).
+
+    Returns:
+        Sequences named ``recording/sequence``, in the order in which they appear. An agent that
+        is absent at some times of a sequence is NaN there (see
+        :func:`nnode.data.quality.find_faults`). Vehicles are ordered by their first position.
+
+    Raises:
+        ConfigError: no domain, or an unknown recording.
+        DataError: columns or cells that are missing or hold no number (names the row), one
+            agent twice at one time, unequal time steps, or values that change within a
+            sequence although they belong to an agent.
+    """
+    path = Path(path)
+    crowd = _is_crowd(options)
+    table = Table(path)
+    names = table.choose(_REQUIRED, _OPTIONAL)
+    if crowd != ("y" in names):
+        expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
+        raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
+    axes = ("x", "y") if crowd else ("x",)
+    goals = tuple(f"dest_{axis}" for axis in axes)
+    if any(goal in names for goal in goals) and not all(goal in names for goal in goals):
+        raise DataError(f"{path}: a destination needs the columns {' and '.join(goals)}")
+    sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
+    time = table.numbers(names["time"])
+    values = {name: table.numbers(names[name]) for name in (*axes, *goals) if name in names}
+    if "length" in names:
+        values["length"] = table.numbers(names["length"], empty=True)
+    words = {k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names}
+    recording = (
+        table.names(names["recording"])
+        if "recording" in names
+        else np.full(len(table), path.stem, dtype=object)
+    )
+    asked = wanted(options.recording)
+    if asked is not None:
+        check_known(asked, recording)
+    segments = None if walls is None else _segments(walls)
+
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, key in enumerate(zip(recording, sequence, strict=True)):
+        groups.setdefault(key, []).append(i)
+    found = []
+    for (run, number), rows in groups.items():
+        if asked is not None and run not in asked:
+            continue
+        name = number if number.startswith(f"{run}/") else f"{run}/{number}"
+        index = np.array(rows)
+        grid, k = _grid(table, name, time, index)
+        people, n = _people(agent[index])
+        if len(grid) * len(people) > MOST_CELLS:
+            raise DataError(
+                f"{path}: sequence {name} has {len(grid)} times and {len(people)} agents in "
+                f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
+                "shorter sequences"
+            )
+        at = np.full((len(grid), len(people)), -1)
+        for row, i, j in zip(index, k, n, strict=True):
+            if at[i, j] >= 0:
+                raise DataError(
+                    f"{path}, {table.row(row)}: agent {agent[row]} of sequence {name} stands "
+                    f"there a second time at {time[row]:g} s (first in {table.row(at[i, j])})"
+                )
+            at[i, j] = row
+        if not crowd:
+            first = values["x"][np.array([column[column >= 0][0] for column in at.T])]
+            order = np.argsort(first, kind="stable")
+            at, people = at[:, order], [people[j] for j in order]
+        owner = np.array([column[column >= 0][0] for column in at.T])
+        for key, column in {**values, **words}.items():
+            if key not in axes:
+                _constant(table, key, column, at, owner)
+        x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
+        length = values["length"][owner] if "length" in values else None
+        found.append(
+            Sequence(
+                name=name,
+                recording=run,
+                time=grid,
+                x=x,
+                agents=tuple(people),
+                length=None if length is None or np.isnan(length).all() else length,
+                kind=tuple(words["kind"][owner]) if "kind" in words else None,
+                group=tuple(words["group"][owner]) if "group" in words else None,
+                destination=(
+                    np.stack([values[goal][owner] for goal in goals], axis=-1)
+                    if goals[0] in values
+                    else None
+                ),
+                walls=segments,
+            )
+        )
+    return found
+
+
+def _is_crowd(options: TableOptions) -> bool:
+    if options.domain not in ("traffic", "crowd"):
+        raise ConfigError(
+            f"data.domain={options.domain}: expected traffic (positions x) or crowd (x and y)"
+        )
+    return options.domain == "crowd"
+
+
+def _people(agent: np.ndarray) -> tuple[list[str], np.ndarray]:
+    """Distinct agents in order of appearance, and each row's number among them."""
+    number: dict[str, int] = {}
+    code = np.array([number.setdefault(name, len(number)) for name in agent])
+    return list(number), code
+
+
+def _grid(
+    table: Table, name: str, time: np.ndarray, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sampling times of a sequence, and each row's number among them."""
+    # Agents' rows may differ in the last digits of a time that is meant to be the same.
+    unique, first, code = np.unique(np.round(time[rows], 9), return_index=True, return_inverse=True)
+    step = np.diff(unique)
+    if step.size:
+        usual = float(np.median(step))
+        uneven = np.flatnonzero(np.abs(step - usual) > UNEVEN * usual)
+        if uneven.size:
+            k = int(uneven[0])
+            raise DataError(
+                f"{table.path}, {table.row(rows[first[k + 1]])}: sequence {name} steps from "
+                f"{unique[k]:g} s to {unique[k + 1]:g} s, expected steps of {usual:g} s; "
+                "interpolate it to equal steps or cut it there into two sequences"
+            )
+    return unique, code
+
+
+def _constant(
+    table: Table, key: str, column: np.ndarray, at: np.ndarray, owner: np.ndarray
+) -> None:
+    """Refuse a property of an agent that changes within a sequence."""
+    value, own = column[at], column[owner]
+    differs = (value != own) & (at >= 0)
+    if value.dtype.kind == "f":
+        differs &= ~(np.isnan(value) & np.isnan(own))
+    if differs.any():
+        row = int(at[differs].min())
+        raise DataError(
+            f"{table.path}, {table.row(row)}: column {key!r} holds {column[row]!s}; it belongs "
+            "to the agent and must be the same in all its rows of a sequence"
+        )
+
+
+def _segments(path: Path) -> np.ndarray:
+    table = Table(path)
+    table.choose(_WALL)
+    walls = np.stack([table.numbers(name) for name in _WALL], axis=-1)
+    point = (walls[:, :2] == walls[:, 2:]).all(axis=1)
+    if point.any():
+        row = table.row(int(np.flatnonzero(point)[0]))
+        raise DataError(f"{path}, {row}: a wall that begins where it ends has no sides")
+    return walls

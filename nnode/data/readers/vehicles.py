@@ -1,0 +1,91 @@
+"""Reader of vehicle tables: one row per vehicle and time, as video recordings give them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nnode.data.options import LaneOptions, VehicleTableOptions
+from nnode.data.readers.columns import Table
+from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
+from nnode.data.readers.recordings import one_of, positive, table_path
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+#: Metres per unit of length.
+LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
+#: Metres per second per unit of speed.
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
+
+#: Times are counted in steps up to this number: it is exact, and adding to it as well.
+_LATEST = 2.0**52
+
+_REQUIRED = ("vehicle", "time", "x")
+_OPTIONAL = ("lane", "speed", "length", "kind")
+
+
+def vehicle_files(options: LaneOptions) -> dict[str, Path]:
+    """The table's path."""
+    path = table_path(options, "path", options.path)
+    return {path.stem: path}
+
+
+def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
+    """Read a table and cut it into sequences, see :func:`nnode.data.readers.platoons.cut_vehicles`.
+
+    Args:
+        path: CSV or Parquet.
+        options: columns, units, lanes, time grid and the way of cutting.
+
+    Raises:
+        ConfigError: an option out of its range, an unknown lane or recording.
+        DataError: columns or cells that are missing or hold no number (names the row), one
+            vehicle twice at one time, or no sequence at all.
+    """
+    path = Path(path)
+    if options.direction not in (1, -1):
+        raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
+    check_cutting(options)
+    return cut_vehicles({path.stem: _rows(Table(path), options)}, options)
+
+
+def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
+    units = {"s": 1.0, "ms": 1e-3, "frame": np.nan}
+    scale = one_of("time_unit", options.time_unit, units)
+    if options.time_unit == "frame":
+        scale = 1.0 / positive("frame_rate", options.frame_rate)
+    time = table.numbers(column) * scale
+    far = np.flatnonzero(~(np.abs(time) < _LATEST * options.dt))
+    if far.size:
+        raise DataError(
+            f"{table.path}, {table.row(int(far[0]))}: column {column!r} is the time "
+            f"{time[far[0]]:g} s, which steps of {options.dt:g} s cannot count; "
+            "correct it, or data.time_unit"
+        )
+    return time
+
+
+def _rows(table: Table, options: VehicleTableOptions) -> Vehicles:
+    """The table's columns, by what they mean."""
+    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
+    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
+    length_unit = options.length_unit or options.position_unit
+    speed = length = None
+    if "speed" in names:
+        scale = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
+        speed = np.abs(table.numbers(names["speed"])) * scale
+    if "length" in names:
+        scale = one_of("length_unit", length_unit, LENGTH_UNITS)
+        length = table.numbers(names["length"], empty=True) * scale
+    return Vehicles(
+        path=table.path,
+        row=table.row,
+        vehicle=table.names(names["vehicle"]),
+        time=_seconds(table, names["time"], options),
+        x=table.numbers(names["x"]) * metres * options.direction,
+        lane=table.names(names["lane"]) if "lane" in names else None,
+        speed=speed,
+        length=length,
+        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
+    )

@@ -1,0 +1,1 @@
+"""What only crowds need: residuals on short windows in which every person walks alone."""

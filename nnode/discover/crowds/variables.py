@@ -1,0 +1,148 @@
+"""What a deviation of people may depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
+from nnode.models.crowd import dot, velocity
+from nnode.models.effects.crowd_pairs import (
+    Neighbours,
+    heading,
+    local_density,
+    right_of,
+)
+from nnode.models.effects.crowd_places import wall_distance
+from nnode.models.term import State
+
+Of = Callable[[State], Tensor]
+
+#: Knots of a curve; of curves along the way, where short waves are possible.
+KNOTS, FINE = 9, 25
+#: The shortest and the longest waves that are looked for, along x in m and in time in s.
+WAY, CLOCK = (1.5, 10.0), (1.5, 10.0)
+#: Width of the kernel of the local density, m.
+KERNEL = 1.0
+#: Distance of the nearest person where there is none, m.
+NOBODY = 100.0
+
+
+def _ahead(state: State) -> Tensor:
+    return heading(velocity(state))
+
+
+def _left(state: State) -> Tensor:
+    return -right_of(heading(velocity(state)))
+
+
+def _along(axis: int) -> Of:
+    def direction(state: State) -> Tensor:
+        out = torch.zeros_like(state.x)
+        out[..., axis] = 1.0
+        return out
+
+    return direction
+
+
+def _position(axis: int) -> Of:
+    return lambda state: state.x[..., axis]
+
+
+def _nearest(state: State) -> tuple[Tensor, Tensor]:
+    """Distance ``(B, N)`` of the nearest person, and the unit vector from him ``(B, N, 2)``."""
+    pair = Neighbours.of(state)
+    far = torch.where(pair.acts > 0, pair.d, NOBODY)
+    d, j = far.min(2)
+    index = j[..., None, None].expand(*j.shape, 1, 2)
+    return d, pair.n.gather(2, index)[:, :, 0]
+
+
+def _distance(state: State) -> Tensor:
+    return _nearest(state)[0]
+
+
+def _away_from_nearest(state: State) -> Tensor:
+    return _nearest(state)[1]
+
+
+def _bearing(state: State) -> Tensor:
+    """Degrees to the left of one's way at which the nearest person is."""
+    towards, ahead = -_nearest(state)[1], _ahead(state)
+    sine = ahead[..., 0] * towards[..., 1] - ahead[..., 1] * towards[..., 0]
+    return torch.rad2deg(torch.atan2(sine, dot(ahead, towards)))
+
+
+def _approach(state: State) -> Tensor:
+    """Speed at which the nearest person comes closer, m/s."""
+    pair = Neighbours.of(state)
+    far = torch.where(pair.acts > 0, pair.d, NOBODY)
+    j = far.argmin(2)[..., None]
+    closing = dot(pair.dv, pair.n)
+    return closing.gather(2, j)[..., 0]
+
+
+def _density(state: State) -> Tensor:
+    return local_density(Neighbours.of(state), KERNEL)
+
+
+def _speed(state: State) -> Tensor:
+    return torch.linalg.vector_norm(velocity(state), dim=-1)
+
+
+def _nearest_wall(state: State) -> tuple[Tensor, Tensor]:
+    d, n = wall_distance(state.x, state.scene.segment)
+    least, w = d.min(2)
+    index = w[..., None, None].expand(*w.shape, 1, 2)
+    return least, n.gather(2, index)[:, :, 0]
+
+
+def _wall(state: State) -> Tensor:
+    return _nearest_wall(state)[0]
+
+
+def _away_from_wall(state: State) -> Tensor:
+    return _nearest_wall(state)[1]
+
+
+def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
+    """The variables of people, with knots where there are data.
+
+    Args:
+        state: many moments of the measured and smoothed paths.
+        first: clock time of the first sample of each sequence, s, by name.
+    """
+    agent = state.scene.agent
+    x, y, ahead, left = "along x", "along y", "ahead", "to the left"
+    axes: dict[str, Of] = {x: _along(0), y: _along(1)}
+    own: dict[str, Of] = {ahead: _ahead, left: _left}
+    looks: list[tuple[str, str, Of, dict[str, Of], int]] = [
+        ("position x", "m", _position(0), axes, FINE),
+        ("position y", "m", _position(1), axes, KNOTS),
+        ("clock time", "s", clock, axes, KNOTS),
+        ("time since the start", "s", since_start(first), own, KNOTS),
+        ("speed", "m/s", _speed, own, KNOTS),
+    ]
+    if bool((agent.sum(1) > 1).any()):
+        looks += [
+            ("distance to the nearest person", "m", _distance,
+             {"away from him": _away_from_nearest, **own}, KNOTS),
+            ("bearing of the nearest person", "degrees", _bearing, own, KNOTS),
+            ("speed of approach of the nearest person", "m/s", _approach, own, KNOTS),
+            ("local density", "1/m²", _density, own, KNOTS),
+        ]  # fmt: skip
+    if not state.scene.segment.isnan().any(-1).all():
+        looks.append(
+            ("distance to the nearest wall", "m", _wall,
+             {"away from it": _away_from_wall, ahead: _ahead}, KNOTS)
+        )  # fmt: skip
+    found = []
+    for name, unit, value, directions, most in looks:
+        seen = value(state)[agent].numpy().astype(float)
+        knots = knots_of(seen, most)
+        for level, direction in directions.items():
+            found.append(Variable(name, unit, value, knots, direction, level))
+    found += waves_of("position x", "m", _position(0), state.x[..., 0][agent], WAY, axes)
+    return found + waves_of("clock time", "s", clock, clock(state)[agent], CLOCK, axes)

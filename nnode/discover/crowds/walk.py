@@ -1,0 +1,228 @@
+"""Simulation of people who walk alone: compiled for the social force, in PyTorch for the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, vmap
+
+from nnode.discover.crowds import kernel
+from nnode.discover.crowds.windows import Windows, WindowScene, alone
+from nnode.discover.residuals.engine import trained
+from nnode.models.crowd import Relaxation, SocialForce
+from nnode.models.system import Crowd, System
+from nnode.models.term import State, Term
+
+#: Numbers in the largest intermediate result.
+CHUNK = 2_000_000
+
+
+class Beyond(nn.Module):
+    """The sum of a model's terms that have no compiled code."""
+
+    def __init__(self, system: Crowd, terms: list[Term]) -> None:
+        super().__init__()
+        self.system = system
+        self.added = terms  # a plain list: the terms' parameters belong to the system
+
+    def forward(self, state: State) -> Tensor:
+        assert state.rate is not None
+        first = total = state.rate
+        for term in self.added:
+            total = total + term(replace(state, system=self.system, rate=total))
+        return total - first
+
+
+@dataclass
+class Tables:
+    """What the compiled code knows of the surroundings, see its description."""
+
+    others: np.ndarray
+    window: np.ndarray
+    meets: np.ndarray
+    wall: np.ndarray
+    points: np.ndarray
+    fixed: np.ndarray
+
+    @classmethod
+    def of(cls, windows: Windows, scene: WindowScene, force: SocialForce) -> Tables:
+        """The tables of all people of all windows."""
+        which, who = windows.person.T
+        x, v = windows.batch.x.numpy(), windows.batch.v.numpy()
+        others = np.ascontiguousarray(np.concatenate([x, v], -1).transpose(0, 1, 3, 2))
+        agent = scene.agent.numpy()
+        count = agent.sum(1)
+        meets = agent[which] / (force.mass * count[which])[:, None]
+        meets[np.arange(len(who)), who] = 0.0
+        place, _, real = (part.numpy() for part in scene.walls_of_each())
+        shape = (*agent.shape, place.shape[2])
+        wall = np.broadcast_to(place, (*shape, 2))[which, who].transpose(0, 2, 1)
+        there = np.broadcast_to(real, shape)[which, who]
+        if not force.walls:
+            there = np.zeros_like(there)
+        share = 1 / (force.mass * scene.wall_count.numpy()[which, 0])
+        goal = scene.destination.numpy()[which, who]
+        # real points come first
+        order = np.argsort(~there, axis=1, kind="stable")
+        wall = np.take_along_axis(wall, order[:, None], 2)
+        return cls(
+            others=others,
+            window=which,
+            meets=meets,
+            wall=np.ascontiguousarray(wall),
+            points=there.sum(1),
+            fixed=np.concatenate([goal, share], 1),
+        )
+
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """In the order of the compiled functions."""
+        return (self.others, self.window, self.meets, self.wall, self.points, self.fixed)
+
+
+class Walk:
+    """One model among the measured others.
+
+    Args:
+        windows: the windows.
+        scene: their surroundings.
+        system: the model.
+        tables: from :class:`Tables`, where they are known already.
+    """
+
+    def __init__(
+        self, windows: Windows, scene: WindowScene, system: System, tables: Tables | None = None
+    ) -> None:
+        self.windows, self.scene, self.system = windows, scene, alone(system)
+        terms = cast(list[Term], list(system.terms))
+        law = [term for term in terms if type(term) in (Relaxation, SocialForce)]
+        self.compiled = [type(term) for term in law] == [Relaxation, SocialForce] and (
+            law == terms[:2]
+        )
+        self.beyond = Beyond(self.system, terms[2:] if self.compiled else terms)
+        self.names = list(trained(system))
+        self._people = tuple(torch.as_tensor(index) for index in windows.person.T)
+        self.sizes = [p.numel() for p in trained(system).values()]
+        if self.compiled:
+            relaxation, force = cast(tuple[Relaxation, SocialForce], law)
+            self.tables = tables or Tables.of(windows, scene, force)
+            self.law = np.array([1 / relaxation.tau, force.r, 1 / force.B, force.friction_sign])
+            self.own = [f"terms.1.{name}" for name in ("A", "k", "kappa")]
+            self.usual = [float(p.detach()) for p in (force.A, force.k, force.kappa)]
+
+    def forces(self, rows: Tensor) -> np.ndarray:
+        """``(R, 3)``: A, k, kappa of rows ``(R, K)``."""
+        out = np.tile(self.usual, (len(rows), 1))
+        for column, name in enumerate(self.own):
+            if name in self.names:
+                place = sum(self.sizes[: self.names.index(name)])
+                out[:, column] = rows[:, place].numpy()
+        return out
+
+    def parameters(self, rows: Tensor) -> dict[str, Tensor]:
+        """Rows ``(R, K)`` as parameters of :class:`Beyond`."""
+        own = trained(self.system).values()
+        parts = rows.split(self.sizes, 1)
+        return {
+            f"system.{name}": part.reshape(-1, *p.shape)
+            for name, p, part in zip(self.names, own, parts, strict=True)
+        }
+
+    @torch.no_grad()
+    def paths(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (m) and velocities (m/s) ``(F, R, P, 2)`` at the steps of the simulation."""
+        w, n = self.windows.batch.agent.shape
+        most = max(1, CHUNK // (2 * w * n * n))
+        parts = [self._run(part.double()) for part in rows.split(most)]
+        path = torch.cat(parts, 1)
+        return path[..., :2], path[..., 2:]
+
+    def _run(self, rows: Tensor) -> Tensor:
+        windows, (which, who) = self.windows, self._people
+        first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
+        parameters = self.parameters(rows)
+        if self.compiled:
+            return self._compiled(parameters, rows, first[which, who])
+        y, h = first.expand(len(rows), *first.shape).clone(), windows.step
+        out = [y[:, which, who]]
+        for k in range(windows.steps):
+            k1 = self._rate(parameters, 2 * k, y)
+            k2 = self._rate(parameters, 2 * k + 1, y + h / 2 * k1)
+            k3 = self._rate(parameters, 2 * k + 1, y + h / 2 * k2)
+            k4 = self._rate(parameters, 2 * k + 2, y + h * k3)
+            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            out.append(y[:, which, who])
+        return torch.stack(out)
+
+    def _compiled(self, parameters: dict[str, Tensor], rows: Tensor, start: Tensor) -> Tensor:
+        """``(F, R, P, 4)``; the terms that are not compiled are evaluated once in each step.
+
+        In a step their accelerations are extrapolated first, and the state after it is corrected
+        when they are known there: a parabola through the last three steps, for a sway of one
+        second changes too fast for lines.
+        """
+        windows, h, q = self.windows, self.windows.step, self.forces(rows)
+        out = np.empty((windows.steps + 1, len(rows), *start.shape))
+        out[0] = start.numpy()
+        fixed = (*self.tables.arguments(), self.law, q)
+        before = self._extra(parameters, q, 0, out[0])
+        after = before
+        for n in range(windows.steps):
+            kernel.advance(out[n], before, after, out[n + 1], n, h, *fixed)
+            if self.beyond.added:
+                found = self._extra(parameters, q, 2 * n + 2, out[n + 1])
+                bend = found - after if n else 0.0
+                out[n + 1, ..., :2] += h**2 / 6 * (found - after) - h**2 / 24 * bend
+                out[n + 1, ..., 2:] += h / 2 * (found - after) - h / 12 * bend
+                before, after = found, 2 * found - before
+        return torch.from_numpy(out)
+
+    def _extra(
+        self, parameters: dict[str, Tensor], q: np.ndarray, moment: int, states: np.ndarray
+    ) -> np.ndarray:
+        """``(R, P, 2)`` m/s² of the terms that are not compiled."""
+        if not self.beyond.added:
+            return np.zeros((*states.shape[:2], 2))
+        (which, who), r = self._people, len(states)
+        x = self.windows.batch.x[moment].expand(r, -1, -1, -1).clone()
+        v = self.windows.batch.v[moment].expand_as(x).clone()
+        state = torch.from_numpy(states)
+        x[:, which, who], v[:, which, who] = state[..., :2], state[..., 2:]
+        rate, p = torch.zeros_like(x), len(which)
+        found = kernel.accelerations(
+            states.reshape(r * p, 4),
+            np.tile(np.arange(p), r),
+            np.full(r * p, moment),
+            np.repeat(np.arange(r), p),
+            *self.tables.arguments(),
+            self.law,
+            q,
+        )
+        rate[:, which, who] = torch.from_numpy(found).reshape(r, p, 2)
+        return self._beyond(parameters, moment, x, v, rate)[:, which, who].numpy()
+
+    def _rate(self, parameters: dict[str, Tensor], moment: int, y: Tensor) -> Tensor:
+        """``(R, W, N, 4)``: time derivative of states at one half step."""
+        x, v = y[..., :2], y[..., 2:]
+        return torch.cat([v, self._beyond(parameters, moment, x, v, torch.zeros_like(x))], -1)
+
+    def _beyond(
+        self, own: dict[str, Tensor], moment: int, x: Tensor, v: Tensor, rate: Tensor
+    ) -> Tensor:
+        t = torch.tensor(moment * self.windows.step / 2, dtype=x.dtype)
+        seen = (self.windows.batch.x[moment], self.windows.batch.v[moment])
+
+        def one(own: dict[str, Tensor], x: Tensor, v: Tensor, rate: Tensor) -> Tensor:
+            state = State(t, x, v, self.scene, rate=rate, seen=seen)
+            found: Tensor = functional_call(self.beyond, own, (state,))
+            return found
+
+        if len(x) == 1:
+            # nothing to batch, and no price of batching
+            single = {name: value[0] for name, value in own.items()}
+            return one(single, x[0], v[0], rate[0])[None]
+        found: Tensor = vmap(one)(own, x, v, rate)
+        return found

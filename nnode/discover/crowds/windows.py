@@ -1,0 +1,203 @@
+"""Short windows in which every person walks alone among the measured paths of the others."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import PADDING_GAP, Batch, Sequence, collate
+from nnode.discover.crowds.paths import Smoother
+from nnode.errors import DataError
+from nnode.models.crowd import SocialForce
+from nnode.models.scene import Scene
+from nnode.models.system import Crowd, System
+
+#: Longest step of a simulation, and about the interval of the residuals, s.
+STEP = 0.13
+INTERVAL = 0.1
+#: Fewest samples of a window: four numbers of each coordinate pair go into the start.
+LEAST = 5
+#: A wall point further away than r + CUT * B is left out: exp(-CUT) of the force at contact.
+CUT = 11.0
+#: How far a simulated person may stray from the measured path before walls are missed, m.
+STRAY = 0.5
+
+
+@dataclass
+class WindowScene(Scene):
+    """A scene of windows, with what only makes sense for people who walk alone.
+
+    Attributes:
+        speed: ``(K, B, N, 2)`` m/s: velocities of the others, at the times of ``measured``.
+        near: wall points, normals and mask of each person, ``(B, N, P, ...)``; None: all
+            points of the scene for everyone.
+    """
+
+    speed: Tensor | None = None
+    near: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def measured_rate_at(self, t: Tensor) -> Tensor:
+        if self.speed is None:
+            return super().measured_rate_at(t)
+        position = t / self.dt
+        k = torch.floor(position + 1e-4).long().clamp(0, self.speed.shape[0] - 2)
+        weight = (position - k).clamp(0, 1).to(self.speed.dtype)
+        return torch.lerp(self.speed[k], self.speed[k + 1], weight)
+
+    def walls_of_each(self) -> tuple[Tensor, Tensor, Tensor]:
+        return super().walls_of_each() if self.near is None else self.near
+
+    def frames(self, every: int, t: Tensor) -> WindowScene:
+        """The scene of the single moments ``t`` (F,), each a simulation of its own.
+
+        Its ``B * F`` simulations are ordered by window, then time. ``every`` samples of
+        ``measured`` lie between the moments.
+        """
+        number = len(t)
+        chosen = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("measured", "speed"):
+                moments = value[::every][:number]
+                value = moments.transpose(0, 1).reshape(1, -1, *value.shape[2:])
+                value = value.expand(2, *value.shape[1:])
+            elif field.name == "near":
+                value = value and tuple(part.repeat_interleave(number, 0) for part in value)
+            elif field.name == "start":
+                value = (value[:, None] + t).reshape(-1)
+            elif isinstance(value, Tensor):
+                value = value.repeat_interleave(number, 0)
+            elif isinstance(value, tuple):
+                value = tuple(item for item in value for _ in range(number))
+            chosen[field.name] = value
+        scene = WindowScene(**chosen)
+        if self.group:
+            # found once for all moments
+            scene.__dict__["companions"] = self.companions.repeat_interleave(number, 0)
+        return scene
+
+
+class Windows:
+    """The windows of some sequences.
+
+    Args:
+        sequences: of people, equally sampled.
+        window: length, s.
+
+    Attributes:
+        batch: one simulation per window. Positions and velocities are the smoothed ones, at half
+            steps of the simulation.
+        measured: ``(L, W, N, 2)`` m: positions as they were measured, at the L residual times.
+        person: ``(P, 2)`` window and place of the P people of all windows who are real.
+        sequence, number: ``(W,)`` position of a window's sequence, and its own within it.
+        step: of the simulation, s. sub: steps between two residuals.
+        used: positions of the sequences that are long enough.
+        variance: m², of the noise of one measured coordinate.
+
+    Raises:
+        DataError: no sequence is long enough, or another fault of the data.
+    """
+
+    def __init__(self, sequences: Many[Sequence], window: float = 1.5) -> None:
+        dt = sequences[0].dt
+        stride = max(1, round(INTERVAL / dt))
+        count = [(item.n_samples + stride - 1) // stride for item in sequences]
+        length = min(max(LEAST + 1, round(window / (stride * dt))), max(count))
+        self.used = [i for i, number in enumerate(count) if number >= length]
+        if length < LEAST:
+            raise DataError(
+                f"the longest sequence has {max(item.n_samples for item in sequences)} samples "
+                f"of {dt:g} s, a window needs {LEAST * stride}; use longer sequences"
+            )
+        smoother = Smoother([sequences[i] for i in self.used])
+        self.variance = smoother.variance
+        self.sub = max(1, int(np.ceil(stride * dt / STEP)))
+        self.step = stride * dt / self.sub
+        self.length = length
+        half = np.arange(2 * self.sub * (length - 1) + 1) * self.step / 2
+        pieces, measured, sequence, number = [], [], [], []
+        for i in self.used:
+            item, windows = sequences[i], count[i] // length
+            spare = (count[i] - windows * length) // 2
+            for w in range(windows):
+                first = (spare + w * length) * stride
+                path = smoother.path(item, first * dt + half)
+                pieces.append(_piece(item, item.time[0] + first * dt + half, path.x, path.v))
+                measured.append(item.x[first::stride][:length])
+                sequence.append(i)
+                number.append(w)
+        self.batch = collate(pieces)
+        _park(self.batch)
+        self.measured = np.zeros((length, *self.batch.x.shape[1:]))
+        for w, x in enumerate(measured):
+            self.measured[:, w, : x.shape[1]] = x
+        self.person = np.argwhere(self.batch.agent.numpy())
+        self.sequence, self.number = np.array(sequence), np.array(number)
+
+    @property
+    def steps(self) -> int:
+        """Steps of the simulation of a window."""
+        return self.sub * (self.length - 1)
+
+    def scene(self, system: System) -> WindowScene:
+        """The surroundings in which ``system`` simulates the windows."""
+        plain = system.scene(self.batch)
+        scene = WindowScene(**{f.name: getattr(plain, f.name) for f in fields(plain)})
+        scene.speed = self.batch.v
+        force = system.find(SocialForce)
+        if force is not None and scene.wall.shape[1]:
+            reach = force.r + CUT * force.B + STRAY
+            scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)
+        return scene
+
+
+def alone(system: System) -> Crowd:
+    """The same model, parameters included, of people among measured others."""
+    assert isinstance(system, Crowd)
+    view = copy.copy(system)
+    view.neighbours = "measured"
+    return view
+
+
+def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Sequence:
+    destination = item.x[-1] if item.destination is None else item.destination
+    return Sequence(
+        name=item.name,
+        recording=item.recording,
+        time=time,
+        x=x,
+        v=v,
+        kind=item.kind,
+        group=item.group,
+        destination=destination,
+        walls=item.walls,
+    )
+
+
+def _park(batch: Batch) -> None:
+    """Move the padding far from everything, also from its destination: directions stay finite."""
+    far = PADDING_GAP * torch.arange(1, batch.x.shape[2] + 1, dtype=batch.x.dtype)
+    place = far[:, None].expand(-1, 2)
+    batch.x = torch.where(batch.agent[..., None], batch.x, place)
+    batch.destination = torch.where(batch.agent[..., None], batch.destination, place + 10.0)
+
+
+def _near(scene: Scene, x: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The wall points within ``reach`` (m) of each person's path ``(L, B, N, 2)``."""
+    middle = (x.amax(0) + x.amin(0)) / 2
+    radius = torch.linalg.vector_norm(x - middle, dim=-1).amax(0)
+    d = torch.linalg.vector_norm(middle[:, :, None] - scene.wall[:, None], dim=-1)
+    real = (d < reach + radius[..., None]) & scene.wall_point[:, None]
+    most = max(int(real.sum(-1).max()), 1)
+    # real points first, then any others, which the mask leaves out
+    index = torch.argsort((~real).to(torch.int8), dim=-1, stable=True)[..., :most]
+    places = index[..., None].expand(*index.shape, 2)
+    shape = (*real.shape, 2)
+    wall = scene.wall[:, None].expand(shape).gather(2, places)
+    normal = scene.wall_normal[:, None].expand(shape).gather(2, places)
+    return wall, normal, real.gather(2, index)

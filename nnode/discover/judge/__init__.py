@@ -1,0 +1,1 @@
+"""What may be said of it: verdicts, and the sealed clusters that confirm them or not."""

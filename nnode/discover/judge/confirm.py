@@ -1,0 +1,99 @@
+"""What the sealed clusters say, once: is what was found in the open ones true of them?
+
+Models are compared by their predictive likelihood, cluster by cluster: the share by which the sum
+of squared whitened residuals falls, one-sided, by sign flips. That takes at least five clusters at
+5 %. The mean square error of positions, which the report shows, must fall as well. Effects are
+tried in the order in which they were found, each beside those before it, until one fails: so all of
+them together keep the level.
+
+Source: Maurer, Hothorn & Lehmacher 1995 (fixed sequences of tests).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from nnode.data.clusters import better, least_number
+from nnode.data.sequence import Sequence
+from nnode.discover.crowds.engine import CrowdEngine
+from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.residuals.engine import Engine, row_of
+from nnode.discover.residuals.fit import sums
+from nnode.discover.statistics.paired import gains
+from nnode.models.system import System
+
+#: Level of a confirmation.
+LEVEL = 0.05
+
+
+def engine_of(
+    domain: str,
+    sequences: list[Sequence],
+    clusters: np.ndarray | None = None,
+    whole: bool = False,
+) -> Engine:
+    """The engine of a domain; ``whole`` compares whole sequences where that makes sense."""
+    if domain == "crowd":
+        return CrowdEngine(sequences, clusters=clusters)
+    if whole:
+        return TrafficEngine(sequences, np.inf, clusters)
+    return TrafficEngine(sequences, clusters=clusters)
+
+
+class Comparing:
+    """Models on some sequences.
+
+    Args:
+        base: the model around which residuals are whitened and weighted.
+        label: ``(S,)`` clusters of the sequences.
+    """
+
+    def __init__(
+        self, domain: str, sequences: list[Sequence], base: System, label: np.ndarray
+    ) -> None:
+        self._domain, self._sequences, self._base, self._label = domain, sequences, base, label
+        self._whole = engine_of(domain, sequences, label, whole=True)
+        self._whole.settle(base, row_of(base))
+
+    @property
+    def floor(self) -> float:
+        """Mean square error of positions that is noise of the measurement, m²."""
+        return self._whole.noise_floor()
+
+    @cached_property
+    def _windows(self) -> Engine:
+        if self._domain == "crowd":
+            return self._whole
+        found = engine_of(self._domain, self._sequences, self._label)
+        found.settle(self._base, row_of(self._base))
+        return found
+
+    def squares(self, system: System) -> np.ndarray:
+        """``(S,)`` mean square errors of positions, m²."""
+        return self._whole.squares(system, row_of(system)).means()
+
+    def scores(self, system: System) -> np.ndarray:
+        """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the
+        negative logarithm of the predictive likelihood, large residuals drawn in."""
+        found = self._windows.residuals(system, row_of(system)[None])[0].numpy()
+        return sums(np.nan_to_num(found, nan=np.inf) ** 2, self._windows.cluster)
+
+
+def improvement(before: np.ndarray, after: np.ndarray) -> float:
+    """One-sided p-value that costs ``(G,)`` fall; 1 where any is infinite afterwards."""
+    if not np.isfinite(before).all() or not np.isfinite(after).all():
+        return 1.0
+    return better(gains(before, after))
+
+
+def too_few(clusters: int) -> str:
+    """Why so many sealed clusters cannot confirm anything; empty where they can."""
+    least = least_number(LEVEL, sided=1)
+    if clusters >= least:
+        return ""
+    have = {0: "no sealed cluster is", 1: "one sealed cluster is"}.get(
+        clusters, f"{clusters} sealed clusters are"
+    )
+    return f"{have} independent of the open ones, and it takes {least} to confirm anything"

@@ -1,0 +1,253 @@
+"""The sealed clusters: opened once, when everything else is decided."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from nnode.data.sequence import Sequence
+from nnode.discover.crowds.indirect_inference import unbiased
+from nnode.discover.judge.confirm import LEVEL, Comparing, improvement, too_few
+from nnode.discover.judge.held_out import MODELS, Later, later
+from nnode.discover.judge.verdict import named
+from nnode.discover.name.search import Search, Step, settled
+from nnode.discover.residuals.engine import Engine
+from nnode.discover.residuals.fit import Fit, refine
+from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
+from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
+from nnode.errors import SimulationError
+from nnode.models.extend import without
+from nnode.models.system import System
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """An effect on the sealed clusters.
+
+    Attributes:
+        p_value: one-sided, that their predictive likelihood rises.
+        before, after: mean square errors of positions, m².
+    """
+
+    p_value: float
+    before: float
+    after: float
+
+    @property
+    def good(self) -> bool:
+        return self.p_value <= LEVEL and self.after < self.before
+
+    @property
+    def reason(self) -> str:
+        if self.p_value > LEVEL:
+            return (
+                "the sealed clusters are not predicted better with it "
+                f"(one-sided p = {self.p_value:.3f}, asked for {LEVEL:g})"
+            )
+        if not self.good:
+            return (
+                "the errors of positions on the sealed sequences do not become smaller with it "
+                f"({self.before:.3g} and {self.after:.3g} m²)"
+            )
+        return ""
+
+
+class Sealed:
+    """Compares models on the sealed sequences.
+
+    Args:
+        base: the model as it was given, calibrated.
+        opened, sealed: sequences.
+        label: ``(S,)`` clusters of the sealed ones.
+        clusters: how many of them are independent of the open ones.
+        seed: of simulations.
+
+    Attributes:
+        tried: the effects in the order in which they were found, until one failed.
+        whole: the fit with all effects that were found.
+    """
+
+    def __init__(
+        self,
+        domain: str,
+        base: System,
+        opened: list[Sequence],
+        sealed: list[Sequence],
+        label: np.ndarray,
+        clusters: int,
+        seed: int,
+    ) -> None:
+        self.domain, self.base, self.opened, self.sealed = domain, base, opened, sealed
+        self.label, self.clusters, self.seed = label, clusters, seed
+        self.comparing = Comparing(domain, sealed, base, label)
+        self.before = self.comparing.squares(base)
+        self.tried: list[_Tried] = []
+        self.whole: Fit | None = None
+        self._corrected: Fit | None = None
+        self._later: dict[str, Later] = {}
+
+    def confirmed(self, engine: Engine, found: Search) -> tuple[Search, list[Step]]:
+        """A search with the effects that sealed clusters confirm, one after the other, and those
+        that they do not."""
+        if not found.steps:
+            return found, []
+        self.whole = self._corrected = self._unbiased(found.fit)
+        best: Fit | None = None
+        scores, passed = self.comparing.scores, 0
+        before, square = scores(self.base), np.nanmean(self.before)
+        for fit in self._path(engine, found, self.whole):
+            after = scores(fit.system)
+            error = np.nanmean(self.comparing.squares(fit.system))
+            p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
+            self.tried.append(_Tried(p_value, float(square), float(error)))
+            if not self.tried[-1].good:
+                break
+            before, square, passed, best = after, error, passed + 1, fit
+        if passed == len(found.steps):
+            return found, []
+        leads = found.steps[passed:]
+        system = self._without(engine, found.fit, leads).system if passed else self.base
+        kept = settled(engine, copy.deepcopy(system), rounds=1)
+        self._corrected = best or kept
+        return replace(found, fit=kept, steps=found.steps[:passed]), leads
+
+    def _path(self, engine: Engine, found: Search, whole: Fit) -> Iterator[Fit]:
+        """The models with the first, the first two, ... effects, each made when it is asked for;
+        all of them corrected."""
+        for number in range(1, len(found.steps)):
+            yield self._unbiased(self._without(engine, found.fit, found.steps[number:]))
+        yield whole
+
+    def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
+        system = fit.system
+        for step in steps:
+            system = without(system, step.chosen.name)
+        return refine(engine, copy.deepcopy(system))
+
+    def _unbiased(self, fit: Fit) -> Fit:
+        return unbiased(fit, self.opened, self.seed) if self.domain == "crowd" else fit
+
+    def corrected(self, found: Search) -> Fit:
+        """The fit with the confirmed effects, without what simulations of it are off by."""
+        return found.fit if self._corrected is None or not found.steps else self._corrected
+
+    def leads(self, engine: Engine, steps: list[Step]) -> list[NamedEffect]:
+        """Effects that were not confirmed, as they are in the model with all that were found."""
+        rest = [one.p_value for one in self.tried[-1:]] + [float("nan")] * len(steps)
+        assert self.whole is not None or not steps
+        return [
+            named(engine, self.whole, step, p)
+            for step, p in zip(steps, rest, strict=False)
+            if self.whole is not None
+        ]
+
+    def confirmation(self, agents: list[Agents]) -> Confirmation:
+        """What is said of the effects that were found: those of the population, or else those with
+        numbers of agents."""
+        few = too_few(self.clusters)
+        tried = [(one.confirmed, one.named, one.reason) for one in agents if one.found]
+        tried = [(one.p_value, one.good, few or one.reason) for one in self.tried] or tried
+        if not tried:
+            return Confirmation(None, self.clusters, None, few)
+        p_value, good, reason = tried[-1]
+        return Confirmation(p_value, self.clusters, good, reason)
+
+    def agents(
+        self, one: Individuals, system: System, alpha: float, structure: bool, enough: bool
+    ) -> Agents:
+        """What agents' own numbers are worth on the last part of the sealed sequences.
+
+        Args:
+            structure: whether something without a name is left, which numbers would absorb.
+            enough: whether there are clusters enough to name anything.
+        """
+        (name,) = one.effect.strengths
+        low, high = one.interval()
+        found = None
+        if one.spread and (one.p_value <= alpha or not enough):
+            found = later(self.domain, self.base, system, one, self.sealed, self.label)
+        p_value, means = 1.0, {}
+        if found is not None:
+            self._later[one.effect.name] = found
+            means = {model: float(np.nanmean(costs)) for model, costs in found.costs.items()}
+            own, *others = (found.scores[model] for model in (MODELS[1], MODELS[0], MODELS[2]))
+            if not too_few(min(len(own), self.clusters)):
+                p_value = max(improvement(other, own) for other in others)
+            if means[MODELS[1]] >= means[MODELS[0]]:
+                p_value = 1.0
+        hindered = _hindered(one, alpha, structure, enough)
+        reason = hindered or _why_not(p_value, found, self.clusters)
+        return Agents(
+            name=one.effect.name,
+            strength=one.sigma,
+            low=low,
+            high=high,
+            unit=one.effect.strengths[name].unit,
+            p_value=one.p_value,
+            lasts=one.lasts,
+            share=one.share,
+            lags=one.lags,
+            common=one.common,
+            later=means,
+            confirmed=float("nan") if found is None else p_value,
+            found=not hindered,
+            named=not reason,
+            reason=reason,
+        )
+
+    def with_numbers(self, engine: Engine, fit: Fit, own: list[Individuals]) -> System:
+        """The model with everybody's numbers in the open sequences, calibrated with them."""
+        system = fit.system
+        for one in own:
+            system = with_people(system, one, numbers(engine, system, one))
+        if not own:
+            return system
+        try:
+            return refine(engine, system).system
+        except SimulationError:
+            return fit.system
+
+    def gap(self, extended: System, own: list[Individuals]) -> tuple[Gap, list[dict[str, Any]]]:
+        """The errors before and after, and those of each sequence."""
+        if own:
+            known = self._later[own[0].effect.name]
+            used, floor = known.used, known.floor
+            before, after = known.costs["base"], known.costs[MODELS[1]]
+        else:
+            used, floor = list(range(len(self.sealed))), self.comparing.floor
+            before = self.before
+            after = before if extended is self.base else self.comparing.squares(extended)
+        first, last = float(np.nanmean(before)), float(np.nanmean(after))
+        closed = (first - last) / (first - floor) if first > floor else float("nan")
+        each = [
+            {"name": self.sealed[i].name, "before": float(a), "after": float(b)}
+            for i, a, b in zip(used, before, after, strict=True)
+        ]
+        return Gap(first, last, floor, closed), each
+
+
+def _hindered(one: Individuals, alpha: float, structure: bool, enough: bool) -> str:
+    """Why agents' own numbers are not found in the open clusters; empty where they are."""
+    if not enough:
+        return "there are too few clusters to test it"
+    if one.p_value > alpha or not one.interval()[0] > 0:
+        return "what an agent's numbers have in common over time does not stand out"
+    if structure:
+        return "something without a name is left, which numbers of agents would absorb"
+    return ""
+
+
+def _why_not(p_value: float, found: Later | None, clusters: int) -> str:
+    """Why the sealed clusters do not confirm them; empty where they do."""
+    if found is None:
+        return "the sealed sequences are too short to be divided"
+    if p_value > LEVEL:
+        return too_few(clusters) or (
+            "the last part of the sealed sequences is not predicted better by own numbers than "
+            f"without, or by one number per sequence (one-sided p = {p_value:.3f})"
+        )
+    return ""

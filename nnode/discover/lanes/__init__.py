@@ -1,0 +1,1 @@
+"""What only traffic needs: residuals of whole platoons behind their measured leader."""

@@ -1,0 +1,363 @@
+"""Traffic: whole platoons are simulated behind their measured leader."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor, nn
+
+from nnode.data.sequence import Sequence, collate
+from nnode.discover.lanes.paths import noise_variance, smooth, velocity
+from nnode.discover.lanes.response import Response
+from nnode.discover.lanes.variables import traffic_variables
+from nnode.discover.lanes.whitening import PlatoonFilter
+from nnode.discover.residuals.engine import (
+    Ensemble,
+    Squares,
+    fill,
+    names_of,
+    of_residuals,
+    row_of,
+    runge_kutta,
+)
+from nnode.discover.residuals.fit import limits
+from nnode.discover.residuals.variables import Variable
+from nnode.models.effects import Effect, IndividualEffect, Probe
+from nnode.models.extend import effects_of, extended, without
+from nnode.models.system import System
+from nnode.models.term import State, Term
+
+#: Longest step of the simulation, s; steps are no longer than the shortest time constant of the
+#: states that terms own.
+STEP = 0.4
+#: Sequences are compared in windows of about this length, s, each simulated from so much
+#: before (at most a share of the sequence) that its start is forgotten.
+WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
+#: Whitened residuals beyond this count less.
+LARGE = 6.0
+#: Change of an agent's number by which derivatives are taken.
+SMALL = 1e-4
+#: Most past samples that a filter looks at.
+ORDER = 6
+
+
+class TrafficEngine:
+    """Residuals of platoons; see :class:`~nnode.discover.residuals.engine.Engine`.
+
+    Only the leader's path and the starts are taken from the measurement, smoothed. Followers are
+    simulated behind each other, so that no follower's noise enters the right-hand side. A law of
+    following forgets its start within some seconds: windows keep the simulated paths near the
+    measured ones, also where the model is quite wrong, and lose little.
+
+    Args:
+        sequences: at least one, of the same sampling interval.
+        window: length of a window, s; infinite simulates whole sequences.
+        clusters: ``(S,)`` of the sequences; None: each is one.
+
+    Attributes:
+        unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
+        people: of each unit, per direction the sequence and the place of its agent.
+    """
+
+    def __init__(
+        self,
+        sequences: list[Sequence],
+        window: float = WINDOW,
+        clusters: np.ndarray | None = None,
+    ) -> None:
+        self.sequences = sequences
+        self.names = [sequence.name for sequence in sequences]
+        parts = [_windows(sequence, window) for sequence in sequences]
+        self.batch = collate(part[0] for each in parts for part in each)
+        smoothed = [_windows(_smoothed(sequence), window) for sequence in sequences]
+        self.smoothed = collate(part[0] for each in smoothed for part in each)
+        owner = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+        leader = self.batch.agent.sum(1) - 1
+        index = torch.arange(self.batch.x.shape[2])
+        follower = self.batch.agent & (index != leader[:, None])
+        self.follows = self.batch.valid & follower
+        # the start is given, and tells of disturbances that still go on
+        first = [part[1] for each in parts for part in each]
+        time = torch.arange(self.batch.n_samples)[:, None]
+        self.seen = self.follows & (time > torch.tensor(first))[..., None]
+        self.filter = PlatoonFilter.none()
+        self._last: tuple[System, Tensor, Tensor] | None = None
+        self._response: tuple[System, Tensor, Response] | None = None
+        k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
+        self.sequence = owner[b]
+        self.cluster = of_residuals(clusters, self.sequence)
+        self.clock = self.batch.start.numpy()[b] + k * self.batch.dt
+        self.component = np.zeros(len(b), dtype=int)
+        self.unit = self.sequence
+        self.people = [
+            [(i, n) for n in range(self.batch.agent.shape[1])] for i in range(len(sequences))
+        ]
+
+    def noise_floor(self) -> float:
+        """Mean square error of positions that is noise of the measurement, m²."""
+        found = [noise_variance(s.x[:, :-1]) for s in self.sequences if s.n_samples > 4]
+        weight = [s.n_samples * (s.n_agents - 1) for s in self.sequences if s.n_samples > 4]
+        return float(np.average(found, weights=weight)) if found else float("nan")
+
+    def simulate(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, K, B, N, W)`` states; their first component are positions, m."""
+        batch = self.smoothed
+        runs = Ensemble(system, rows, system.scene(batch))
+        longest = min(STEP, fastest(system, rows))
+        # several samples in a step, or several steps in a sample
+        stride = max(1, math.floor(longest / batch.dt + 1e-9))
+        steps = max(1, math.ceil(batch.dt / longest - 1e-9))
+        h = batch.dt * stride / steps
+        y = runs.start(batch)
+        rate = runs.recorded_rate(_time(0.0), y)
+        slope, found = rate(_time(0.0), y), [y]
+        number = math.ceil((batch.n_samples - 1) / stride) * steps
+        for step in range(number):
+            t = step * h
+            after = runge_kutta(rate, _time(t), y, h, slope)
+            then = rate(_time(t + h), after)
+            found += _between(y, slope, after, then, h, stride)
+            if (step + 1) % steps == 0:
+                found.append(after)
+            y, slope = after, then
+        return torch.stack(found[: batch.n_samples], 1)
+
+    def deviations(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, K, B, N)`` measured minus simulated positions, m; 0 for leaders and outside of
+        what was measured."""
+        with torch.no_grad():
+            states = self.simulate(system, rows)
+        self._last = system, rows[0].clone(), states[0]
+        away = self.batch.x[..., 0] - states[..., 0]
+        return torch.where(self.follows, away, 0.0)
+
+    def residuals(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, n)`` whitened residuals, the largest drawn in."""
+        return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen])
+
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        """``(K, n)`` derivatives of the residuals, by linear response."""
+        response = self.linear(system, row)
+        with torch.no_grad():
+            return self._columns(response, response.parameters())
+
+    def screen_columns(
+        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(S, n)`` derivatives of the residuals with respect to a probe's strengths, by linear
+        response; the change by the effect as a whole where it has no strength."""
+        response = self.linear(system, row)
+        if effect.memory:
+            return self._whole(response, effect, probe)
+        base = response.rates(response.system)
+        sources = []
+        if not probe.steps:
+            changed, _ = extended(response.system, effect(**probe.options))
+            sources.append(response.rates(changed) - base)
+        for name, step in probe.steps.items():
+            value = effect.strengths[name].neutral + step
+            changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
+            sources.append((response.rates(changed) - base) / step)
+        return self._columns(response, response.moved(torch.stack(sources)))
+
+    def _whole(self, response: Response, effect: type[Effect], probe: Probe) -> Tensor:
+        """``(1, n)`` change of the residuals by an effect of finite strength."""
+        values, amount = dict(probe.options), 1.0
+        for name, step in probe.steps.items():
+            values[name], amount = effect.strengths[name].neutral + step, step
+        changed, _ = extended(response.system, effect(**values))
+        with torch.no_grad():
+            x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
+        return self._columns(response, (x - response.states[..., 0])[None] / amount)
+
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to factors of M further speeds.
+
+        Args:
+            rates: of a state M speeds ``(B, N, 1)``, m/s.
+        """
+        linear = self.linear(system, row)
+        scene, lead = linear.scene, linear.scene.leader[..., None]
+
+        def one(t: Tensor, y: Tensor, rate: Tensor) -> Tensor:
+            x = torch.where(lead, scene.measured_at(t), y[..., :1])
+            speed = torch.where(lead, scene.measured_rate_at(t), rate[..., :1])
+            return torch.stack(rates(State(t, x, None, scene, linear.system, speed)))
+
+        base = linear.rates(linear.system)
+        with torch.no_grad():
+            found = torch.func.vmap(one)(linear.time, linear.states, base).transpose(0, 1)
+        rest = found.new_zeros(*found.shape[:-1], base.shape[-1] - 1)
+        return self._columns(linear, linear.moved(torch.cat([found, rest], -1)))
+
+    def linear(self, system: System, row: Tensor) -> Response:
+        """The linear response of a run, kept until another one is asked for."""
+        known = self._response
+        if known is not None and known[0] is system and torch.equal(known[1], row):
+            return known[2]
+        last = self._last
+        if last is None or last[0] is not system or not torch.equal(last[1], row):
+            self.deviations(system, row[None])
+        assert self._last is not None
+        fixed = fill(copy.deepcopy(system), row)
+        with torch.no_grad():
+            found = Response(fixed, self.smoothed, self._last[2])
+        self._response = system, row.clone(), found
+        return found
+
+    def _columns(self, response: Response, moved: Tensor) -> Tensor:
+        """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
+        away = self.batch.x[..., 0] - response.states[..., 0]
+        residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
+        weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
+        found = self.filter(torch.where(self.follows, -moved, 0.0))[:, self.seen]
+        return torch.nan_to_num(found * weight)
+
+    def near(self, system: System) -> System:
+        """A copy whose law is fitted to the smoothed speeds: simulations started from there do
+        not end in a far minimum. The regression itself is biased by noise, as a start it may."""
+        found = copy.deepcopy(system)
+        batch, scene = self.smoothed, found.scene(self.smoothed)
+        low, high = limits(found)
+        time = batch.dt * torch.arange(batch.n_samples, dtype=torch.float64)
+        every = torch.func.vmap(lambda t, x: found(t, x, scene))
+
+        def missed(row: np.ndarray) -> np.ndarray:
+            fill(found, torch.from_numpy(row))
+            with torch.no_grad():
+                speed = every(time, batch.x)[..., 0]
+            away: np.ndarray = (batch.v[..., 0] - speed)[self.follows].numpy()
+            return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
+
+        start = np.clip(row_of(found).numpy(), low, high)
+        best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
+        return fill(found, torch.from_numpy(best.x))
+
+    def squares(self, system: System, row: Tensor) -> Squares:
+        """Squared errors of the followers' positions."""
+        away = self.deviations(system, row[None])[0][self.seen].numpy()
+        return Squares(away**2, self.sequence)
+
+    def variables(self) -> list[Variable]:
+        """What deviations of vehicles may depend on."""
+        return traffic_variables(self.smoothed)
+
+    def individual(
+        self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
+    ) -> Tensor:
+        """``(N, n)``: derivatives of the residuals with respect to the number of the vehicle at
+        each place of the platoon, in all sequences at once."""
+        linear = self.linear(system, row)
+        ((values, number),) = effect.directions(options)
+        present = [one for one in effects_of(linear.system) if isinstance(one, effect)]
+        now = present[0].people if present else {}
+        plain = without(linear.system, effect.name) if present else linear.system
+        size = self.batch.agent.shape[1]
+
+        def rates(place: int | None) -> Tensor:
+            people = {name: [*now.get(name, []), *[0.0] * size][:size] for name in self.names}
+            for own in people.values():
+                if place is not None:
+                    own[place] += number * SMALL
+            return linear.rates(extended(plain, effect(people=people, **values))[0])
+
+        base = rates(None)
+        sources = [(rates(place) - base) / SMALL for place in range(size)]
+        return self._columns(linear, linear.moved(torch.stack(sources)))
+
+    def settle(self, system: System, row: Tensor) -> None:
+        """Fit the filter to the residuals that a model leaves."""
+        shortest = int(self.batch.valid.any(-1).sum(0).min())
+        order = min(ORDER, max(0, (shortest - 2) // 3))
+        away = self.deviations(system, row[None])[0]
+        self.filter = PlatoonFilter.fitted(away, self.seen, order)
+
+
+def drawn_in(residual: Tensor) -> Tensor:
+    """Residuals whose squares are Huber's loss: a vehicle that breaks down does not outweigh
+    all others.
+
+    Source: Huber 1964.
+    """
+    size = residual.abs()
+    large = torch.sqrt((2 * LARGE * size - LARGE**2).clamp(min=0)).copysign(residual)
+    return torch.where(size <= LARGE, residual, large)
+
+
+def fastest(system: System, rows: Tensor) -> float:
+    """The shortest time constant of the states that terms own, s; infinite where none do."""
+    factors = {
+        f"terms.{i}.{name}": factor
+        for i, term in enumerate(system.terms)
+        for name, factor in _fast(term).items()
+    }
+    found = [
+        factors[name] * float(rows[:, j].min())
+        for j, name in enumerate(names_of(system))
+        if name in factors
+    ]
+    return min(found, default=math.inf)
+
+
+def _fast(term: nn.Module) -> dict[str, float]:
+    assert isinstance(term, Term)
+    return term.fast
+
+
+def _time(t: float) -> Tensor:
+    return torch.tensor(t, dtype=torch.float64)
+
+
+def _between(
+    before: Tensor, start: Tensor, after: Tensor, end: Tensor, h: float, stride: int
+) -> list[Tensor]:
+    """States at the samples within a step of ``h`` s, by Hermite's cubic interpolation."""
+    x0, v0, x1, v1 = before, start, after, end
+    found = []
+    for part in range(1, stride):
+        s = part / stride
+        away = h * (s * (1 - s) ** 2 * v0 - s**2 * (1 - s) * v1)
+        found.append((1 + 2 * s) * (1 - s) ** 2 * x0 + s**2 * (3 - 2 * s) * x1 + away)
+    return found
+
+
+def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:
+    """Windows, and of each the number of samples after its start that are not compared.
+
+    What is compared are pieces of equal length that share their boundary sample; each is
+    preceded by the time in which a start is forgotten. Whole sequences are compared from their
+    start on.
+    """
+    intervals = sequence.n_samples - 1
+    if intervals < 1 or not math.isfinite(length):
+        return [(sequence, 0)]
+    forget = int(min(FORGET, SHARE * intervals * sequence.dt) / sequence.dt + 1e-9)
+    number = max(1, round((intervals - forget) * sequence.dt / length))
+    ends = np.linspace(forget, intervals, number + 1).round().astype(int)
+    return [
+        (
+            replace(
+                sequence,
+                time=sequence.time[first - forget : last + 1],
+                x=sequence.x[first - forget : last + 1],
+                v=None if sequence.v is None else sequence.v[first - forget : last + 1],
+            ),
+            forget,
+        )
+        for first, last in pairwise(ends)
+    ]
+
+
+def _smoothed(sequence: Sequence) -> Sequence:
+    x = smooth(sequence.x)
+    return replace(sequence, x=x, v=velocity(x, sequence.dt) if len(x) > 1 else None)

@@ -1,0 +1,222 @@
+"""How much of a deviation depends on each variable: curves without a formula."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from nnode.discover.residuals.engine import Engine, fill, square_of
+from nnode.discover.residuals.fit import ROUGH, Fit, grams, limits, refine, sums
+from nnode.discover.residuals.variables import Curves, Variable
+from nnode.discover.statistics.paired import compare, heldout
+from nnode.discover.statistics.score import Screen, at_least
+from nnode.errors import SimulationError
+from nnode.models.system import System
+from nnode.models.term import Interval, State, Term
+
+#: A curve may bend about so many times; several are tried.
+BENDS = (2, 5, 12)
+#: Heights are drawn to zero by this share of their mean information.
+RIDGE = 1e-3
+#: Sign flips that p-values of curves come from: there are many curves.
+FLIPS = 7999
+#: At most so many curves are calibrated with the model, those that predict best.
+MOST = 6
+#: A share of the knowledge of a height that is none, but for rounding.
+UNKNOWN = 1e-9
+#: Columns that are computed at once.
+CHUNK = 128
+
+
+class Curve(Term):
+    """A curve as a term of a model: the flexible fit of what is left."""
+
+    name = "curve"
+    formula = "f(variable)"
+    source = "a curve without a formula, fitted to what a model leaves"
+
+    def __init__(self, variable: Variable, amounts: np.ndarray) -> None:
+        super().__init__()
+        self.variable = variable
+        self.amounts = torch.from_numpy(amounts)
+        self.declare("scale", 1.0, unit="1", bounds=Interval(0.0, 2.0))
+        self.scale: Tensor
+
+    def forward(self, state: State) -> Tensor:
+        amount = self.scale * (self.variable.weights(state) @ self.amounts)
+        return amount[..., None] * self.variable.direction(state)
+
+
+def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
+    """``(n, M)`` changes of the residuals per unit of the curve's weights."""
+    total = 2 * len(variable.lengths) or len(variable.knots)
+    row, found = torch.from_numpy(fit.row), []
+    for first in range(0, total, CHUNK):
+        part = slice(first, first + CHUNK)
+
+        def rates(state: State, part: slice = part) -> list[Tensor]:
+            weights, way = variable.weights(state)[..., part], variable.direction(state)
+            return [weight[..., None] * way for weight in weights.unbind(-1)]
+
+        found.append(engine.response(fit.system, row, rates).numpy().T)
+    return np.concatenate(found, 1)
+
+
+def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -> list[Curves]:
+    """The best curve or wave of every variable, the one that explains most first.
+
+    They are kept with the fit, which is looked at more than once.
+
+    Args:
+        seed: of the sign flips, see :mod:`nnode.discover.statistics.score`.
+    """
+    if fit.curves is None:
+        fit.curves = _curves(engine, fit, variables, seed)
+    return fit.curves
+
+
+def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> list[Curves]:
+    if not variables:
+        return []
+    screen = Screen(fit, engine.cluster, seed, FLIPS)
+    before = heldout(fit, engine.cluster)
+    looks = [_Look(engine, fit, screen, variable) for variable in variables]
+    every = np.stack([squares for look in looks for squares in look.squares])
+    share = np.stack([at_least(row) for row in every])
+    least = share.min(0)
+    found, first = [], 0
+    for look in looks:
+        own = share[first : first + len(look.squares), 0].min()
+        first += len(look.squares)
+        found.append(look.best(before, float((least <= own + 1e-12).mean())))
+    return sorted(found, key=lambda one: -one.gain.gain)
+
+
+class _Look:
+    """All curves of one variable.
+
+    Attributes:
+        squares: per kind of curve ``(F,)`` what it explains in the data and under sign flips:
+            of a curve one per strength of smoothing, of waves the largest of all.
+    """
+
+    def __init__(self, engine: Engine, fit: Fit, screen: Screen, variable: Variable) -> None:
+        self.engine, self.fit, self.variable = engine, fit, variable
+        columns = columns_of(engine, fit, variable)
+        self.z = screen.beyond(columns)
+        self.parts = sums(self.z * fit.residual[:, None], engine.cluster)
+        self.total = screen.flipped(screen.parts(self.z, engine.cluster))
+        self.absorbed = np.linalg.lstsq(fit.jacobian, columns, rcond=1e-9)[0]
+        self.squares: list[np.ndarray] = []
+        if variable.lengths:
+            self._look_for_waves()
+        else:
+            self._look_for_curves()
+
+    def _look_for_curves(self) -> None:
+        whole = self.z.T @ self.z
+        number = len(whole)
+        bend = np.diff(np.eye(number), 2, axis=0)
+        size = max(float(np.trace(whole)) / number, 1e-300)
+        self.penalties = []
+        for bends in BENDS:
+            smooth = (number / (np.pi * bends)) ** 4 * bend.T @ bend
+            self.penalties.append(size * (smooth + RIDGE * np.eye(number)))
+            solved = np.linalg.solve(whole + self.penalties[-1], self.total.T)
+            self.squares.append((self.total.T * solved).sum(0))
+
+    def _look_for_waves(self) -> None:
+        z, total = self.z, self.total
+        sine, cosine = z[:, ::2], z[:, 1::2]
+        a, b = (sine**2).sum(0), (sine * cosine).sum(0)
+        c = (cosine**2).sum(0)
+        determinant = np.maximum(a * c - b**2, 1e-12 * (a * c + 1e-300))
+        s, t = total[:, ::2], total[:, 1::2]
+        squares = (c * s**2 - 2 * b * s * t + a * t**2) / determinant
+        self.squares.append(squares.max(1))
+        best = int(np.argmax(squares[0]))
+        own = slice(2 * best, 2 * best + 2)
+        self.variable = self.variable.wave(best)
+        self.z, self.parts, self.absorbed = z[:, own], self.parts[:, own], self.absorbed[:, own]
+        self.penalties = [np.zeros((2, 2))]
+
+    def best(self, before: np.ndarray, p_value: float) -> Curves:
+        """With the smoothing that predicts best.
+
+        Args:
+            before: ``(G,)`` held-out costs without a curve.
+            p_value: with regard to all variables.
+        """
+        label = self.engine.cluster
+        plain = sums(self.fit.residual**2, label)
+        count, number = len(plain), self.z.shape[1]
+        gram, score = grams(self.z, label), -self.parts
+        whole, total = gram.sum(0), score.sum(0)
+        change, penalty = np.full(count, np.inf), self.penalties[0]
+        for tried in self.penalties:
+            # what one cluster alone knows of cannot be predicted by the others
+            tried = tried + UNKNOWN * np.trace(whole) * np.eye(number)
+            heights = np.linalg.solve(whole - gram + tried, (total - score)[..., None])[..., 0]
+            new = np.einsum("sm,smn,sn->s", heights, gram, heights) - 2 * (heights * score).sum(1)
+            if new.sum() < change.sum():
+                change, penalty = new, tried
+        # relative to the model's own held-out cost
+        losses = before * np.maximum(1 + change / np.maximum(plain, 1e-300), 0.0)
+        inverse = np.linalg.inv(whole + penalty)
+        amounts = inverse @ total
+        shape = self.variable.heights(np.eye(number))
+        rest = score - np.einsum("gmn,n->gm", gram, amounts)
+        rest = rest * np.sqrt(count / max(count - 1, 1))
+        cov = shape @ inverse @ (rest.T @ rest) @ inverse @ shape.T
+        return Curves(
+            variable=self.variable,
+            amounts=amounts,
+            heights=shape @ amounts,
+            errors=np.sqrt(np.maximum(np.diag(cov), 1e-300)),
+            losses=losses,
+            gain=compare(before, losses),
+            p_value=p_value,
+            shift=-self.absorbed @ amounts,
+        )
+
+
+def with_curve(fit: Fit, curve: Curves) -> System:
+    """A model with a curve as one more term, its own parameters moved to make room for it."""
+    found = copy.deepcopy(fit.system)
+    low, high = limits(found)
+    fill(found, torch.from_numpy(np.clip(fit.row + curve.shift, low, high)))
+    found.terms.append(Curve(curve.variable, curve.amounts))
+    return found
+
+
+def weighed(engine: Engine, fit: Fit, found: list[Curves], alpha: float) -> list[Curves]:
+    """The curves that are no chance at probability ``alpha``, with what they remove.
+
+    The linear response overshoots where a curve is strong: its scale is calibrated with the
+    model.
+    """
+    before = square_of(engine, fit.system)
+    sure: list[Curves] = []
+    for one in found:
+        if one.p_value >= alpha or one.gain.gain <= 0:
+            continue
+        if len(sure) == MOST:
+            break
+        try:
+            after = square_of(engine, refine(engine, with_curve(fit, one), tolerance=ROUGH).system)
+        except SimulationError:
+            continue
+        sure.append(replace(one, removed=1 - after / before))
+    return sorted(sure, key=lambda one: -one.removed)
+
+
+def tail(one: Curves, number: int) -> np.ndarray:
+    """Two-sided p-values of a curve's heights by Student's t, corrected for ``number`` of them."""
+    degrees = max(one.clusters - 1, 1)
+    found: np.ndarray = np.minimum(1.0, 2 * stats.t.sf(np.abs(one.statistic), degrees) * number)
+    return found

@@ -1,0 +1,271 @@
+"""Adding effects one after the other, and taking back those that are not needed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nnode.discover.locate.curves import curves
+from nnode.discover.name.candidate import Candidate, calibrated
+from nnode.discover.residuals.comparison import Comparison
+from nnode.discover.residuals.engine import Engine, row_of, square_of
+from nnode.discover.residuals.fit import FINE, Fit, refine
+from nnode.discover.residuals.variables import Variable
+from nnode.discover.statistics.paired import compare, heldout
+from nnode.discover.statistics.profile import moved
+from nnode.discover.statistics.score import Score, Screen, traces
+from nnode.errors import SimulationError
+from nnode.models.effects import Effect
+from nnode.models.extend import effects_of, without
+from nnode.models.system import System
+
+log = logging.getLogger(__name__)
+
+#: An effect must remove this share of the squared errors of positions that the model had before
+#: anything was added to it.
+FLOOR = 0.02
+#: A mean square error of positions, m², below which nothing is left to be explained: 1 mm.
+EXACT = 1e-6
+#: Effects whose trace explains this share of what the best one explains are calibrated too.
+RIVAL = 0.25
+#: Of two effects whose held-out gains differ by less than this share, the simpler one is chosen,
+#: or the likelier one.
+NEAR = 0.97
+#: At most so many effects are calibrated in a round.
+RIVALS = 5
+#: A rival whose held-out gain is below this share of the best one's is told apart from it.
+CLOSE = 0.8
+#: A curve counts as better than an effect from this much more held-out gain on, at this error
+#: probability: an interval that was looked for is flattered, and no name is better than a wrong
+#: one.
+MARGIN, RATHER = 0.1, 0.35
+#: An effect must predict clusters that a calibration left out better, at this error probability.
+#: False alarms are held by its score; an effect that acts in few clusters helps few of them.
+BETTER = 0.05
+#: Further effects are held to this share of the error probability: a model that has one more
+#: effect is nearer to the data, but what is left of them is not all chance.
+LATER = 0.5
+#: Two rivals are told apart at this error probability; two of a kin at a smaller one.
+APART, KIN_APART = 0.05, 0.01
+
+
+@dataclass
+class Step:
+    """An effect that was accepted.
+
+    Attributes:
+        chosen: the candidate.
+        rivals: candidates that the data cannot tell from it, with the test against each.
+    """
+
+    chosen: Candidate
+    rivals: list[tuple[Candidate, Comparison]]
+
+
+@dataclass
+class Search:
+    """How far a search for effects came.
+
+    Attributes:
+        fit: of the model with all accepted effects.
+        steps: in order of acceptance.
+        scores: of all effects that are left, against ``fit``.
+        screen: that they come from.
+        first: the scores of all effects against the model as it was given.
+        square: mean square error of positions of the model without any effect, m²; 0 until it
+            is known.
+    """
+
+    fit: Fit
+    steps: list[Step] = field(default_factory=list)
+    scores: list[Score] = field(default_factory=list)
+    screen: Screen | None = None
+    first: list[Score] = field(default_factory=list)
+    square: float = 0.0
+
+
+def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:
+    """Calibrate a model, and the engine's filter to what it leaves, in turns."""
+    fit = refine(engine, system)
+    for _ in range(rounds):
+        engine.settle(fit.system, row_of(fit.system))
+        fit = refine(engine, fit.system)
+    return fit
+
+
+def search(
+    engine: Engine,
+    fit: Fit,
+    effects: list[type[Effect]],
+    *,
+    alpha: float = 0.05,
+    most: int = 4,
+    seed: int = 0,
+    variables: list[Variable] | None = None,
+    levels: dict[str, np.ndarray] | None = None,
+    within: Callable[[float], None] = lambda part: None,
+) -> Search:
+    """Forwards until no effect passes, then backwards.
+
+    Args:
+        engine: of the open sequences.
+        fit: the calibrated model, in the engine's filter.
+        effects: to look for.
+        alpha: probability of naming anything where nothing is hidden.
+        most: effects at most.
+        seed: of the sign flips.
+        variables: no effect is accepted where a curve of one of these predicts better: it is a
+            sign of something that the catalogue lacks.
+        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser
+            than the engine's.
+        within: is told, now and then, about which part of the search is done.
+    """
+    found, levels = Search(fit), levels or {}
+    while True:
+        own = {effect.name for effect in effects_of(found.fit.system)}
+        left = [effect for effect in effects if effect.name not in own]
+        begun = len(found.steps)
+        within(begun / (begun + 2))  # of most searches, the last but one round finds nothing more
+        look = [trace for effect in left for trace in traces(engine, found.fit, effect)]
+        within((begun + 0.5) / (begun + 2))
+        found.screen = Screen(found.fit, engine.cluster, seed + len(found.steps), levels=levels)
+        found.scores = found.screen.scores(look)
+        found.first = found.first or found.scores
+        if len(found.steps) >= most:
+            break
+        step = _round(engine, found, alpha if not found.steps else LATER * alpha)
+        if step is None or _outdone(engine, found.fit, step.chosen, variables or []):
+            break
+        found.steps.append(step)
+        found.fit = settled(engine, step.chosen.fit.system, rounds=1)
+        if step.chosen.score.effect.consecutive:
+            found.fit = moved(engine, found.fit, step.chosen.name)
+        log.info("added %s", step.chosen.name)
+    return _pruned(engine, found)
+
+
+def _round(engine: Engine, found: Search, alpha: float) -> Step | None:
+    scores, screen = found.scores, found.screen
+    assert screen is not None
+    if not scores or min(score.p_value for score in scores) > alpha:
+        return None
+    most = max(score.gain for score in scores)
+    tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
+    square = square_of(engine, found.fit.system)
+    found.square = found.square or square
+    if square < EXACT:
+        return None
+    candidates: list[Candidate] = []
+    for score in tried:
+        least = min((c.fit.cost for c in candidates), default=0.0)
+        try:
+            fit = calibrated(engine, found.fit, score, least)
+        except SimulationError:
+            continue
+        removed = (square - square_of(engine, fit.system)) / found.square
+        candidates.append(_candidate(score, fit, found.fit, screen, removed))
+    candidates = _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
+    passing = [
+        c for c in candidates
+        if c.score.p_value <= alpha
+        and c.removed >= FLOOR
+        and c.gain.p_value < BETTER
+        and c.strength_excludes_neutral(screen.label(c.name))
+        and c.ordered
+    ]  # fmt: skip
+    if not passing:
+        return None
+    best = _simplest(passing, screen)
+    rivals = []
+    for other in candidates:
+        if other is best or other.gain.gain < CLOSE * best.gain.gain:
+            continue
+        test = _between(other, best, screen)
+        kin = best.score.effect.kin
+        alike = bool(kin) and kin == other.score.effect.kin
+        if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
+            rivals.append((other, test))
+    return Step(best, rivals)
+
+
+def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:
+    """Compared with the model without it, on the clusters that tell of the effect."""
+    label = screen.label(score.effect.name)
+    losses = heldout(fit, label)
+    return Candidate(score, fit, losses, compare(heldout(before, label), losses), removed)
+
+
+def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
+    """Whether the second candidate predicts better, on the coarser clusters of the two."""
+    label = min(
+        (screen.label(one.name) for one in (first, second)), key=lambda label: int(label.max())
+    )
+    return compare(heldout(first.fit, label), heldout(second.fit, label))
+
+
+def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> list[Candidate]:
+    """Candidates in their order, those near the best calibrated to the end: kin differ by less
+    than a rough calibration leaves."""
+    assert found.screen is not None
+    ended = []
+    for one in candidates:
+        if one.gain.gain >= CLOSE * candidates[0].gain.gain > 0:
+            fit = refine(engine, one.fit.system, tolerance=FINE)
+            one = _candidate(one.score, fit, found.fit, found.screen, one.removed)
+        ended.append(one)
+    return sorted(ended, key=lambda c: -c.gain.gain)
+
+
+def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
+    """Whether a curve without a formula predicts better than an effect."""
+    for curve in curves(engine, fit, variables) if variables else []:
+        better = curve.gain.gain > (1 + MARGIN) * best.gain.gain
+        if better and curve.p_value < APART:
+            test = compare(heldout(best.fit, engine.cluster), curve.losses)
+            if test.p_value < RATHER:
+                return True
+    return False
+
+
+def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
+    """The best candidate, or one that is as good and has fewer parameters, or as many and a
+    greater likelihood."""
+    best = candidates[0]
+    for other in candidates[1:]:
+        number = len(other.fit.row), len(best.fit.row)
+        likelier = number[0] == number[1] and other.fit.cost < best.fit.cost
+        near = other.gain.gain >= NEAR * best.gain.gain
+        apart = _between(other, best, screen).p_value <= APART
+        if (number[0] < number[1] or likelier) and near and not apart:
+            best = other
+    return best
+
+
+def _contains(wider: Candidate, narrower: Candidate) -> bool:
+    """Whether one effect is a special case of the other."""
+    return narrower.name in wider.score.effect.contains
+
+
+def _pruned(engine: Engine, found: Search) -> Search:
+    """Take back effects that the later ones have made needless; who was a rival of one effect
+    and was added later is none."""
+    while len(found.steps) > 1:
+        losses = heldout(found.fit, engine.cluster)
+        worst: tuple[float, Step, Fit] | None = None
+        for step in found.steps:
+            fit = refine(engine, without(found.fit.system, step.chosen.name))
+            test = compare(heldout(fit, engine.cluster), losses)
+            if test.p_value > BETTER and (worst is None or test.gain < worst[0]):
+                worst = test.gain, step, fit
+        if worst is None:
+            break
+        found.steps.remove(worst[1])
+        found.fit = worst[2]
+        log.info("took back %s", worst[1].chosen.name)
+    added = {step.chosen.name for step in found.steps}
+    for step in found.steps:
+        step.rivals = [rival for rival in step.rivals if rival[0].name not in added]
+    return found

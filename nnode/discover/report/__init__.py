@@ -1,0 +1,1 @@
+"""A diagnosis as files, a page and figures."""

@@ -1,0 +1,241 @@
+"""Figures of a diagnosis' page, with captions and words for those who cannot see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from nnode.data.sequence import Sequence
+from nnode.discover.found import Found
+from nnode.discover.inputs import Inputs
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.report.deviation import Deviation, deviation, simulate, smooth_velocity
+from nnode.discover.report.figures.maps import (
+    approach_maps,
+    neighbour_maps,
+    plane_maps,
+    time_space_maps,
+)
+from nnode.discover.report.figures.marks import (
+    coefficient_intervals,
+    flexible_curve,
+    place_curves,
+    sealed_costs,
+)
+from nnode.discover.report.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
+from nnode.discover.report.files import amount, individual, interval
+from nnode.pages.page import FigureBlock, MovingBlock
+from nnode.plots.quality import faults_figure
+
+#: Faulty sequences and variables that are drawn.
+FAULTY, PLACES = 10, 9
+
+#: Seconds of a crowd's sequence that are shown: later, small errors have grown to other ways.
+SHOWN = 4.0
+
+UNITS = {"traffic": "m/s", "crowd": "m/s²"}
+
+
+@dataclass
+class Figures:
+    """What a page shows, by the section it belongs to."""
+
+    effects: list[FigureBlock] = field(default_factory=list)
+    gap: list[FigureBlock] = field(default_factory=list)
+    faults: list[FigureBlock] = field(default_factory=list)
+    places: list[FigureBlock] = field(default_factory=list)
+    unknown: list[FigureBlock] = field(default_factory=list)
+    paths: list[FigureBlock | MovingBlock] = field(default_factory=list)
+
+
+def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
+    """Draw everything that the diagnosis gives occasion to."""
+    drawn = Figures()
+    d = found.diagnosis
+    if d.effects:
+        drawn.effects.append(
+            FigureBlock(
+                "coefficients",
+                coefficient_intervals(d.effects),
+                "Coefficients with their 95 % intervals. The dotted line stands where the effect "
+                "would be absent.",
+                "; ".join(f"{effect.name}: {interval(effect)}" for effect in d.effects),
+            )
+        )
+    if d.sealed:
+        drawn.gap.append(_sealed(found))
+    if inputs.faulty:
+        drawn.faults.append(_faults(inputs))
+    drawn.places += _places(inputs, found, options)
+    if d.unknown is not None and d.unknown.curve:
+        first = d.unknown.variables[0] if d.unknown.variables else "the first variable"
+        drawn.unknown.append(
+            FigureBlock(
+                "unknown",
+                flexible_curve(d.unknown, UNITS[inputs.domain]),
+                f"What a flexible fit adds, by {first}. A description, not an explanation.",
+                f"Curve of the missing term by {first}.",
+            )
+        )
+    drawn.paths += _paths(inputs, found, options)
+    return drawn
+
+
+def _sealed(found: Found) -> FigureBlock:
+    d = found.diagnosis
+    columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
+    names, before, after = columns
+    better = sum(a < b for a, b in zip(after, before, strict=True))
+    return FigureBlock(
+        "sealed",
+        sealed_costs([str(n) for n in names], before, after, d.gap.noise_floor),
+        f"Every sealed sequence before and after. {better} of {len(names)} are better with the "
+        "effects.",
+        f"Paired marks of {len(names)} sequences; {better} lie lower after than before.",
+    )
+
+
+def _faults(inputs: Inputs) -> FigureBlock:
+    shown = inputs.faulty[:FAULTY]
+    cut = f" The first {FAULTY} of {len(inputs.faulty)}." if len(inputs.faulty) > FAULTY else ""
+    return FigureBlock(
+        "faults",
+        faults_figure([*inputs.faulty, *inputs.sequences], inputs.faults, inputs.domain, FAULTY),
+        f"Sequences with a fault of the measurement, which is marked.{cut}",
+        "Position over time of " + ", ".join(s.name for s in shown) + ", faults marked.",
+    )
+
+
+def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[FigureBlock]:
+    unit = UNITS[inputs.domain]
+    blocks = []
+    curves = [place for place in found.diagnosis.places if place.curve][:PLACES]
+    if curves:
+        blocks.append(
+            FigureBlock(
+                "where",
+                place_curves(curves, unit),
+                "Mean deviation of the measurement from the calibrated model, with standard "
+                "errors; the interval that stands out is shaded.",
+                "; ".join(
+                    f"{p.variable} {amount(p.low)} to {amount(p.high)} {p.unit}: "
+                    f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}"
+                    for p in curves
+                ),
+            )
+        )
+    maps = _maps(inputs, found, options)
+    if not len(next(iter(maps.values())).time):
+        return blocks
+    said = ", ".join(f"{name}: {_spread(map_)} {unit} rms" for name, map_ in maps.items())
+    if inputs.domain == "traffic":
+        space, beside = time_space_maps(maps), approach_maps(maps)
+        words = (
+            "Measured minus simulated speed in time and space; platoons are simulated for two "
+            f"seconds at a time. Grey: nobody was there.{_laid(inputs)}",
+            "The same by gap and by how fast the vehicle ahead draws away.",
+        )
+    else:
+        space = plane_maps(maps, inputs.sequences[0].walls)
+        beside = neighbour_maps(maps)
+        words = (
+            "Mean of measured minus simulated acceleration by place; everyone is simulated for "
+            "one second at a time. Walls are black.",
+            "The same by where the nearest person is, seen in one's own way: the triangle walks "
+            "to the right.",
+        )
+    return [
+        *blocks,
+        FigureBlock("map", space, words[0], f"Map of the deviations by place. {said}."),
+        FigureBlock("map_beside", beside, words[1], f"Map by the nearest agent. {said}."),
+    ]
+
+
+def _laid(inputs: Inputs) -> str:
+    number = len({s.recording for s in inputs.sequences})
+    return f" The {number} recordings are laid on top of each other." if number > 1 else ""
+
+
+def _spread(map_: Deviation) -> str:
+    sizes = np.linalg.norm(map_.value, axis=1)
+    return amount(float(np.sqrt(np.mean(sizes**2))), 2)
+
+
+def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, Deviation]:
+    titles = {"before": "as it was given", "after": "with the effects"}
+    systems = {"before": found.base, "after": found.extended}
+    if not found.diagnosis.effects:
+        titles.pop("after")
+    return {
+        title: found.maps.get(key) or deviation(systems[key], inputs.sequences, options.step)
+        for key, title in titles.items()
+    }
+
+
+def telling(found: Found, sequences: list[Sequence]) -> Sequence | None:
+    """The sealed sequence that shows most: where most was gained, or else most is missed."""
+    rows = {str(row["name"]): row for row in found.diagnosis.sealed}
+    chosen = [sequences[i] for i in found.sealed]
+
+    def shown(s: Sequence) -> float:
+        row = rows.get(s.name)
+        if row is None:
+            return -np.inf
+        after = row["after"] if found.diagnosis.effects else 0.0
+        gain = float(row["before"]) - float(after)
+        return gain if np.isfinite(gain) else -np.inf
+
+    return max(chosen, key=shown) if chosen else None
+
+
+def _paths(
+    inputs: Inputs, found: Found, options: DiscoverOptions
+) -> list[FigureBlock | MovingBlock]:
+    s = telling(found, inputs.sequences)
+    if s is None:
+        return []
+    if inputs.domain == "crowd":
+        keep = 1 + round(SHOWN / s.dt)
+        goal = s.x[-1] if s.destination is None else s.destination
+        s = replace(s, time=s.time[:keep], x=s.x[:keep], v=smooth_velocity(s)[:keep],
+                    destination=goal)  # fmt: skip
+    (before,) = simulate(found.base, [s], options.step)
+    (after,) = simulate(found.extended, [s], options.step)
+    if before is None or after is None:
+        return []
+    simulated = pair(before, after if found.diagnosis.effects else None)
+    errors = ", ".join(f"{one.title} {amount(rmse(s, one.x), 2)} m" for one in simulated)
+    name = f"the sealed sequence {s.name}"
+    unknown = "".join(
+        f" Its agents' numbers are not known, so that {effect} does not act here."
+        for effect in individual(found.extended)
+    )
+    blocks: list[FigureBlock | MovingBlock] = [
+        FigureBlock(
+            "trajectories",
+            trajectories(s, simulated),
+            f"Measured and simulated paths of {name}, on which nothing was calibrated.{unknown}",
+            f"Paths of {name}; root mean square error: {errors}.",
+        ),
+        FigureBlock(
+            "moments",
+            film_strip(s, simulated),
+            f"Moments of {name}: open marks are measured, filled ones simulated, lines join them.",
+            f"Moments of {name}; root mean square error: {errors}.",
+        ),
+    ]
+    picture = moving_picture(s, simulated) if options.animation else None
+    if picture is not None:
+        content, width, height = picture
+        blocks.append(
+            MovingBlock(
+                "moving",
+                content,
+                width,
+                height,
+                f"The same as a moving picture, once, in {s.time[-1] - s.time[0]:.0f} s.",
+                f"Moving picture of {name}; root mean square error: {errors}.",
+            )
+        )
+    return blocks

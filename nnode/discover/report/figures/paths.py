@@ -1,0 +1,266 @@
+"""One sequence as measured and as two models simulate it: paths, moments, a moving picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from PIL import Image
+
+from nnode.data.sequence import Sequence
+from nnode.discover.report.figures.maps import draw_walls
+from nnode.discover.report.figures.marks import AFTER, BEFORE
+from nnode.plots.style import FONT, GREY, SMALL_FONT, dress, new_figure
+
+#: Moments of a film strip.
+MOMENTS = 5
+#: At most so many frames, colours and bytes has a moving picture, and so many dots in an inch.
+FRAMES, COLOURS, BYTES, DOTS = 60, 32, 1_000_000, 80
+
+_MEASURED: dict[str, Any] = {"color": GREY, "marker": "o"}
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulation of a sequence.
+
+    Attributes:
+        title: of its panel.
+        x: ``(K, N, D)`` m.
+        style: colour and marker.
+    """
+
+    title: str
+    x: np.ndarray
+    style: dict[str, Any]
+
+
+def pair(before: np.ndarray, after: np.ndarray | None) -> list[Simulated]:
+    """The two simulations as they are drawn; one where nothing was added to the model."""
+    found = [Simulated("as it was given", before, BEFORE)]
+    return found if after is None else [*found, Simulated("with the effects", after, AFTER)]
+
+
+def rmse(sequence: Sequence, x: np.ndarray) -> float:
+    """Root mean square distance of a simulation from the measurement, m."""
+    return float(np.sqrt(((x - sequence.x) ** 2).sum(-1).mean()))
+
+
+def trajectories(sequence: Sequence, simulated: list[Simulated]) -> Figure:
+    """Measured and simulated trajectories, one column or row per simulation.
+
+    Traffic: time-space lines, and below what is simulated minus what was measured. Crowds: paths
+    in the plane, with a line from where people arrived to where they were simulated to.
+    """
+    draw = _lines if sequence.x.shape[2] == 1 else _paths
+    return draw(sequence, simulated)
+
+
+def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
+    figure = new_figure(4.3 * len(simulated) + 0.5, 5.6)
+    axes = figure.subplots(
+        2, len(simulated), sharex=True, sharey="row", squeeze=False, height_ratios=[1.6, 1]
+    )
+    for (top, below), one in zip(axes.T, simulated, strict=True):
+        colour = one.style["color"]
+        top.plot(s.time, s.x[..., 0], color=GREY, linewidth=2.2, alpha=0.55)
+        top.plot(s.time, one.x[..., 0], color=colour, linewidth=0.9)
+        below.axhline(0, color=GREY, linewidth=0.8)
+        below.plot(s.time, (one.x - s.x)[..., 0], color=colour, linewidth=0.9)
+        dress(top, y="position (m)", title=f"{one.title}: {rmse(s, one.x):.2g} m rms")
+        dress(below, x="clock time (s)", y="simulated −\nmeasured (m)")
+        for ax in (top, below):
+            ax.label_outer()
+    figure.legend(handles=_handles(simulated, True), **_LEGEND)
+    return figure
+
+
+def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
+    low, high = _view(s)
+    figure, axes = _planes(low, high, len(simulated))
+    for ax, one in zip(axes, simulated, strict=True):
+        colour = one.style["color"]
+        draw_walls(ax, s.walls)
+        ax.plot(s.x[..., 0], s.x[..., 1], color=GREY, linewidth=2.2, alpha=0.55)
+        ax.plot(one.x[..., 0], one.x[..., 1], color=colour, linewidth=0.9)
+        ends = np.stack([s.x[-1], one.x[-1]], 1)
+        ax.add_collection(LineCollection(list(ends), colors="black", linewidths=0.7))
+        ax.plot(*s.x[-1].T, linestyle="", markersize=4, **_MEASURED)
+        ax.plot(*one.x[-1].T, linestyle="", markersize=4, **one.style)
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        dress(ax, x="x (m)", y="y (m)", title=f"{one.title}: {rmse(s, one.x):.2g} m rms")
+        ax.label_outer()
+    figure.legend(handles=_handles(simulated, True), **_LEGEND)
+    return figure
+
+
+_LEGEND: dict[str, Any] = {
+    "loc": "outside upper center",
+    "ncols": 3,
+    "frameon": False,
+    "fontsize": SMALL_FONT,
+}
+
+
+def _handles(simulated: list[Simulated], lines: bool) -> list[Line2D]:
+    style: dict[str, Any] = {"linestyle": "-", "marker": ""} if lines else {"linestyle": ""}
+    measured: dict[str, Any] = {"linewidth": 2.2, "alpha": 0.55} if lines else {"fillstyle": "none"}
+    return [
+        Line2D([], [], label="measured", **{**_MEASURED, **style, **measured}),
+        *(Line2D([], [], label=one.title, **{**one.style, **style}) for one in simulated),
+    ]
+
+
+def _view(s: Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of what a plane shows: where people walk, and walls not far from there."""
+    low, high = s.x.min((0, 1)) - 0.5, s.x.max((0, 1)) + 0.5
+    if s.walls is not None and len(s.walls):
+        ends = s.walls.reshape(-1, 2)
+        near = ((ends > low - 1.5) & (ends < high + 1.5)).all(1)
+        # a long wall beside the way has its ends far off, but its place across is near
+        for axis in (0, 1):
+            flat = np.abs(s.walls[:, axis] - s.walls[:, axis + 2]) < 1e-9
+            at = s.walls[flat, axis]
+            at = at[(at > low[axis] - 1.5) & (at < high[axis] + 1.5)]
+            at = np.concatenate([at, ends[near, axis]])
+            if at.size:
+                low[axis] = min(low[axis], at.min() - 0.2)
+                high[axis] = max(high[axis], at.max() + 0.2)
+    return low, high
+
+
+def _planes(
+    low: np.ndarray, high: np.ndarray, number: int, *, side: float = 7.4
+) -> tuple[Figure, list[Axes]]:
+    """Panels of one plane: above each other where it is wide, else beside each other."""
+    ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.15, 2.0))
+    if ratio < 0.7:
+        figure = new_figure(side, (0.9 * side * ratio + 0.45) * number + 0.6)
+        grid = figure.subplots(number, 1, sharex=True, sharey=True, squeeze=False)
+    else:
+        width = side / number
+        figure = new_figure(side + 0.6, 0.9 * width * ratio + 1.1)
+        grid = figure.subplots(1, number, sharex=True, sharey=True, squeeze=False)
+    return figure, list(grid.ravel())
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A panel of moments: what moves in it, and what puts that where it is at sample k."""
+
+    artists: list[Artist]
+    show: Callable[[int], None]
+
+
+def _panel(ax: Axes, s: Sequence, one: Simulated) -> _Panel:
+    """A panel with measured and simulated agents, joined by lines."""
+    traffic = s.x.shape[2] == 1
+    joined = LineCollection([], colors="black", linewidths=0.7)
+    ax.add_collection(joined)
+    (real,) = ax.plot([], [], linestyle="", markersize=5.5, fillstyle="none", **_MEASURED)
+    (model,) = ax.plot([], [], linestyle="", markersize=5, alpha=0.85, **one.style)
+    # cars are shown from a car that drives along in their midst
+    frame = s.x.mean((1, 2)) if traffic else np.zeros(s.n_samples)
+    if traffic:
+        half = max(np.abs(x[..., 0] - frame[:, None]).max() for x in (s.x, one.x))
+        ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
+        ax.set_yticks([0, 1], ["simulated", "measured"])
+    else:
+        low, high = _view(s)
+        draw_walls(ax, s.walls)
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+
+    def show(k: int) -> None:
+        if traffic:
+            ends = [
+                np.stack([x[k, :, 0] - frame[k], np.full(x.shape[1], y)], 1)
+                for x, y in ((s.x, 1.0), (one.x, 0.0))
+            ]
+        else:
+            ends = [s.x[k], one.x[k]]
+        real.set_data(*ends[0].T)
+        model.set_data(*ends[1].T)
+        joined.set_segments(list(np.stack(ends, 1)))
+
+    return _Panel([joined, real, model], show)
+
+
+def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
+    """Moments of a sequence, a row each; a column per simulation, joined to the measurement."""
+    s = sequence
+    number = min(MOMENTS, s.n_samples)
+    moments = np.unique(np.linspace(0, s.n_samples - 1, number).round().astype(int))
+    traffic = s.x.shape[2] == 1
+    low, high = (np.zeros(2), np.array([1.0, 0.28])) if traffic else _view(s)
+    ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.15, 1.4))
+    width = 4.2
+    figure = new_figure(width * len(simulated) + 0.6, (width * ratio + 0.2) * len(moments) + 0.8)
+    axes = figure.subplots(len(moments), len(simulated), sharex=True, sharey="col", squeeze=False)
+    for row, k in zip(axes, moments, strict=True):
+        for i, (ax, one) in enumerate(zip(row, simulated, strict=True)):
+            _panel(ax, s, one).show(int(k))
+            last, seconds = k == moments[-1], s.time[k] - s.time[0]
+            across = f"{seconds:.1f} s" if traffic else f"{seconds:.1f} s: y (m)"
+            along = "position seen from the platoon's middle (m)" if traffic else "x (m)"
+            title = one.title if k == moments[0] else ""
+            dress(ax, x=along if last else "", y=across if i == 0 else "", title=title)
+            if i:
+                ax.tick_params(labelleft=False)
+    figure.legend(handles=_handles(simulated, False), **_LEGEND)
+    return figure
+
+
+def moving_picture(sequence: Sequence, simulated: list[Simulated]) -> tuple[bytes, int, int] | None:
+    """The sequence as an animated GIF in the time it took, played once.
+
+    Returns:
+        Its bytes, and its width and height in pixels; None where it would exceed a megabyte.
+    """
+    s = sequence
+    every = -(-s.n_samples // FRAMES)
+    if s.x.shape[2] == 1:
+        figure = new_figure(6.4, 1.15 * len(simulated) + 0.75)
+        axes = list(figure.subplots(len(simulated), 1, sharex=True, squeeze=False)[:, 0])
+    else:
+        figure, axes = _planes(*_view(s), len(simulated), side=6.4)
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(DOTS)
+    panels = [_panel(ax, s, one) for ax, one in zip(axes, simulated, strict=True)]
+    for ax, one in zip(axes, simulated, strict=True):
+        if s.x.shape[2] == 1:
+            dress(ax, x="position seen from the platoon's middle (m)", y=one.title)
+        else:
+            dress(ax, x="x (m)", y="y (m)", title=one.title)
+        ax.label_outer()
+    clock = figure.suptitle("0.0 s", fontsize=FONT, x=0.02, ha="left")
+    moving: list[Artist] = [artist for panel in panels for artist in panel.artists]
+    for artist in (*moving, clock):
+        artist.set_animated(True)  # not part of the ground, which is drawn once
+    canvas.draw()
+    ground = canvas.copy_from_bbox(figure.bbox)
+    pictures = []
+    for k in range(0, s.n_samples, every):
+        for panel in panels:
+            panel.show(k)
+        clock.set_text(f"{s.time[k] - s.time[0]:.1f} s")
+        canvas.restore_region(ground)
+        for artist in (*moving, clock):
+            artist.draw(canvas.get_renderer())
+        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        pictures.append(picture.quantize(COLOURS, dither=Image.Dither.NONE))
+    stream = io.BytesIO()
+    pictures[0].save(
+        stream, format="GIF", save_all=True, append_images=pictures[1:], optimize=True,
+        duration=max(20, round(1000 * every * s.dt)),
+    )  # fmt: skip
+    content = stream.getvalue()
+    return None if len(content) > BYTES else (content, *pictures[0].size)

@@ -1,0 +1,317 @@
+"""A diagnosis as one page, and as events for TensorBoard."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nnode.calibrate.logbook import Logbook
+from nnode.discover.found import Found
+from nnode.discover.inputs import Inputs
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.report import tables
+from nnode.discover.report.captions import UNITS, Figures, figures
+from nnode.discover.report.files import (
+    CHECKPOINT,
+    amount,
+    closed,
+    has_network,
+    in_unit,
+    individual,
+    interval,
+    sentence,
+)
+from nnode.discover.result import Diagnosis
+from nnode.machine import how_made
+from nnode.pages.page import Block, Heading, Provenance, Text, write_page
+
+TENSORBOARD = "tensorboard"
+
+_PACKAGES = ("torch", "numpy", "scipy", "matplotlib")
+
+_NETWORK = (
+    "**The model is a network.** A network can learn any function of its own inputs: an effect "
+    "that depends on nothing else (in traffic on the gap, in a crowd on relative place and "
+    "velocity) is inside its weights already and can be neither found nor excluded here. "
+    "Diagnose a physical law, such as `model=lin` or `model=sf`, to learn about those."
+)
+
+
+def draw(
+    inputs: Inputs,
+    found: Found,
+    options: DiscoverOptions,
+    config: dict[str, Any],
+    commands: list[str],
+    folder: Path,
+) -> Callable[[], dict[str, Path]]:
+    """Draw all figures.
+
+    Args:
+        config: of a training with the extended model, as its checkpoint has it.
+        commands: that make use of the extended model.
+        folder: of the run.
+
+    Returns:
+        What writes the page and the events into the folder and returns their paths.
+    """
+    drawn = figures(inputs, found, options)
+    blocks = page_blocks(inputs, found, drawn, commands, folder)
+    title = f"Diagnosis of {found.diagnosis.model} on {config['data']['name']}"
+
+    def write() -> dict[str, Path]:
+        subtitle = sentence(found.diagnosis)
+        page, *others = write_page(blocks, folder, title=title, subtitle=subtitle, stem="report")
+        pictures = [path for path in others if path.suffix == ".png"]
+        events = write_events(found, pictures, config, folder / TENSORBOARD)
+        return {"page": page, "tensorboard": events}
+
+    return write
+
+
+def page_blocks(
+    inputs: Inputs, found: Found, drawn: Figures, commands: list[str], folder: Path
+) -> list[Block]:
+    """The page in the order of the diagnosis, the verdict first."""
+    d = found.diagnosis
+    return [
+        *_verdict(d, drawn, found),
+        *_data(d, drawn),
+        *_agents(d),
+        *_model(d),
+        *_places(d, drawn, UNITS[inputs.domain]),
+        *_rest(d, drawn, UNITS[inputs.domain]),
+        *_shown(d, drawn),
+        *_usage(d, commands, folder, found),
+        _provenance(d, inputs),
+    ]
+
+
+def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
+    blocks: list[Block] = [Heading("What is missing")]
+    if d.notes:
+        blocks.append(Text("\n".join(f"- {note}" for note in d.notes)))
+    if has_network(found.base):
+        blocks.append(Text(_NETWORK))
+    if d.effects:
+        blocks += [tables.coefficients_table(d.effects), *drawn.effects, tables.effects_table(d)]
+    else:
+        blocks.append(Text("No effect of the catalogue was added to the model."))
+    if any(effect.alternatives for effect in d.effects):
+        blocks.append(tables.alternatives_table(d))
+    if d.leads:
+        blocks += [
+            Heading("Found, not confirmed", 3),
+            Text(f"A lead to follow, not a finding: {d.confirmation.reason}."),
+            tables.coefficients_table(d.leads, "leads"),
+        ]
+    if d.verdict == "not_testable" and d.screen.leads:
+        blocks += [
+            Heading("What one would look at first", 3),
+            Text(
+                "A description of the open sequences, and no finding: with so few independent "
+                "clusters chance cannot be told from anything."
+            ),
+            tables.screen_table(d),
+        ]
+    blocks += [
+        Heading("What is independent of what", 3),
+        Text(_independence(d)),
+        tables.clusters_table(d),
+        Heading("What it changes on sealed sequences", 3),
+        Text(
+            f"{len(d.split.get('sealed', []))} of "
+            f"{len(d.split.get('sealed', [])) + len(d.split.get('open', []))} sequences were "
+            f"sealed: nothing looked at them before this comparison. {_gap_words(d)}"
+        ),
+        tables.gap_table(d),
+        *drawn.gap,
+    ]
+    return blocks
+
+
+def _independence(d: Diagnosis) -> str:
+    c = d.clusters
+    return (
+        f"One cluster are {c.why}; {c.simultaneous}. Every interval, test and fold goes by "
+        f"cluster. With {c.open} open {'cluster' if c.open == 1 else 'clusters'} no two-sided "
+        f"p-value can be below {amount(d.screen.floor, 2)}."
+    )
+
+
+def _gap_words(d: Diagnosis) -> str:
+    if not d.effects:
+        return "As nothing was added, the error is what the calibrated model leaves."
+    words = f"The effects close {closed(d)} of the gap between the model and the noise."
+    for one in d.agents:
+        if one.named:
+            words += (
+                f" {one.name} has a number for every agent: the errors are those of the last part "
+                "of each sequence, with numbers from its first part."
+            )
+    return words
+
+
+def _agents(d: Diagnosis) -> list[Block]:
+    """What agents have numbers of their own for, beside the effects of the population."""
+    if not d.agents:
+        return []
+    words = [
+        f"- {one.name}: "
+        + ("named." if one.named else f"not named: {one.reason}.")
+        + f" What lasts longer than {amount(one.lasts, 2)} s cannot be told from a number of "
+        "one's own."
+        for one in d.agents
+    ]
+    blocks: list[Block] = [
+        Heading("Do agents differ?"), Text("\n".join(words)), tables.agents_table(d)
+    ]  # fmt: skip
+    if any(one.later for one in d.agents):
+        blocks.append(tables.later_table(d))
+    return blocks
+
+
+def _data(d: Diagnosis, drawn: Figures) -> list[Block]:
+    blocks: list[Block] = [Heading("Faults of the measurement")]
+    if not d.data_faults:
+        return [*blocks, Text("None: every sequence was used.")]
+    sequences = {fault.sequence for fault in d.data_faults}
+    return [
+        *blocks,
+        Text(
+            f"{len(d.data_faults)} faults in {len(sequences)} sequences, which the diagnosis did "
+            "without: what no vehicle and no person can have done is no missing effect. Look at "
+            "the recording there, and correct it or leave it out."
+        ),
+        tables.faults_table(d),
+        *drawn.faults,
+    ]
+
+
+def _model(d: Diagnosis) -> list[Block]:
+    if not d.base:
+        return []
+    return [Heading("The model's own parameters"), tables.base_table(d)]
+
+
+def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
+    blocks: list[Block] = [Heading("Where model and measurement part")]
+    if d.places:
+        words = [
+            f"- {p.variable} in [{amount(p.low)}, {amount(p.high)}]{in_unit(p.unit)}: "
+            f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}, "
+            f"{'–' if np.isnan(p.share) else f'{100 * p.share:.0f} %'} of the excess error"
+            for p in d.places[:3]
+        ]
+        blocks += [Text("\n".join(words)), tables.places_table(d, unit)]
+    else:
+        blocks.append(Text("No single variable that was looked at stands out."))
+    return [*blocks, *drawn.places]
+
+
+def _rest(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
+    blocks: list[Block] = [Heading("What is left")]
+    if d.unknown is None:
+        blocks.append(Text("No structure that a flexible fit would find."))
+    else:
+        hint = f" A form that comes near, as a hint only: `{d.unknown.hint}`."
+        blocks += [
+            Text(
+                "Something that is not in the catalogue. It depends on "
+                f"{', '.join(d.unknown.variables) or 'no variable that was looked at'}; a "
+                f"flexible fit of the first removes {100 * d.unknown.gain:.0f} % of the squared "
+                f"errors of positions that are left.{hint if d.unknown.hint else ''} "
+                "Next: look at where it acts, think of a cause, and write it as an effect of "
+                "your own (docs/discovery.md)."
+            ),
+            *drawn.unknown,
+        ]
+    blocks.append(Heading("Effects that were not found", 3))
+    absent = any(absence.testable for absence in d.absences)
+    untested = bool(d.not_testable) or any(not absence.testable for absence in d.absences)
+    if absent:
+        blocks.append(tables.absent_table(d))
+    if untested:
+        blocks.append(tables.not_testable_table(d))
+    if not absent and not untested:
+        blocks.append(Text("None was left to look for."))
+    return blocks
+
+
+def _shown(d: Diagnosis, drawn: Figures) -> list[Block]:
+    if not drawn.paths:
+        return []
+    return [Heading("A sealed sequence"), *drawn.paths]
+
+
+def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> list[Block]:
+    more = ""
+    if has_network(found.base):
+        more += (
+            " The weights of the network are in the checkpoint alone; trained from the "
+            "configuration it starts anew."
+        )
+    for name in individual(found.extended):
+        more += (
+            f" {name} knows the agents of the open sequences; for all others it does not act, so "
+            "that errors on sealed sequences are those without it."
+        )
+    words = (
+        "The extended model is a model like any other: errors beside baselines on the sealed "
+        "sequences, force plots, and further training from its configuration, in which every "
+        f"parameter starts at its estimate.{more}"
+    )
+    code = "```sh\n" + "\n".join(commands) + "\n```"
+    python = f'```python\nimport nnode\n\nmodel = nnode.load("{folder / CHECKPOINT}")\n```'
+    return [Heading("Using the extended model"), Text(f"{words}\n\n{code}\n\n{python}")]
+
+
+def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
+    facts = how_made(_PACKAGES)
+    files = inputs.manifest.get("files", {})
+    if files:
+        listed = [f"{f['name']} (SHA-256 {f['sha256'][:12]})" for f in files.values()]
+        facts["Data"] = ", ".join(listed[:12]) + (" …" if len(listed) > 12 else "")
+    facts["Sequences"] = (
+        f"open: {_names(d.split.get('open', []))}; sealed: {_names(d.split.get('sealed', []))}"
+    )
+    facts["Time"] = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in d.seconds.items())
+    return Provenance(facts)
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+
+
+def write_events(found: Found, pictures: list[Path], config: dict[str, Any], folder: Path) -> Path:
+    """Write TensorBoard's events: step 0 is the model as it was given, step 1 the extended one.
+
+    Events of an earlier run in the folder are replaced.
+
+    Args:
+        pictures: the page's figures.
+    """
+    d = found.diagnosis
+    shutil.rmtree(folder, ignore_errors=True)
+    book = Logbook(folder, config)
+    for step, (cost, key) in enumerate(((d.gap.before, "before"), (d.gap.after, "after"))):
+        row = {"gap/sealed": cost, "gap/noise_floor": d.gap.noise_floor}
+        row |= {f"parameters/{n}": v[key] for n, v in d.base.items() if key in v}
+        book.scalars({name: value for name, value in row.items() if _number(value)}, step)
+    for effect in d.effects:
+        row = {f"effects/{effect.name}/{n}": c.value for n, c in effect.coefficients.items()}
+        book.scalars({name: value for name, value in row.items() if _number(value)}, 1)
+    book.text("verdict", sentence(d))
+    book.text("effects", "\n\n".join(f"{e.name}: {interval(e)}; {e.where}" for e in d.effects))
+    for path in pictures:
+        book.picture(f"diagnosis/{path.stem}", path, 1)
+    book.close()
+    return folder
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and bool(np.isfinite(value))

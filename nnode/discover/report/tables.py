@@ -1,0 +1,305 @@
+"""Tables of a diagnosis' page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pandas as pd
+
+from nnode.data.quality import KINDS
+from nnode.discover.report.files import amount, estimate, in_unit
+from nnode.discover.result import Diagnosis, NamedEffect
+from nnode.models.term import short_names
+from nnode.pages.page import TableBlock
+
+#: Faults that the page lists; its CSV has all.
+LISTED = 30
+
+
+_SIMULATED = {
+    "traffic": ", simulated as a whole",
+    "crowd": ", of everyone simulated for a short while among the measured paths of the others",
+}
+
+
+def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> TableBlock:
+    return TableBlock(name, pd.DataFrame(rows), caption, **more)
+
+
+def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -> TableBlock:
+    """The coefficients of some effects."""
+    rows = [
+        {
+            "effect": effect.name,
+            "coefficient": coefficient,
+            **dict(zip(("value", "95 % from", "to"), estimate(c), strict=True)),
+            "unit": _unit(c.unit),
+            "where": effect.where,
+            "p on sealed clusters": amount(effect.confirmed, 2),
+        }
+        for effect in effects
+        for coefficient, c in effect.coefficients.items()
+    ]
+    return _table(
+        name, rows, "Coefficients with 95 % intervals; one-sided p on the sealed clusters."
+    )
+
+
+def clusters_table(d: Diagnosis) -> TableBlock:
+    """How many clusters there are, and how many it takes."""
+    c = d.clusters
+    rows = [
+        {"clusters": "open", "there are": c.open, "it takes": c.least, "to": "name any effect"},
+        {"clusters": "sealed", "there are": c.sealed, "it takes": c.least_sealed, "to": "confirm"},
+    ]
+    return _table("clusters", rows, "Clusters are what is taken as independent.")
+
+
+def screen_table(d: Diagnosis) -> TableBlock:
+    """What explains most in the open sequences."""
+    rows = [
+        {
+            "effect": one["name"],
+            "share of the squared residuals": _percent(one["share"]),
+            "p": amount(one["p_value"], 2),
+            "about": ", ".join(
+                f"{name} {amount(value)}" for name, value in one.items()
+                if name not in ("name", "share", "p_value")
+            ),
+        }
+        for one in d.screen.leads
+    ]  # fmt: skip
+    return _table(
+        "screen",
+        rows,
+        "What explains most of the open sequences, by linear response; *about*: by how much the "
+        "coefficient would differ from no effect. Where the floor allows no small p, a large one "
+        "says nothing.",
+    )
+
+
+def agents_table(d: Diagnosis) -> TableBlock:
+    """Numbers of agents, and what their variance belongs to."""
+    rows = [
+        {
+            "effect": one.name,
+            "strength": f"{amount(one.strength, 2)} [{amount(one.low, 2)}, {amount(one.high, 2)}]",
+            "unit": _unit(one.unit),
+            "p": amount(one.p_value, 2),
+            **{
+                who: "–" if share is None else _percent(share)
+                for who, share in one.share.items()
+            },
+            "p on sealed clusters": amount(one.confirmed, 2),
+        }
+        for one in d.agents
+    ]  # fmt: skip
+    return _table(
+        "agents",
+        rows,
+        "Numbers of agents, estimated in parts of their time. *strength*: what a number carries "
+        "over any time. The variance by what it belongs to: the recording, the sequence, the "
+        "agent, and moods that pass.",
+    )
+
+
+def later_table(d: Diagnosis) -> TableBlock:
+    """Who predicts the last part of sealed sequences."""
+    rows = [
+        {"effect": one.name, "who predicts": who, "mean square error (m²)": amount(error)}
+        for one in d.agents
+        for who, error in one.later.items()
+    ]
+    return _table(
+        "later",
+        rows,
+        "The last 40 % of each sealed sequence, simulated from the state in which they begin. "
+        "Numbers and mean velocities come from the first 40 %, their variance from open "
+        "sequences.",
+    )
+
+
+def effects_table(d: Diagnosis) -> TableBlock:
+    """The effects that were added, in their order."""
+    rows = [
+        {
+            "effect": effect.name,
+            "formula": effect.formula,
+            "p": amount(effect.p_value, 2),
+            "held-out gain": _percent(effect.gain),
+            "source": effect.source,
+        }
+        for effect in d.effects
+    ]
+    return _table(
+        "effects",
+        rows,
+        "In the order in which they were added. *p*: how often pure chance scores as high, with "
+        "regard to all effects that were looked for. *Held-out gain*: share of the error that "
+        "the effect removed, when it was added, on sequences it was not calibrated on.",
+    )
+
+
+def alternatives_table(d: Diagnosis) -> TableBlock:
+    """What could stand in the place of an effect."""
+    rows = [
+        {
+            "chosen": effect.name,
+            "as good": other.name,
+            "loss relative to the chosen": amount(other.loss, 4),
+            "p": amount(other.p_value, 2),
+            "what would tell them apart": other.separated_by or "–",
+        }
+        for effect in d.effects
+        for other in effect.alternatives
+    ]
+    return _table(
+        "alternatives",
+        rows,
+        "Effects that explain the data nearly as well. *p*: of the hypothesis that the other is "
+        "as good. Take none of them for granted before such data are there.",
+    )
+
+
+def gap_table(d: Diagnosis) -> TableBlock:
+    """The error on the sealed sequences."""
+    rows = [
+        {"": what, "mean square error (m²)": amount(value)}
+        for what, value in (
+            (f"{d.model}, calibrated", d.gap.before),
+            ("with the effects", d.gap.after),
+            ("noise of the measurement", d.gap.noise_floor),
+        )
+    ]
+    return _table(
+        "gap",
+        rows,
+        f"Mean square error of positions on the sealed sequences{_SIMULATED[d.domain]}. The noise "
+        "of the measurement is what no model can explain.",
+    )
+
+
+def base_table(d: Diagnosis) -> TableBlock:
+    """How the model's own parameters move when effects join them."""
+    short = short_names(d.base)
+    rows = [
+        {
+            "parameter": short[name],
+            "alone": amount(values.get("before"), 4),
+            "with the effects": amount(values.get("after"), 4),
+            "unit": _unit(values.get("unit", "")),
+        }
+        for name, values in d.base.items()
+    ]
+    return _table(
+        "parameters",
+        rows,
+        f"Parameters of {d.model}, calibrated alone and together with the effects. Where they "
+        "differ, they had been standing in for what was missing.",
+    )
+
+
+def faults_table(d: Diagnosis) -> TableBlock:
+    """Faults of the measurement."""
+    rows = [
+        {
+            "kind": fault.kind,
+            "sequence": fault.sequence,
+            "agents": ", ".join(fault.agents) or "–",
+            "clock time (s)": "–" if fault.time is None else f"{fault.time:.2f}",
+            "what": fault.detail or KINDS.get(fault.kind, ""),
+        }
+        for fault in d.data_faults
+    ]
+    cut = f" The first {LISTED} of {len(rows)}; the file has all." if len(rows) > LISTED else ""
+    frame = pd.DataFrame(rows)
+    return TableBlock(
+        "data_faults",
+        frame.head(LISTED),
+        "Faults of the measurement. Where the data have no names for the agents, they are "
+        f"numbered in their sequence from 0 on, in a lane from the hindmost.{cut}",
+        full=frame,
+    )
+
+
+def places_table(d: Diagnosis, unit: str) -> TableBlock:
+    """Where simulation and measurement part."""
+    rows = [
+        {
+            "variable": place.variable,
+            "from": amount(place.low),
+            "to": amount(place.high),
+            "unit": _unit(place.unit),
+            f"deviation ({unit})": f"{amount(place.deviation)} ± {amount(place.error, 2)}",
+            "share of the excess": _percent(place.share),
+            "p": amount(place.p_value, 2),
+        }
+        for place in d.places
+    ]
+    return _table(
+        "places",
+        rows,
+        "Where the calibrated model and the measurement part, before anything was added: measured "
+        "minus simulated, with its standard error; the share of the error above the noise that "
+        "lies there; *p* with regard to all variables and intervals. One cause shows in several "
+        "variables.",
+    )
+
+
+def absent_table(d: Diagnosis) -> TableBlock:
+    """Effects that the data speak against."""
+    rows = [
+        {
+            "effect": absence.name,
+            "coefficient": absence.coefficient,
+            "absent to within": amount(absence.bound),
+            "would be found from": amount(absence.detectable),
+            "unit": _unit(absence.unit),
+            "remark": absence.reason or "–",
+        }
+        for absence in d.absences
+        if absence.testable
+    ]
+    if all(row["remark"] == "–" for row in rows):
+        rows = [{key: row[key] for key in row if key != "remark"} for row in rows]
+    return _table(
+        "absent",
+        rows,
+        "Effects that were looked for and not found. *Absent to within*: a larger deviation from "
+        "no effect is excluded with 95 % confidence. *Would be found from*: the smallest one that "
+        "is named with a probability of 80 %, confirmation on sealed clusters included.",
+    )
+
+
+def not_testable_table(d: Diagnosis) -> TableBlock:
+    """Effects about which the data say nothing."""
+    known = {absence.name: absence for absence in d.absences if not absence.testable}
+    names = list(dict.fromkeys([*known, *d.not_testable]))
+    rows = []
+    for name in names:
+        absence = known.get(name)
+        needed = amount(absence.detectable) if absence else "–"
+        rows.append(
+            {
+                "effect": name,
+                "coefficient": absence.coefficient if absence else "–",
+                "would be found from": needed,
+                "unit": _unit(absence.unit) if absence else "–",
+                "why": (absence.reason if absence else "") or "the data do not excite it",
+            }
+        )
+    return _table(
+        "not_testable",
+        rows,
+        "Effects that would not be named with these data, confirmation on sealed clusters "
+        "included, with a probability of 80 % even at the least usual strength: that they were "
+        "not found says nothing about them.",
+    )
+
+
+def _unit(unit: str) -> str:
+    return in_unit(unit).strip() or "–"
+
+
+def _percent(share: float) -> str:
+    return "–" if share != share else f"{100 * share:.0f} %".replace("-", "−")

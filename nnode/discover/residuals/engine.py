@@ -1,0 +1,225 @@
+"""What a diagnosis needs to know of a domain: how a model's residuals come about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from nnode.data.sequence import Batch, Sequence
+from nnode.discover.residuals.traced import recorded
+from nnode.models.effects import Effect, IndividualEffect, Probe
+from nnode.models.scene import Scene
+from nnode.models.system import System
+from nnode.models.term import State
+
+if TYPE_CHECKING:
+    from nnode.discover.residuals.variables import Variable
+
+
+Rate = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass
+class Squares:
+    """Squared errors of positions.
+
+    Attributes:
+        value: ``(m,)`` m².
+        sequence: ``(m,)`` as in :class:`Engine`, of each error.
+    """
+
+    value: np.ndarray
+    sequence: np.ndarray
+
+    def means(self) -> np.ndarray:
+        """``(S,)`` mean square error of each sequence; infinite where it blows up."""
+        total = np.bincount(self.sequence, np.nan_to_num(self.value, nan=np.inf))
+        found: np.ndarray = total / np.bincount(self.sequence)
+        return found
+
+
+class Engine(Protocol):
+    """The residuals of models on some sequences.
+
+    A residual is a number that is zero where simulation and measurement agree: positions that
+    differ, in m, without what unknown start states explain, and whitened as far as a filter of
+    the residuals allows it. All models of a diagnosis are compared in the same residuals.
+
+    Attributes:
+        batch: the sequences, or windows of them that bear their names.
+        names: of the sequences.
+        sequences: as they were given.
+        sequence: ``(n,)`` position of each residual's sequence in ``names``.
+        cluster: ``(n,)`` number of its cluster: see :mod:`nnode.data.clusters`.
+        clock: ``(n,)`` its time in the recording, s.
+        component: ``(n,)`` residuals of one time and agent that have different numbers mean
+            different things.
+        unit: ``(n,)`` number of the agents whose own numbers are estimated together.
+        people: of each unit, per direction the sequence and the place of the agent it belongs
+            to; one entry where all directions belong to one agent.
+    """
+
+    batch: Batch
+    names: list[str]
+    sequences: list[Sequence]
+    sequence: np.ndarray
+    cluster: np.ndarray
+    clock: np.ndarray
+    component: np.ndarray
+    unit: np.ndarray
+    people: list[list[tuple[int, int]]]
+
+    def residuals(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, n)`` residuals of R runs of one model; NaN where a run blows up.
+
+        Args:
+            system: the model.
+            rows: ``(R, K)`` its parameters that are calibrated, see :func:`row_of`.
+        """
+        ...
+
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        """``(K, n)`` derivatives of the residuals with respect to the calibrated parameters."""
+        ...
+
+    def screen_columns(
+        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe; one
+        row for the effect as a whole where the probe varies none."""
+        ...
+
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to factors of M further rates
+        ``(B, N, D)``, m/s or m/s², that are functions of the state."""
+        ...
+
+    def individual(
+        self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to M amounts of every unit."""
+        ...
+
+    def settle(self, system: System, row: Tensor) -> None:
+        """Fit what the residuals are whitened and weighted with to what a model leaves."""
+        ...
+
+    def noise_floor(self) -> float:
+        """Mean square error of positions that is noise of the measurement, m²."""
+        ...
+
+    def squares(self, system: System, row: Tensor) -> Squares:
+        """Squared errors of positions as they are, for the costs that are reported."""
+        ...
+
+    def variables(self) -> list[Variable]:
+        """What deviations may depend on."""
+        ...
+
+
+def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
+    """``(n,)`` labels of the residuals' clusters, counted from 0 without gaps.
+
+    Args:
+        label: ``(S,)`` of the sequences; None: every sequence is a cluster.
+        sequence: ``(n,)`` of the residuals.
+    """
+    own = sequence if label is None else np.asarray(label)[sequence]
+    found: np.ndarray = np.unique(own, return_inverse=True)[1].reshape(-1)
+    return found
+
+
+def trained(system: System) -> dict[str, nn.Parameter]:
+    """The parameters that are calibrated, by name."""
+    return {name: p for name, p in system.named_parameters() if p.requires_grad}
+
+
+def row_of(system: System) -> Tensor:
+    """``(K,)`` all parameters that are calibrated, one after the other, float64."""
+    own = [p.detach().double().flatten() for p in trained(system).values()]
+    return torch.cat(own) if own else torch.zeros(0, dtype=torch.float64)
+
+
+def names_of(system: System) -> list[str]:
+    """K names: of the parameter that each number of a row belongs to."""
+    return [name for name, p in trained(system).items() for _ in range(p.numel())]
+
+
+def square_of(engine: Engine, system: System) -> float:
+    """Mean square error of positions, m², every sequence alike."""
+    return float(engine.squares(system, row_of(system)).means().mean())
+
+
+@torch.no_grad()
+def fill(system: System, row: Tensor) -> System:
+    """Write a row into the system and return it."""
+    own = trained(system)
+    parts = row.split([p.numel() for p in own.values()])
+    for parameter, part in zip(own.values(), parts, strict=True):
+        parameter.copy_(part.reshape(parameter.shape))
+    return system
+
+
+@dataclass
+class Ensemble:
+    """The right-hand side of R runs of one model at once.
+
+    Attributes:
+        system: the model.
+        rows: ``(R, K)`` the runs' parameters.
+        scene: the surroundings, the same in all runs.
+    """
+
+    system: System
+    rows: Tensor
+    scene: Scene
+
+    def __post_init__(self) -> None:
+        own = trained(self.system)
+        parts = self.rows.split([p.numel() for p in own.values()], 1)
+        self._parameters = {
+            name: part.reshape(-1, *p.shape)
+            for (name, p), part in zip(own.items(), parts, strict=True)
+        }
+        self._rate = torch.func.vmap(self._one, in_dims=(0, None, 0))
+
+    def _one(self, parameters: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
+        found: Tensor = functional_call(self.system, parameters, (t, y, self.scene))
+        return found
+
+    def start(self, batch: Batch) -> Tensor:
+        """``(R, B, N, ...)`` states at the first sample."""
+        y = self.system.initial(batch)
+        return y.expand(len(self.rows), *y.shape).clone()
+
+    def rate(self, t: Tensor, y: Tensor) -> Tensor:
+        """Time derivative of the states ``(R, B, N, ...)`` at time ``t`` (s)."""
+        return self._rate(self._parameters, t, y)
+
+    def recorded_rate(self, t: Tensor, y: Tensor) -> Rate:
+        """:meth:`rate` for many calls with states like ``y``."""
+        names, values = list(self._parameters), list(self._parameters.values())
+
+        def rate(t: Tensor, y: Tensor, *values: Tensor) -> Tensor:
+            found: Tensor = self._rate(dict(zip(names, values, strict=True)), t, y)
+            return found
+
+        graph = recorded(rate, [t, y, *values])
+        return lambda t, y: graph(t, y, *values)
+
+
+def runge_kutta(rate: Rate, t: Tensor, y: Tensor, h: float, k1: Tensor) -> Tensor:
+    """The states after a step of ``h`` s by the classical method of fourth order, from those
+    and their rates ``k1`` before."""
+    k2 = rate(t + h / 2, y + h / 2 * k1)
+    k3 = rate(t + h / 2, y + h / 2 * k2)
+    k4 = rate(t + h, y + h * k3)
+    return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

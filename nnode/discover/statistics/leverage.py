@@ -1,0 +1,37 @@
+"""What the parameters of a fit take out of the residuals of each cluster.
+
+Source: Bell & McCaffrey 2002 (CR2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nnode.discover.residuals.fit import grams
+
+
+def blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """``(n,)`` residuals times (1 - H)^-1/2 of each cluster's part H of the projection onto an
+    orthonormal basis; what one cluster alone determines stays as it is."""
+    found = residual.copy()
+    if not basis.shape[1]:
+        return found
+    for own, gram in enumerate(grams(basis, label)):
+        part = label == own
+        size, turn = np.linalg.eigh(gram)
+        known = (size > 1e-12) & (size < 1 - 1e-6)
+        size, turn = size[known], turn[:, known]
+        more = turn * ((1 / np.sqrt(1 - size) - 1) / size) @ turn.T
+        found[part] += basis[part] @ (more @ (basis[part].T @ residual[part]))
+    return found
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the columns' span."""
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns[:, scale > 0] / scale[scale > 0]
+    if not columns.shape[1]:
+        return columns
+    vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
+    kept: np.ndarray = vectors[:, values > 1e-8 * values[0]]
+    return kept

@@ -1,0 +1,50 @@
+"""Held-out costs of calibrated models by cluster, and tests of their differences."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from nnode.discover.residuals.comparison import Comparison
+from nnode.discover.residuals.fit import Fit, sums
+
+#: What the other clusters know less of than this share of what all know is not changed by
+#: leaving one out: nothing follows from them.
+ALONE = 0.02
+
+
+def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
+    """``(G,)`` cost of each cluster under the parameters that the other clusters give.
+
+    See :meth:`Fit.left_out`.
+    """
+    columns, residual = fit.tangents, fit.residual
+    if columns.shape[1]:
+        moved = fit.left_out(cluster, ALONE)
+        residual = residual + (columns * moved[cluster]).sum(1)
+    return sums(residual**2, cluster)
+
+
+def gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """``(G,)`` (first - second) / max(first, second), 0 where both vanish."""
+    larger = np.maximum(first, second)
+    found: np.ndarray = np.where(larger > 0, first - second, 0.0) / np.where(larger > 0, larger, 1)
+    return found
+
+
+def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
+    """Paired by cluster; each one's difference is relative to its greater cost, so that no
+    cluster dominates.
+
+    Args:
+        first, second: ``(G,)`` held-out costs.
+    """
+    share = gains(first, second)
+    number = len(share)
+    mean = float(share.mean())
+    if number < 2:
+        return Comparison(mean, -np.inf, np.inf, 1.0)
+    error = float(share.std(ddof=1) / np.sqrt(number))
+    half = float(stats.t.ppf(0.975, number - 1)) * error
+    p_value = float(stats.t.sf(mean / error, number - 1)) if error > 0 else float(mean <= 0)
+    return Comparison(mean, mean - half, mean + half, p_value)

@@ -1,0 +1,173 @@
+"""Edges of zones and periods: where else they could lie."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import stats
+
+from nnode.discover.residuals.engine import Engine, fill
+from nnode.discover.residuals.fit import Fit, refine
+from nnode.models.effects import Effect
+from nnode.models.extend import place_of
+
+#: Places on either side of an edge, the nearest at this share of the whole extent.
+PLACES, NEAREST = 16, 5e-4
+#: An edge is moved to another minimum at most so many times.
+MOVES = 3
+
+
+@dataclass
+class Profile:
+    """What it costs to put an edge elsewhere, everything else calibrated to it linearly.
+
+    Attributes:
+        index: of the edge in the row of parameters.
+        value: where it is.
+        at: ``(T,)`` other places, ascending.
+        rise: ``(T,)`` of the cost there.
+        bounds: the extent of the data, within which an edge can lie.
+    """
+
+    index: int
+    value: float
+    at: np.ndarray
+    rise: np.ndarray
+    bounds: tuple[float, float]
+
+    def interval(self, most: float) -> tuple[float, float]:
+        """Ends of what can be reached from the edge at a rise of at most ``most``."""
+        found = []
+        for bound, (at, rise) in zip(self.bounds, self._sides(), strict=True):
+            k = _crossing(rise, most)
+            if k is None:
+                found.append(bound)
+            elif np.isfinite(rise[k]):
+                share = (most - rise[k - 1]) / (rise[k] - rise[k - 1])
+                found.append(float(at[k - 1] + share * (at[k] - at[k - 1])))
+            else:
+                found.append(float(at[k]))
+        return found[0], found[1]
+
+    def between(self, most: float) -> np.ndarray:
+        """Places between the last one below ``most`` and the first above it, on both sides."""
+        found = [np.empty(0)]
+        for at, rise in self._sides():
+            k = _crossing(rise, most)
+            if k is not None:
+                found.append(np.linspace(at[k - 1], at[k], PLACES + 2)[1:-1])
+        return np.concatenate(found)
+
+    def with_more(self, at: np.ndarray, rise: np.ndarray) -> Profile:
+        """The profile with further places."""
+        at, rise = np.append(self.at, at), np.append(self.rise, rise)
+        order = np.argsort(at, kind="stable")
+        return replace(self, at=at[order], rise=rise[order])
+
+    def _sides(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Places and rises below and above the edge, outwards."""
+        below = self.at < self.value
+        sides = (self.at[below][::-1], self.rise[below][::-1]), (self.at[~below], self.rise[~below])
+        return [(np.append(self.value, at), np.append(0.0, rise)) for at, rise in sides]
+
+
+def profiles(engine: Engine, fit: Fit, name: str) -> dict[str, Profile]:
+    """The profile of both edges of a named effect."""
+    place = place_of(fit.system, name)
+    effect = fit.system.terms[place]
+    assert isinstance(effect, Effect)
+    cells = effect.probes(engine.batch, fit.system)
+    bounds = cells[0].options["a"], cells[-1].options["b"]
+    index = {edge: fit.names.index(f"terms.{place}.{edge}") for edge in ("a", "b")}
+    a, b = (float(fit.row[k]) for k in index.values())
+    found = {}
+    for edge, low, high in (("a", bounds[0], b), ("b", a, bounds[1])):
+        value = float(fit.row[index[edge]])
+        at = _around(value, low, high, bounds[1] - bounds[0])
+        rise = _rises(engine, fit, index[edge], at)
+        found[edge] = Profile(index[edge], value, at, rise, bounds)
+    return found
+
+
+def intervals(engine: Engine, fit: Fit, name: str) -> dict[str, tuple[float, float]]:
+    """Intervals of 95 % of both edges: where the likelihood ratio leaves them.
+
+    Squares of residuals are taken to count as much less than independent ones as those do that
+    tell of the effect's strength. Unlike an edge's derivative, a profile knows of the gaps
+    between sequences: an edge may lie anywhere in one.
+    """
+    most = float(stats.chi2.ppf(0.95, 1)) * _unit(engine, fit, name)
+    found = {}
+    for edge, one in profiles(engine, fit, name).items():
+        near = one.between(most)
+        found[edge] = one.with_more(near, _rises(engine, fit, one.index, near)).interval(most)
+    return found
+
+
+def moved(engine: Engine, fit: Fit, name: str) -> Fit:
+    """The fit with edges in the best minimum that their profiles show."""
+    for _ in range(MOVES):
+        known = [one for one in profiles(engine, fit, name).values() if len(one.at)]
+        best = min(known, key=lambda one: float(one.rise.min()), default=None)
+        if best is None or best.rise.min() >= 0:
+            break
+        row = fit.row.copy()
+        row[best.index] = best.at[int(np.argmin(best.rise))]
+        trial = refine(engine, fill(copy.deepcopy(fit.system), torch.from_numpy(row)))
+        if trial.cost >= fit.cost:
+            break
+        fit = trial
+    return fit
+
+
+# -- parts ---------------------------------------------------------------------------------------
+
+
+def _around(value: float, low: float, high: float, extent: float) -> np.ndarray:
+    """Places on both sides, closer to each other near the edge, up to the bounds."""
+    found = []
+    for sign, room in ((-1.0, value - low), (1.0, high - value)):
+        if room > NEAREST * extent:
+            found += list(value + sign * np.geomspace(NEAREST * extent, room, PLACES))
+    return np.sort(np.array(found))
+
+
+def _crossing(rise: np.ndarray, most: float) -> int | None:
+    """The first place where the cost has risen by more than ``most``."""
+    beyond = np.flatnonzero(rise > most)
+    return int(beyond[0]) if len(beyond) else None
+
+
+def _rises(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
+    """``(T,)`` changes of the cost when one parameter is at ``(T,)`` other places."""
+    found = np.full(len(at), np.inf)
+    if not len(at):
+        return found
+    rows = np.repeat(fit.row[None], len(at), 0)
+    rows[:, index] = at
+    trials = engine.residuals(fit.system, torch.from_numpy(rows)).numpy()
+    good = np.isfinite(trials).all(1)
+    others = fit.free.copy()
+    others[index] = False
+    base, _ = np.linalg.qr(fit.jacobian[:, others])
+    every = np.concatenate([fit.residual[None], trials[good]])
+    cost = (every**2).sum(1) - ((every @ base) ** 2).sum(1)
+    found[good] = cost[1:] - cost[0]
+    return found
+
+
+def _unit(engine: Engine, fit: Fit, name: str) -> float:
+    """What a unit of the likelihood ratio is in this cost: the variance of the residuals, and how
+    much wider than by independent residuals the strengths' intervals are."""
+    place, columns = place_of(fit.system, name), fit.tangents
+    variance = fit.cost / max(len(fit.residual) - columns.shape[1], 1)
+    plain = np.full(len(fit.row), np.nan)
+    plain[fit.free] = variance * np.diag(np.linalg.pinv(columns.T @ columns))
+    ratios = fit.errors(engine.cluster) ** 2 / plain
+    effect = fit.system.terms[place]
+    assert isinstance(effect, Effect)
+    own = [ratios[fit.names.index(f"terms.{place}.{strength}")] for strength in effect.strengths]
+    return variance * max([1.0, *(float(ratio) for ratio in own if np.isfinite(ratio))])

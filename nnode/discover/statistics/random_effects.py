@@ -1,0 +1,258 @@
+"""Effects that differ from agent to agent: what of an agent's number carries far enough.
+
+An agent's number is estimated in every part of his time. What two parts far from each other have in
+common, beyond what he shares with the others of his sequence then, is his own; what they have in
+common only while they are near is a mood that lasts for some time. Both are told apart by their
+fall with the lag: a constant, and an exponential of at most a third of the longest lag. What lasts
+longer than that cannot be told from a number of his own and is called so.
+
+Source: MacKinnon, Nielsen & Webb 2023 (jackknife by cluster).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import stats
+
+from nnode.discover.residuals.engine import Engine
+from nnode.discover.residuals.fit import Fit, evaluated, grams, sums
+from nnode.discover.statistics.variance_components import LONGEST, Curve, ratio, seen_in, shares
+from nnode.models.effects import IndividualEffect
+from nnode.models.extend import effects_of, extended, without
+from nnode.models.system import System
+
+#: Rounds in which numbers are linearised again, and the largest change in one.
+SHARPER, LEAP = 3, 0.1
+
+
+@dataclass
+class Individuals:
+    """An individual effect in the residuals of a calibrated model.
+
+    Attributes:
+        effect: its class.
+        options: its settings.
+        variance: of the agents' own numbers, per direction; negative by chance.
+        error: its standard error, by leaving out each cluster in turn.
+        p_value: one-sided, Student's t by cluster, corrected for the settings tried.
+        share: of the variance of numbers by what they belong to: ``recording`` (None where there
+            is one only), ``sequence``, ``agent`` and ``mood``.
+        lags: s; ``common``: what parts at that lag have in common, per lag.
+        lasts: s, the longest mood that can be told from a number of one's own.
+        mood: variance of what passes, and its time constant in s.
+        shared: variance of what the agents of a sequence have in common.
+        settings: intervals of 95 % of settings that were chosen among neighbouring ones.
+    """
+
+    effect: type[IndividualEffect]
+    options: dict[str, Any]
+    variance: float
+    error: float
+    p_value: float
+    share: dict[str, float | None]
+    lags: list[float]
+    common: list[float]
+    lasts: float
+    mood: tuple[float, float]
+    shared: float
+    settings: dict[str, tuple[float, float]] = field(default_factory=dict)
+    left_out: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the numbers, per direction."""
+        return float(np.sqrt(max(self.variance, 0.0)))
+
+    @property
+    def sigma(self) -> float:
+        """The effect's strength."""
+        return self.effect.spread(self.spread)
+
+    def interval(self) -> tuple[float, float]:
+        """Of 95 % of the strength."""
+        half = float(stats.t.ppf(0.975, max(len(self.left_out) - 1, 1))) * self.error
+        low, high = (float(np.sqrt(np.maximum(self.variance + s * half, 0.0))) for s in (-1, 1))
+        return self.effect.spread(low), self.effect.spread(high)
+
+    def detectable(self, alpha: float, power: float = 0.8) -> float:
+        """The least strength whose variance stands out with a probability of 80 %."""
+        quantiles = stats.t.ppf([1 - alpha, power], max(len(self.left_out) - 1, 1))
+        return self.effect.spread(float(np.sqrt(self.error * quantiles.sum())))
+
+
+def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Individuals | None:
+    """The best setting of an individual effect; None where nobody is seen for long enough."""
+    probes = effect.probes(engine.batch, fit.system)
+    tried = [_at(engine, fit, effect, probe.options) for probe in probes]
+    found = [one for one in tried if one is not None]
+    best = max(found, key=lambda one: one.variance, default=None)
+    if best is None:
+        return None
+    best.p_value = min(1.0, best.p_value * len(probes))
+    if len(best.options) == 1 and len(found) > 2:
+        _with_interval(found, best)
+    return best
+
+
+def numbers(
+    engine: Engine, system: System, one: Individuals, *, common: bool = False
+) -> dict[str, list[float]]:
+    """Sequence name to its agents' numbers, from all the time that the engine holds.
+
+    Linearised around the motion that they lead to: who is much slower than the others is not
+    where a linear response expects him. Drawn to zero as the variance of the numbers says, and
+    that of the moods, which are noise to them.
+
+    Args:
+        engine: settled.
+        system: with the effect or without.
+        one: whose spread and settings are used.
+        common: one number for all agents of a sequence.
+    """
+    system = with_people(system, one, {})
+    own = next(t for t in system.terms if isinstance(t, one.effect))
+    label = engine.sequence if common else engine.unit
+    amounts: np.ndarray | None = None
+    for _ in range(SHARPER if len(engine.people[0]) > 1 else 1):
+        fit = evaluated(engine, system)
+        if not np.isfinite(fit.residual).all():
+            break
+        z = _directions(engine, fit, one.effect, one.options)
+        if common and len(engine.people[0]) > 1:
+            z = z.sum(1, keepdims=True)
+        gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
+        gram, score = _among_moods(gram, score, _passing(engine, one))
+        ridge = np.eye(z.shape[1]) / max(one.shared if common else one.variance, 1e-12)
+        start = np.zeros(score.shape) if amounts is None else amounts
+        change = np.linalg.solve(gram + ridge, (score - start @ ridge)[..., None])[..., 0]
+        amounts = change if amounts is None else start + np.clip(change, -LEAP, LEAP)
+        own.people = _people(engine, one, amounts, common)
+    return own.people
+
+
+def _passing(engine: Engine, one: Individuals) -> float:
+    """Variance of the mean mood over the time that sequences last."""
+    height, tau = one.mood
+    last = np.array([s.time[-1] - s.time[0] for s in engine.sequences]).mean()
+    x = max(float(last) / max(tau, 1e-9), 1e-9)
+    return height * 2 / x * (1 + np.expm1(-x) / x)
+
+
+def _among_moods(gram: np.ndarray, score: np.ndarray, mood: float) -> tuple[np.ndarray, np.ndarray]:
+    """Information and scores of numbers that moods of a variance are added to."""
+    if mood <= 0:
+        return gram, score
+    number = gram.shape[1]
+    size = np.trace(gram, axis1=1, axis2=2)[:, None, None] / number
+    known = gram + (1e-9 * size + 1e-12) * np.eye(number)
+    # (gram^-1 + mood)^-1 = (1 + gram mood)^-1 gram
+    less = np.linalg.inv(np.eye(number) + mood * known)
+    return less @ known, np.einsum("uij,uj->ui", less, score)
+
+
+def with_people(system: System, one: Individuals, people: dict[str, list[float]]) -> System:
+    """A copy of a model with an individual effect and its agents' numbers."""
+    if any(isinstance(effect, one.effect) for effect in effects_of(system)):
+        system = without(system, one.effect.name)
+    options = dict(one.options)
+    options.update(dict.fromkeys(one.effect.strengths, one.sigma))
+    found, _ = extended(system, one.effect(**options, people=people))
+    return found
+
+
+# -- parts ---------------------------------------------------------------------------------------
+
+
+def _at(
+    engine: Engine, fit: Fit, effect: type[IndividualEffect], options: dict[str, Any]
+) -> Individuals | None:
+    seen = seen_in(engine, fit, _directions(engine, fit, effect, options))
+    if len(seen.agent) < 2:
+        return None
+    curve = Curve.of(seen)
+    if curve is None:
+        return None
+    own, *mood = curve.fitted(curve.same, curve.between)
+    count = curve.same.shape[1]
+    left_out = np.array(
+        [
+            curve.fitted(np.delete(curve.same, c, 1), np.delete(curve.between, c, 1))[0]
+            for c in range(count)
+        ]
+    )
+    error = float(np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum()))
+    if count < 3:  # as for all intervals
+        error = float("nan")
+    p_value = float(stats.t.sf(own / error, count - 1)) if error > 0 else 1.0
+    return Individuals(
+        effect=effect,
+        options=options,
+        variance=own,
+        error=error,
+        p_value=p_value,
+        share=shares(seen, curve, own, mood[0]),
+        lags=curve.lags.tolist(),
+        common=(ratio(curve.same) - ratio(curve.between)).tolist(),
+        lasts=float(LONGEST * curve.lags[-1]),
+        mood=(mood[0], mood[1]),
+        shared=max(curve.plateau(ratio(curve.between), curve.between[1].sum(0))[0], 0.0),
+        left_out=left_out,
+    )
+
+
+def _directions(
+    engine: Engine, fit: Fit, effect: type[IndividualEffect], options: dict[str, Any]
+) -> np.ndarray:
+    """``(n, M)`` derivatives of the residuals with respect to the numbers of every unit."""
+    row = torch.from_numpy(fit.row)
+    found: np.ndarray = engine.individual(fit.system, row, effect, options).numpy().T
+    return found
+
+
+def _with_interval(found: list[Individuals], best: Individuals) -> None:
+    """The interval of the one setting: where parabolas through neighbouring variances have their
+    tops, each cluster left out in turn."""
+    (name,) = best.options
+    found = sorted(found, key=lambda one: float(one.options[name]))
+    place = found.index(best)
+    if not 0 < place < len(found) - 1:
+        return
+    near = found[place - 1 : place + 2]
+    if len({len(one.left_out) for one in near}) > 1:
+        return
+    at = np.array([one.options[name] for one in near])
+    value = float(_vertex(at, np.array([[one.variance for one in near]]))[0])
+    tops = _vertex(at, np.stack([one.left_out for one in near], 1))
+    count = len(tops)
+    error = float(np.sqrt((count - 1) / count * ((tops - tops.mean()) ** 2).sum()))
+    half = float(stats.t.ppf(0.975, max(count - 1, 1))) * error
+    best.options = {name: value}
+    best.settings = {name: (value - half, value + half)}
+
+
+def _vertex(at: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """``(S,)`` where parabolas through ``(S, 3)`` gains at three places are highest; within
+    them."""
+    left = (gain[:, 1] - gain[:, 0]) / (at[1] - at[0])
+    right = (gain[:, 2] - gain[:, 1]) / (at[2] - at[1])
+    bend = np.minimum((right - left) / (at[2] - at[0]), -1e-300)
+    top: np.ndarray = (at[0] + at[1]) / 2 - left / (2 * bend)
+    return np.clip(top, at[0], at[2])
+
+
+def _people(
+    engine: Engine, one: Individuals, amounts: np.ndarray, common: bool
+) -> dict[str, list[float]]:
+    names, size = [s.name for s in engine.sequences], engine.batch.agent.shape[1]
+    found = {name: [0.0] * size for name in names}
+    for unit, people in enumerate(engine.people):
+        for m, (b, n) in enumerate(people):
+            own = amounts[b] if common else amounts[unit]
+            alone = common or len(people) == 1
+            number = own if alone else own[m : m + 1]
+            found[names[b]][n] = one.effect.person(number, one.options)
+    return found

@@ -1,0 +1,341 @@
+"""Efficient scores: which effect's trace is in what the calibrated model leaves.
+
+The trace of an effect is the change of the residuals by a small strength of it. What
+recalibration of the model's own parameters can absorb is taken out of it, so that only the rest
+counts. Sums over clusters may change their sign without changing their distribution where nothing
+is hidden. Each effect's statistic is compared with its own distribution under such flips, and the
+least of these p-values over all effects with the distribution of the least: a search over many
+intervals, whose largest statistic is large by chance, does not raise the bar for the others.
+
+Residuals are not free of systematic errors: measured positions are smoothed, people are simulated
+among the measured paths of others who have reacted to them. Where nothing is hidden that makes
+some effects a twentieth of their least usual size, which many data would tell from nothing. So what
+is tested is whether an effect exceeds a tenth of that size.
+
+Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Hemerik, Goeman & Finos 2020
+(of scores that are free of nuisance parameters); Westfall & Young 1993 (least p-value over
+hypotheses); Murphy & Myors 1999 (tests of a minimal effect).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from nnode.data.clusters import signs
+from nnode.discover.residuals.engine import Engine
+from nnode.discover.residuals.fit import Fit, sums
+from nnode.discover.residuals.fit import grams as grams_of
+from nnode.discover.statistics.leverage import blown_up, orthonormal
+from nnode.discover.statistics.standard import PRIOR, joint, standardised, usual_of
+from nnode.models.effects import Effect, Probe
+
+#: Sign flips that a p-value comes from.
+FLIPS = 1999
+#: A strength of which the plausible range allows less than this share speaks for something
+#: else; the linear estimate of a strong effect may overshoot.
+FORBIDDEN = 0.2
+#: Effects up to this share of their least usual size are taken for none.
+MINIMAL = 0.1
+
+
+@dataclass
+class Trace:
+    """What a weak effect does to the residuals.
+
+    Attributes:
+        effect: its class.
+        probes: one; or the neighbouring cells of an effect on an interval.
+        columns: ``(n, k)`` per unit of each strength of the probe, or per cell.
+    """
+
+    effect: type[Effect]
+    probes: list[Probe]
+    columns: np.ndarray
+
+
+@dataclass
+class Evidence:
+    """What the clusters tell of one direction.
+
+    Attributes:
+        options: of the probe.
+        size: of an effect with a memory, whose trace is that of a finite strength; otherwise 0.
+        parts, grams: ``(G,)`` scores and their information.
+        minimal: amount that is taken for none.
+    """
+
+    options: dict[str, Any]
+    size: float
+    parts: np.ndarray
+    grams: np.ndarray
+    minimal: float
+
+
+@dataclass
+class Score:
+    """The best trace of an effect.
+
+    Attributes:
+        effect: its class.
+        options: where a calibration with this effect should start.
+        statistic: in units of a standard normal one.
+        p_value: of the maximum over all effects.
+        gain: share of the sum of squares that the trace explains beyond the model.
+        amount: strengths that explain most, less their neutral values.
+        error: standard errors of ``amount``.
+        evidence: of every strength; of an effect with a memory, or without a strength, of every
+            probe.
+    """
+
+    effect: type[Effect]
+    options: dict[str, Any]
+    statistic: float
+    p_value: float
+    gain: float
+    amount: dict[str, float]
+    error: dict[str, float]
+    evidence: list[Evidence] = field(default_factory=list)
+
+
+def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
+    """The traces of an effect's probes in the residuals of a calibrated model."""
+    probes = effect.probes(engine.batch, fit.system)
+    row = torch.from_numpy(fit.row)
+    columns = [engine.screen_columns(fit.system, row, effect, p).numpy().T for p in probes]
+    if effect.consecutive and probes:
+        return [Trace(effect, probes, np.concatenate(columns, 1))]
+    return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
+
+
+class Screen:
+    """All traces against the residuals of one fit.
+
+    Args:
+        fit: the calibrated model.
+        cluster: ``(n,)`` see :class:`~nnode.discover.residuals.engine.Engine`.
+        seed: of the sign flips.
+        flips: their number at most; with few clusters, all there are.
+        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser.
+    """
+
+    def __init__(
+        self,
+        fit: Fit,
+        cluster: np.ndarray,
+        seed: int = 0,
+        flips: int = FLIPS,
+        levels: dict[str, np.ndarray] | None = None,
+    ) -> None:
+        self.fit, self.cluster, self.levels = fit, cluster, levels or {}
+        self.residual = fit.residual
+        self.variance = fit.cost / len(fit.residual)
+        self._basis = orthonormal(fit.tangents)
+        self._rng = np.random.default_rng(seed)
+        #: ``(F, G)``, the data as they are first
+        self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
+        #: of each effect's name the largest statistic of its probes under each flip
+        self._chance: dict[str, np.ndarray] = {}
+        self._least = np.ones(len(self._signs))
+        self._blown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def beyond(self, columns: np.ndarray) -> np.ndarray:
+        """``columns`` without what the model's own parameters can do."""
+        rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
+        return rest
+
+    def parts(self, z: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """``(G, k)`` scores of directions that are free of the model's parameters.
+
+        What the parameters have taken out of the residuals makes the clusters' scores vary less
+        than the errors do; signs of those would promise too little chance. So each cluster's
+        residuals are blown up by its leverage, and the sum of the scores is kept.
+
+        Source: Bell & McCaffrey 2002 (CR2).
+        """
+        own = id(label)
+        if own not in self._blown:
+            self._blown[own] = blown_up(self.residual, self._basis, label), label
+        raw = z.T @ self.residual
+        found, size = sums(z * self._blown[own][0][:, None], label), sums(z**2, label)
+        share = size / np.maximum(size.sum(0), 1e-300)
+        spread: np.ndarray = found + (raw - found.sum(0)) * share
+        return spread
+
+    def flipped(self, parts: np.ndarray) -> np.ndarray:
+        """``(F, C)`` sums of the clusters ``(G, C)``, as they are and with every flip."""
+        total: np.ndarray = self._signs @ parts
+        return total
+
+    def label(self, name: str) -> np.ndarray:
+        """``(n,)`` the clusters that tell of an effect."""
+        return self.levels.get(name, self.cluster)
+
+    def scores(self, found: Iterable[Trace]) -> list[Score]:
+        """The best trace of each effect, the one that explains most first."""
+        best: dict[str, Score] = {}
+        largest: dict[str, float] = {}
+        for trace in found:
+            scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
+            for score in scores:
+                name, known = score.effect.name, best.get(score.effect.name)
+                largest[name] = max(largest.get(name, 0.0), score.statistic)
+                every = (known.evidence if known else []) + score.evidence
+                if known is None or score.gain > known.gain:
+                    best[name] = score
+                if trace.effect.memory or not trace.effect.strengths:
+                    best[name].evidence = every
+        if best:
+            self._judge(best, largest)
+        return sorted(best.values(), key=lambda score: -score.gain)
+
+    def _judge(self, best: dict[str, Score], largest: dict[str, float]) -> None:
+        """P-values with regard to all effects."""
+        # the data themselves are one of the flips
+        every = np.stack([np.append(largest[name], self._chance[name][1:]) for name in best])
+        share = np.stack([at_least(row) for row in every])
+        self._least = share.min(0)
+        for score, own in zip(best.values(), share[:, 0], strict=True):
+            score.p_value = float((self._least <= own + 1e-12).mean())
+
+    def critical(self, name: str, alpha: float = 0.05) -> float:
+        """The statistic of an effect that it passes where the least p-value of all does so with
+        probability ``alpha`` by chance."""
+        share = float(np.quantile(self._least, alpha))
+        return float(np.quantile(self._chance[name], 1 - share))
+
+    def statistic(self, one: Evidence, parts: np.ndarray) -> np.ndarray:
+        """``(R,)`` the statistic where the scores of a direction were ``parts`` ``(G, R)``."""
+        usual = usual_of(one.parts[:, None], one.grams[:, None], self.variance)
+        sizes = np.repeat(one.grams[:, None], parts.shape[1], 1)
+        amount = -parts.sum(0) / max(float(one.grams.sum()), 1e-300)
+        parts = parts + sizes * _less(amount, one.minimal)
+        return standardised(parts, sizes, np.ones((1, len(parts))), usual)[0]
+
+    def costs(self, name: str) -> np.ndarray:
+        """``(G,)`` sums of squared residuals of the clusters that tell of an effect."""
+        return sums(self.residual**2, self.label(name))
+
+    def _by_chance(self, name: str, statistics: np.ndarray) -> None:
+        """Note an effect's statistics ``(F,)`` under the flips."""
+        self._chance[name] = np.maximum(self._chance.get(name, 0.0), statistics)
+
+    def _flips(self, name: str) -> np.ndarray:
+        """``(F, G)`` signs of the clusters that tell of an effect, the data first."""
+        if name not in self.levels:
+            return self._signs
+        shape = len(self._signs), int(self.levels[name].max()) + 1
+        drawn: np.ndarray = self._rng.choice([-1.0, 1.0], shape)
+        drawn[0] = 1.0
+        return drawn
+
+    def _single(self, trace: Trace) -> Score:
+        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        parts = self.parts(z, label)
+        grams = grams_of(z, label)
+        minimal = minimal_of(trace.effect, z.shape[1])
+        less = _less(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
+        beyond = parts + grams @ less
+        chance = joint(beyond, grams, self._flips(trace.effect.name), self.variance)
+        statistic = float(chance[0])
+        amount, error, gain = self._estimate(parts, grams)
+        (probe,) = trace.probes
+        options, amounts, errors = dict(probe.options), {}, {}
+        for name, value, width in zip(probe.steps, amount, error, strict=False):
+            strength = trace.effect.strengths[name]
+            options[name] = strength.at(value)
+            amounts[name], errors[name] = float(value), float(width)
+        if len(probe.steps) == 1 and value != 0:
+            # a strength that is not plausible speaks for something else
+            share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
+            if share < FORBIDDEN:
+                statistic, gain = statistic * share, gain * share * (2 - share)
+        self._by_chance(trace.effect.name, chance)
+        size = max(map(abs, probe.steps.values())) if trace.effect.memory else 0.0
+        evidence = [
+            Evidence(probe.options, size, parts[:, i], grams[:, i, i], minimal[i])
+            for i in range(z.shape[1])
+        ]
+        return Score(trace.effect, options, statistic, 1.0, gain, amounts, errors, evidence)
+
+    def _interval(self, trace: Trace) -> list[Score]:
+        """The best interval of neighbouring cells."""
+        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        parts = self.parts(z, label)
+        grams = grams_of(z, label)
+        cells = z.shape[1]
+        first, last = np.triu_indices(cells)
+        cumulative = np.concatenate([np.zeros((len(parts), 1)), parts.cumsum(1)], 1)
+        each = cumulative[:, last + 1] - cumulative[:, first]
+        square = np.zeros((len(parts), cells + 1, cells + 1))
+        square[:, 1:, 1:] = grams.cumsum(1).cumsum(2)
+        sizes = (
+            square[:, last + 1, last + 1] - square[:, first, last + 1]
+            - square[:, last + 1, first] + square[:, first, first]
+        )  # fmt: skip
+        size = sizes.sum(0)
+        usable = size > 1e-9 * max(size.max(), 1e-300)
+        each, sizes, size = each[:, usable], sizes[:, usable], size[usable]
+        if not size.size:
+            return []
+        first, last = first[usable], last[usable]
+        usual = usual_of(parts, np.einsum("bii->bi", grams), self.variance)
+        (minimal,) = minimal_of(trace.effect, 1)
+        beyond = each + sizes * _less(-each.sum(0) / size, minimal)
+        flipped = standardised(beyond, sizes, self._flips(trace.effect.name), usual)
+        self._by_chance(trace.effect.name, flipped.max(1))
+        total = each.sum(0)
+        gain = total**2 / size / (self.residual @ self.residual)
+        i = int(np.argmax(gain))
+        (name,) = trace.effect.strengths
+        strength = trace.effect.strengths[name]
+        amount = -total[i] / size[i]
+        rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
+        blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
+        error = np.sqrt((blocks * rest + PRIOR * usual * size[i]) / (blocks + PRIOR)) / size[i]
+        options = dict(trace.probes[0].options)
+        options["a"] = trace.probes[first[i]].options["a"]
+        options["b"] = trace.probes[last[i]].options["b"]
+        options[name] = strength.at(amount)
+        return [
+            Score(
+                trace.effect, options, float(flipped[0].max()), 1.0, float(gain[i]),
+                {name: float(amount)}, {name: float(error)},
+                [Evidence(options, 0.0, each[:, i], sizes[:, i], minimal)],
+            )
+        ]  # fmt: skip
+
+    def _estimate(
+        self, parts: np.ndarray, grams: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        inverse = np.linalg.pinv(grams.sum(0), rcond=1e-10)
+        total = parts.sum(0)
+        amount = -inverse @ total
+        rest = parts + np.einsum("bij,j->bi", grams, amount)
+        cov = inverse @ (rest.T @ rest) @ inverse
+        gain = float(total @ inverse @ total / (self.residual @ self.residual))
+        return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
+
+
+def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
+    """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
+    not say what size is usual."""
+    found = [MINIMAL * (one.usual or 0.0) for one in effect.strengths.values()]
+    return np.array(found or [0.0] * number)[:number]
+
+
+def _less(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
+    """What is taken off amounts to bring them nearer to none."""
+    found: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
+    return found
+
+
+def at_least(values: np.ndarray) -> np.ndarray:
+    """``(F,)`` share of the values that are at least as large as each, but for rounding."""
+    order = np.sort(values)
+    below = np.searchsorted(order, values * (1 - 1e-12), side="left")
+    return 1 - below / len(values)

@@ -1,0 +1,271 @@
+"""What numbers of agents, estimated in parts of their time, have in common at every lag.
+
+Source: Searle, Casella & McCulloch 1992 (variance components by products); Bell & McCaffrey 2002
+(the share that a mean takes along).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from nnode.discover.residuals.engine import Engine
+from nnode.discover.residuals.fit import Fit, grams, sums
+
+#: Parts of a sequence's time in which numbers are estimated.
+PARTS = 6
+#: Time constants that are tried, the longest of them this share of the longest lag.
+TRIED, LONGEST = 30, 1 / 3
+#: Information below this share of the largest is none.
+NONE = 1e-6
+
+
+@dataclass
+class Seen:
+    """Numbers of agents in parts of their time: O of them.
+
+    Attributes:
+        agent, sequence, cluster, recording: ``(O,)`` whose; agents are the same in all sequences
+            of a recording that name them.
+        time: ``(O,)`` s.
+        value: ``(O, D)`` per direction.
+        info: ``(O,)`` inverse variance that the residuals leave to a value.
+    """
+
+    agent: np.ndarray
+    sequence: np.ndarray
+    cluster: np.ndarray
+    recording: np.ndarray
+    time: np.ndarray
+    value: np.ndarray
+    info: np.ndarray
+
+    @property
+    def weight(self) -> np.ndarray:
+        """``(O,)`` with which products are known best."""
+        weight, noise = self.info, 1 / self.info
+        square = (self.value**2).mean(1)
+        for _ in range(3):
+            spread = max(float((weight**2 * (square - noise)).sum() / (weight**2).sum()), 0.0)
+            weight = 1 / (spread + noise)
+        return weight
+
+
+def seen_in(engine: Engine, fit: Fit, z: np.ndarray) -> Seen:
+    """The numbers of everybody in every part of his time."""
+    number = len(engine.sequences)
+    first, last = np.full(number, np.inf), np.full(number, -np.inf)
+    np.minimum.at(first, engine.sequence, engine.clock)
+    np.maximum.at(last, engine.sequence, engine.clock)
+    at = (engine.clock - first[engine.sequence]) / np.maximum(last - first, 1e-9)[engine.sequence]
+    part = np.minimum((PARTS * at).astype(int), PARTS - 1)
+    present, label = np.unique(PARTS * engine.unit + part, return_inverse=True)
+    gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
+    count = np.bincount(label)
+    time = np.bincount(label, engine.clock) / count
+    start = np.unique(label, return_index=True)[1]
+    noise = fit.cost / len(fit.residual)
+    alone = len(engine.people[0]) == 1
+    least = NONE * float(np.einsum("umm->um", gram).max(initial=0.0))
+    identity = _Identity(engine)
+    places: list[int] = []
+    rows: list[tuple[int, int, int, int, float, np.ndarray, float]] = []
+    for k, unit in enumerate(present // PARTS):
+        known = np.flatnonzero(np.diag(gram[k]) > least)
+        if not len(known) or (alone and len(known) < z.shape[1]):
+            continue
+        inverse = np.linalg.pinv(gram[k][np.ix_(known, known)])
+        value, wide = inverse @ score[k][known], np.maximum(np.diag(inverse), 1e-300)
+        cluster, people = int(engine.cluster[start[k]]), engine.people[unit]
+        if alone:
+            b, n = people[0]
+            own = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
+            rows.append((*own, value, 1 / (noise * float(wide.mean()))))
+            continue
+        for m, v, w in zip(known, value, wide, strict=True):
+            b, n = people[m]
+            own = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
+            rows.append((*own, np.array([v]), 1 / (noise * float(w))))
+            places.append(engine.sequences[b].n_agents - n)
+    columns = list(zip(*rows, strict=True)) or [()] * 7
+    agent, sequence, cluster_of, recording, when, values, info = (np.array(c) for c in columns)
+    seen = Seen(agent, sequence, cluster_of, recording, when, values, info)
+    return seen if alone else _beyond_places(seen, np.array(places, dtype=int))
+
+
+def _beyond_places(seen: Seen, place: np.ndarray) -> Seen:
+    """Numbers beyond what all at a place of the platoon have in common.
+
+    The mean of a place takes a part of every cluster's numbers along; the rest is enlarged by it
+    (as CR2 does, see :mod:`~nnode.discover.statistics.leverage`). Places that one cluster alone
+    tells of are left out.
+    """
+    value, known = seen.value.copy(), np.zeros(len(place), dtype=bool)
+    weight = seen.weight if len(place) else seen.info
+    for p in np.unique(place):
+        at = np.flatnonzero(place == p)
+        share = np.bincount(seen.cluster[at], weight[at])[seen.cluster[at]] / weight[at].sum()
+        away = seen.value[at] - weight[at] @ seen.value[at] / weight[at].sum()
+        known[at] = share < 1 - 1e-9
+        value[at] = away / np.sqrt(np.maximum(1 - share, 1e-9))[:, None]
+    kept = np.flatnonzero(known)
+    parts = {f.name: getattr(seen, f.name)[kept] for f in fields(seen)}
+    return Seen(**{**parts, "value": value[kept]})
+
+
+class _Identity:
+    """Who is the same in several sequences."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.sequences = engine.sequences
+        names = [s.recording for s in engine.sequences]
+        self.recording = np.unique(names, return_inverse=True)[1].reshape(-1)
+        self._known: dict[tuple[Any, ...], int] = {}
+
+    def agent(self, b: int, n: int) -> int:
+        own = self.sequences[b]
+        key = (own.recording, own.agents[n]) if own.agents else (b, n, None)
+        return self._known.setdefault(key, len(self._known))
+
+
+@dataclass
+class Curve:
+    """What parts have in common at every lag.
+
+    Attributes:
+        lags: ``(L,)`` s.
+        same, between: ``(2, G, L)`` sums of weighted products and of weights: of one agent's
+            parts, and of different agents of a sequence.
+        clusters: whose G.
+    """
+
+    lags: np.ndarray
+    same: np.ndarray
+    between: np.ndarray
+
+    @classmethod
+    def of(cls, seen: Seen) -> Curve | None:
+        """None where there are fewer than three lags."""
+        weight = seen.weight
+        value = weight[:, None] * seen.value / np.sqrt(seen.value.shape[1])
+        steps = []
+        for s in np.unique(seen.sequence):
+            times = np.unique(seen.time[seen.sequence == s].round(6))
+            steps += list(np.diff(times))
+        step = float(np.median(steps)) if steps else 0.0
+        if not step > 0:
+            return None
+        pairs = _pairs(seen.agent, seen.time, step, lambda i, j: i != j)
+        across = _pairs(seen.sequence, seen.time, step, lambda i, j: seen.agent[i] != seen.agent[j])
+        number = int(seen.cluster.max()) + 1
+        most = int(pairs[2].max(initial=0)) + 1
+        found = [
+            _collected(one, value, weight, seen.cluster, number, most) for one in (pairs, across)
+        ]
+        total = np.bincount(pairs[2], weight[pairs[0]] * weight[pairs[1]], most)
+        apart = np.abs(seen.time[pairs[0]] - seen.time[pairs[1]])
+        lags = np.bincount(pairs[2], apart * weight[pairs[0]] * weight[pairs[1]], most)
+        kept = total > 0
+        if kept.sum() < 3:
+            return None
+        present = found[0][1].sum(1) > 0
+        same, between = (one[:, present][:, :, kept] for one in found)
+        return cls(lags[kept] / total[kept], same, between)
+
+    def fitted(self, same: np.ndarray, between: np.ndarray) -> tuple[float, float, float]:
+        """A constant, an exponential's height, and its time constant."""
+        return self.plateau(ratio(same) - ratio(between), same[1].sum(0))
+
+    def plateau(self, common: np.ndarray, weight: np.ndarray) -> tuple[float, float, float]:
+        """The least squares of a constant and an exponential that falls with the lag."""
+        best = (np.inf, 0.0, 0.0, 0.0)
+        level = float((weight * common).sum() / weight.sum())
+        for tau in np.geomspace(self.lags[0] / 3, LONGEST * self.lags[-1], TRIED):
+            fall = np.exp(-self.lags / tau)
+            mean = (weight * fall).sum() / weight.sum()
+            away = fall - mean
+            known = max(float((weight * away**2).sum()), 1e-300)
+            height = float((weight * away * common).sum()) / known
+            height = max(height, 0.0)
+            own = level - height * float(mean)
+            left = float((weight * (common - own - height * fall) ** 2).sum())
+            if left < best[0]:
+                best = left, own, height, float(tau)
+        return best[1:]
+
+
+def _pairs(
+    label: np.ndarray, time: np.ndarray, step: float, keep: Callable[..., np.ndarray]
+) -> list[np.ndarray]:
+    """Positions i < j of pairs within a label that are apart in time, and their lag's bin."""
+    order = np.argsort(label, kind="stable")
+    ends = np.flatnonzero(np.diff(label[order])) + 1
+    firsts, seconds = [], []
+    for members in np.split(order, ends):
+        i, j = np.triu_indices(len(members), 1)
+        firsts.append(members[i])
+        seconds.append(members[j])
+    first, second = np.concatenate(firsts), np.concatenate(seconds)
+    lag = np.abs(time[first] - time[second]) / step
+    good = (lag > 0.5) & keep(first, second)
+    # bins of one step, and from the sixth on wider ones
+    number = np.where(lag < 6.5, lag.round(), 6 + (6 * np.log2(np.maximum(lag, 6) / 6)).round())
+    return [first[good], second[good], number[good].astype(int)]
+
+
+def _collected(
+    pairs: list[np.ndarray],
+    value: np.ndarray,
+    weight: np.ndarray,
+    cluster: np.ndarray,
+    number: int,
+    most: int,
+) -> np.ndarray:
+    """``(2, G, L)``: see :class:`Curve`."""
+    first, second, at = pairs
+    inside = at < most
+    first, second, at = first[inside], second[inside], at[inside]
+    label = cluster[first] * most + at
+    product = (value[first] * value[second]).sum(1)
+    both = [np.bincount(label, w, number * most) for w in (product, weight[first] * weight[second])]
+    found: np.ndarray = np.stack(both).reshape(2, number, most)
+    return found
+
+
+def ratio(sums_of: np.ndarray) -> np.ndarray:
+    found: np.ndarray = sums_of[0].sum(0) / np.maximum(sums_of[1].sum(0), 1e-300)
+    return found
+
+
+def shares(seen: Seen, curve: Curve, own: float, mood: float) -> dict[str, float | None]:
+    """Variance by what a number belongs to, as shares of their sum; negative ones are none."""
+    shared, passing, _ = curve.plateau(ratio(curve.between), curve.between[1].sum(0))
+    weight = seen.weight
+    total, size = 0.0, 0.0
+    for r in np.unique(seen.recording):
+        parts = [
+            (weight[own_part] @ seen.value[own_part], weight[own_part].sum())
+            for c in np.unique(seen.cluster[seen.recording == r])
+            if len(own_part := np.flatnonzero((seen.recording == r) & (seen.cluster == c)))
+        ]
+        values, sizes = np.stack([v for v, _ in parts]), np.array([w for _, w in parts])
+        total += float((values.sum(0) ** 2).sum() - (values**2).sum()) / values.shape[1]
+        size += float(sizes.sum() ** 2 - (sizes**2).sum())
+    several = len(np.unique(seen.recording)) > 1 and size > 0
+    recording = total / size if several else 0.0
+    parts_of = {
+        "recording": max(recording, 0.0),
+        "sequence": max(shared - max(recording, 0.0), 0.0),
+        "agent": max(own, 0.0),
+        "mood": max(mood, 0.0) + max(passing, 0.0),
+    }
+    whole = sum(parts_of.values())
+    found: dict[str, float | None] = {
+        name: value / whole if whole > 0 else 0.0 for name, value in parts_of.items()
+    }
+    if not several:
+        found["recording"] = None
+    return found

@@ -1,0 +1,1 @@
+"""Section 5 of the paper: cars, five models on ten recordings."""

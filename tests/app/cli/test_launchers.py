@@ -1,0 +1,206 @@
+"""Training in several processes, and sweeps whose runs are other processes."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from benchmarks.config import register
+from nnode.app.cli import launchers, sweep
+from nnode.app.cli.run import check_overrides
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.errors import ConfigError
+from tests.app.conftest import ROOT, environment
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+#: 32 sequences in 5 mini-batches, 4 epochs: 20 steps of the paper's stochastic descent.
+PROBLEM = (
+    "experiment=demo_traffic",
+    "model=n4",
+    "optimizer=adadelta",
+    "data.loader.batch_size=7",
+    "trainer.max_epochs=4",
+    "trainer.figure_every=0",
+)
+
+
+@pytest.fixture(scope="module")
+def prepared(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The override that takes prepared traffic."""
+    folder = tmp_path_factory.mktemp("prepared")
+    done = script(
+        "prepare_data", "data=demo_traffic", f"data.source={raw}", f"hydra.run.dir={folder}"
+    )
+    assert done.returncode == 0, done.stderr
+    return f"data.prepared={folder}"
+
+
+@pytest.fixture(scope="module")
+def alone(script: Script, prepared: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a training in one process."""
+    folder = tmp_path_factory.mktemp("alone")
+    done = script("train", *PROBLEM, prepared, f"hydra.run.dir={folder}")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def problem(*changes: str) -> list[str]:
+    """The problem's options, some of them changed or added."""
+    names = {change.partition("=")[0] for change in changes}
+    return [*(one for one in PROBLEM if one.partition("=")[0] not in names), *changes]
+
+
+def start(*overrides: str, temporary: Path) -> subprocess.Popen[str]:
+    """Two processes; their temporary files go to a folder of their own."""
+    temporary.mkdir(exist_ok=True)
+    return subprocess.Popen(
+        [*TORCHRUN, "scripts/train.py", *overrides],
+        cwd=ROOT,
+        env={**environment(), "TMPDIR": str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def difference(a: Path, b: Path) -> float:
+    """Largest difference of the last parameters of two runs."""
+    first, second = (load_checkpoint(p / "checkpoints" / "last.pt") for p in (a, b))
+    assert first.progress["step"] == second.progress["step"] == 20
+    return max(float((first.model[k] - second.model[k]).abs().max()) for k in first.model)
+
+
+def test_two_processes_train_as_one(alone: Path, prepared: str, tmp_path: Path) -> None:
+    run, temporary = tmp_path / "run", tmp_path / "tmp"
+    process = start(*PROBLEM, prepared, f"hydra.run.dir={run}", temporary=temporary)
+    out, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert difference(alone, run) < 1e-6
+    assert out.count("best checkpoint:") == 1
+    assert out.count("sequences train") == 1
+    assert {p.name for p in run.iterdir()} == {p.name for p in alone.iterdir()}
+    assert not list(temporary.glob("nnode-*"))  # the second process has cleaned up
+
+
+@pytest.mark.thorough
+def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    last = run / "checkpoints" / "last.pt"
+    # long enough that the signal meets it
+    options = problem("trainer.max_epochs=100000", "trainer.save_every=0", prepared)
+    process = start(*options, f"hydra.run.dir={run}", temporary=tmp_path / "tmp")
+    while not last.exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode != 0
+    assert errors.count("everything up to here is in") == 1
+    saved = load_checkpoint(last)
+    end = saved.progress["epoch"] + 1
+    # another number of processes goes on
+    done = script("train", f"resume={last}", f"trainer.max_epochs={end}", f"hydra.run.dir={run}")
+    assert done.returncode == 0, done.stderr
+    assert load_checkpoint(last).progress["epoch"] == end
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("model=n5", "error: model=n5 is unknown"),  # before the work starts
+        ("solver.dt=0.03", "error: solver.dt=0.03 s does not divide"),  # with the data
+    ],
+)
+def test_an_error_is_said_once(prepared: str, tmp_path: Path, override: str, message: str) -> None:
+    run = f"hydra.run.dir={tmp_path / 'run'}"
+    process = start(*problem(override), prepared, run, temporary=tmp_path / "tmp")
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode != 0
+    assert errors.count(message) == 1
+
+
+@pytest.mark.parametrize(
+    "launcher", ["cores", pytest.param("submitit_local", marks=pytest.mark.thorough)]
+)
+def test_runs_of_a_sweep_in_other_processes(
+    script: Script, prepared: str, tmp_path: Path, launcher: str
+) -> None:
+    done = script(
+        "train",
+        "-m",
+        f"hydra/launcher={launcher}",
+        *PROBLEM[:1],
+        prepared,
+        "optimizer=adadelta",
+        "solver.dt=0.02,0.03",
+        "trainer.max_epochs=1",
+        f"hydra.sweep.dir={tmp_path}",
+    )
+    assert done.returncode == 1, done.stderr  # the second run cannot work
+    table = pd.read_csv(tmp_path / "sweep.csv")
+    assert table["model"].tolist()[0] == "lin"
+    assert table["error"].str.contains("does not divide").tolist()[1] is True
+    assert "sweep.csv" in done.stdout
+
+
+def test_failures_of_an_earlier_sweep_in_the_same_folder_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep, "_sweep", {})  # commands that later tests fork inherit this process
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
+    for job in ("0", "1"):
+        sweep.record_failure(tmp_path / job, "of an earlier sweep")
+    sweep.SweepFailures().on_multirun_start(config)
+    assert sweep.failures() == []
+    sweep.write_json(tmp_path / "0" / "result.json", {"summary": {}})
+    assert sweep.failures() == []
+    sweep.record_failure(tmp_path / "1", "of this one")
+    sweep.record_failure(tmp_path / "a" / "b", "of this one")
+    assert sweep.failures() == [tmp_path / "1", tmp_path / "a" / "b"]
+
+
+@pytest.fixture
+def configurations() -> Path:
+    register()
+    return ROOT / "conf"
+
+
+def test_slurm_launcher_gives_submitit_what_it_knows(configurations: Path) -> None:
+    with initialize_config_dir(str(configurations), version_base="1.3"):
+        config = compose("train", ["hydra/launcher=slurm"], return_hydra_config=True)
+    settings = config.hydra.launcher
+    assert settings._target_.endswith("submitit_launcher.SlurmLauncher")
+    assert settings.cpus_per_task == 1
+    assert settings.max_num_timeout == 0  # of the plugin's own
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "plot_forces", "prepare_data", "benchmark"])
+def test_every_script_knows_its_failed_runs(configurations: Path, name: str) -> None:
+    with initialize_config_dir(str(configurations), version_base="1.3"):
+        config = compose(name, [], return_hydra_config=True)
+    targets = [callback._target_ for callback in config.hydra.callbacks.values()]
+    assert {"nnode.app.cli.sweep.SweepTable", "nnode.app.cli.sweep.SweepFailures"} & set(targets)
+
+
+def test_launchers_are_checked_like_every_group(configurations: Path) -> None:
+    check_overrides(["hydra/launcher=cores", "hydra.launcher.n_jobs=2"], configurations, "train")
+    with pytest.raises(ConfigError, match=r"hydra/launcher=core is unknown.*did you mean cores"):
+        check_overrides(["hydra/launcher=core"], configurations, "train")
+
+
+def test_a_launcher_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    launchers.check_launcher(["hydra/launcher=slurm"])
+    monkeypatch.setattr(launchers, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"hydra/launcher=slurm needs .* 'nnode\[cluster\]'"):
+        launchers.check_launcher(["hydra/launcher=slurm"])
+    launchers.check_launcher(["hydra/launcher=basic"])

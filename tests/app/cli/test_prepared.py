@@ -1,0 +1,132 @@
+"""``data.prepared=FOLDER`` alone: scripts read how a folder was made in the folder."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import nnode
+from nnode.app.cli.prepared import prepared_group
+from nnode.data.options import EsimasOptions, TableOptions, WalkwayOptions
+from nnode.data.prepare import prepare
+from nnode.errors import DataError
+from tests.app.conftest import ROOT
+from tests.discover.recorded import lane
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+CONF = ROOT / "conf"
+
+
+def numbered(path: Path) -> pd.DataFrame:
+    table = pd.read_csv(path)
+    table["agent"] = table["agent"].str.rpartition("-")[2]
+    table["time"] -= table.groupby("sequence")["time"].transform("min")
+    return table
+
+
+@pytest.fixture(scope="module")
+def table(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A prepared table; in every sequence agents are numbered from 0 and times start at 0."""
+    folder = tmp_path_factory.mktemp("table")
+    path = folder / "lane.csv"
+    numbered(lane(path, sequences=6, seconds=4.0, cars=3)).to_csv(path, index=False)
+    done = script(
+        "prepare_data",
+        "data=table",
+        f"data.path={path}",
+        "data.domain=traffic",
+        "data.faults=keep",
+        f"hydra.run.dir={folder / 'out'}",
+    )
+    assert done.returncode == 0, done.stderr
+    told = [line for line in done.stdout.splitlines() if "data.agents decides by hand" in line]
+    assert len(told) == 1
+    assert "lane: identifiers belong to their sequence" in told[0]
+    assert f"(train with data.prepared={folder / 'out'})" in done.stdout
+    path.unlink()
+    return folder / "out"
+
+
+def test_training_needs_the_folder_alone(script: Script, table: Path, tmp_path: Path) -> None:
+    arguments = ["trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
+    done = script("train", f"data.prepared={table}", *arguments)
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "data").exists()
+    assert json.loads((tmp_path / "result.json").read_text())["summary"]["data"] == "table"
+    # what was trained can be evaluated, and says itself where its data are
+    done = script(
+        "evaluate",
+        f"checkpoint={tmp_path / 'checkpoints' / 'best.pt'}",
+        "hydra.run.dir=" + str(tmp_path),
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_notebook_takes_such_a_table(tmp_path: Path) -> None:
+    table = numbered(lane(tmp_path / "lane.csv", sequences=6, seconds=4.0, cars=3))
+    run = nnode.fit(table, "traffic", epochs=2, folder=tmp_path / "run")
+    assert run.summary["cost_heldout"] > 0
+    table["time"] += 5.0 * table["sequence"]  # and one whose clock goes on
+    run = nnode.fit(table, "traffic", epochs=2, folder=tmp_path / "again")
+    assert run.summary["cost_heldout"] > 0
+
+
+def test_a_diagnosis_needs_the_folder_alone(script: Script, table: Path, tmp_path: Path) -> None:
+    done = script(
+        "discover", f"data.prepared={table}", "discover.page=false", f"hydra.run.dir={tmp_path}"
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["data=table", "data.faults=drop"],
+            "was prepared with other options: data.faults=keep then, drop now. Leave out "
+            "data.faults to take the folder as it is, or data.prepared to prepare the data anew",
+        ),
+        (["data=esimas"], "holds data=table, chosen is data=esimas; leave out data=esimas to take"),
+    ],
+)
+def test_what_contradicts_the_folder_is_refused(
+    script: Script, table: Path, tmp_path: Path, options: list[str], message: str
+) -> None:
+    done = script("train", *options, f"data.prepared={table}", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+def test_the_group_is_the_folder_s(raw: Path, table: Path, tmp_path: Path) -> None:
+    given = [f"data.prepared={tmp_path}"]
+    options = EsimasOptions(name="demo_traffic", recording="demo", source=str(raw))
+    prepare(options, tmp_path)
+    assert prepared_group(given, CONF, "train") == ["data=demo_traffic"]
+    assert prepared_group([*given, "data=esimas"], CONF, "train") == []
+    assert prepared_group(given, CONF, "study") == []
+    assert prepared_group(["data.prepared=null"], CONF, "train") == []
+    options.name = "mine"  # a name of the user's own, or that of another reader's data
+    prepare(options, tmp_path)
+    assert prepared_group(given, CONF, "train") == ["data=esimas"]
+    options.name = "table"
+    prepare(options, tmp_path)
+    assert prepared_group(given, CONF, "train") == ["data=esimas"]
+    assert prepared_group([f"data.prepared={table}"], CONF, "discover") == ["data=table"]
+    with pytest.raises(DataError, match="holds no prepared data"):
+        prepared_group([f"data.prepared={raw}"], CONF, "train")
+
+
+def test_every_reader_has_a_group_of_its_usual_name() -> None:
+    from nnode.app.cli.prepared import _groups
+    from nnode.data.prepare import FORMATS
+
+    groups = _groups(CONF)
+    for reader in FORMATS:
+        assert groups[str(reader().name)] is reader
+    assert {TableOptions, WalkwayOptions} <= set(FORMATS)

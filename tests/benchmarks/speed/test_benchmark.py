@@ -1,0 +1,228 @@
+"""The benchmark: engines that agree are timed, others are refused."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from benchmarks.config import BenchmarkConfig
+from benchmarks.speed import floor, memory
+from benchmarks.speed.engines import ENGINES
+from benchmarks.speed.memory import peak_memory
+from benchmarks.speed.problems import SHAPES, Shape, pose
+from benchmarks.speed.run import benchmark
+from nnode.errors import ConfigError, SimulationError
+from tests.solvers.fused.test_generate import PACKED, is_vector_code
+
+SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+
+
+@pytest.fixture
+def small(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    tiny = (
+        Shape("traffic", ("lin", "n4"), 3, 3, 2, 10, 0.02),
+        Shape("crowd", ("sf", "nn"), 2, 4, 2, 1, 0.04),
+    )
+    monkeypatch.setitem(SHAPES, "paper", tiny)
+
+
+def options(**changes: object):  # type: ignore[no-untyped-def]
+    config = OmegaConf.structured(BenchmarkConfig)
+    config.benchmark.update({"shapes": ["paper"], "repeats": 1, "restarts": 2, **changes})
+    return config
+
+
+@pytest.mark.thorough
+def test_all_engines(small, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    chosen = ["odeint_adjoint", "odeint", "loop", "fused_1", "fused_2"]
+    benchmark(options(engines=chosen), tmp_path)
+    found = json.loads((tmp_path / "benchmark.json").read_text())
+    assert len(found["problems"]) == 4
+    for problem in found["problems"]:
+        assert list(problem["engines"]) == chosen
+        for engine in problem["engines"].values():
+            assert 0 < engine["min"] <= engine["median"] <= engine["max"]
+            assert len(engine["all"]) == 1
+            assert engine["peak_memory_MB"] <= problem["peak_memory_MB"]
+    assert found["problems"][0]["ensemble"]["threads_1"]["single_runs"] > 0
+    # softplus of 4 neurons for 2 followers in 3 sequences and 20 steps, and none in other laws
+    floors = [problem.get("floor", {}).get("evaluations") for problem in found["problems"]]
+    assert floors == [None, 4 * 2 * 3 * 20, None, None]
+    assert not (tmp_path / "benchmark.png").exists()  # one number of steps, one of people
+
+
+@pytest.fixture
+def series(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    steps = tuple(Shape("traffic", ("n4",), 2, 3, n, 5, 0.02) for n in (1, 2))
+    # so long and so many that somebody meets somebody; a gradient of zero has no relative error
+    people = tuple(Shape("crowd", ("sf",), 1, n, 25, 1, 0.04) for n in (50, 100))
+    for name, shapes in (("steps", steps), ("scale", people)):
+        monkeypatch.setitem(SHAPES, name, shapes)
+
+
+def test_a_series_is_drawn(series, tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
+    chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", "fused_1"]}
+    benchmark(options(**chosen), tmp_path)
+    found = json.loads((tmp_path / "benchmark.json").read_text())
+    scale = found["scale"]["fused_1"]
+    assert scale["people"] == [50, 100]
+    medians = [row["engines"]["fused_1"]["median"] for row in found["problems"][2:]]
+    np.testing.assert_allclose(scale["seconds"], [medians[0] / 1250, medians[1] / 2500])
+    assert scale["ratio"] == max(scale["seconds"]) / min(scale["seconds"])
+    assert "fused_1: one step of one person takes" in capsys.readouterr().out
+    drawn = (tmp_path / "benchmark.png").read_bytes()
+    again = tmp_path / "again"
+    benchmark(options(redraw=str(tmp_path / "benchmark.json")), again)
+    assert (again / "benchmark.png").read_bytes() == drawn
+    assert not (again / "benchmark.json").exists()
+
+
+def test_what_was_timed_before_an_error_is_kept(series, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    right = ENGINES["loop"]
+
+    def prepare(problem):  # type: ignore[no-untyped-def]
+        if problem.shape.agents == 100:
+            raise KeyboardInterrupt
+        return right.prepare(problem)
+
+    monkeypatch.setitem(ENGINES, "loop", replace(right, prepare=prepare))
+    with pytest.raises(KeyboardInterrupt):
+        benchmark(options(shapes=["scale"], engines=["loop"]), tmp_path)
+    found = json.loads((tmp_path / "benchmark.json").read_text())
+    assert [row["agents"] for row in found["problems"]] == [50]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "cannot be read.*FileNotFoundError"),
+        ("{", "cannot be read.*expected the benchmark.json of an earlier run"),
+        ('{"rows": 3}', "cannot be read.*problems"),
+        ('{"problems": []}', "has nothing to draw; expected at least two problems"),
+    ],
+)
+def test_results_that_cannot_be_drawn(text: str | None, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "old.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        benchmark(options(redraw=str(path)), tmp_path)
+
+
+def test_pytorch_solves_what_fits() -> None:
+    reach = {
+        (name, shape.agents): ENGINES["odeint"].covers(pose(shape, shape.models[0], torch.float32))
+        for name, shapes in SHAPES.items()
+        for shape in shapes
+    }
+    assert {key for key, covered in reach.items() if not covered} == {
+        ("scale", people) for people in (1000, 2000, 5000, 10000)
+    }
+
+
+def test_memory_is_that_of_the_call() -> None:
+    def call(megabytes: int) -> int:
+        return len(np.ones(megabytes * 125_000))
+
+    peak_memory(lambda: call(300))
+    result, found = peak_memory(lambda: call(100))
+    assert result == 12_500_000
+    if found["memory_MB"] is None:
+        pytest.skip("the system does not tell")
+    assert found["memory_MB"] == pytest.approx(100, abs=10)
+    assert found["peak_memory_MB"] > 100
+
+
+def test_memory_where_the_system_does_not_tell(monkeypatch, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(memory, "_PROCESS", tmp_path / "missing")
+    result, found = peak_memory(lambda: 7)
+    assert result == 7
+    assert found["memory_MB"] is None
+    assert found["peak_memory_MB"] is None or found["peak_memory_MB"] > 10
+
+
+def test_the_floor_is_the_arithmetic_of_a_network() -> None:
+    (stress,) = SHAPES["stress"]
+    # 9 followers in 100 sequences, 4 neurons, 5000 steps
+    assert floor.evaluations(pose(stress, "n4", torch.float32)) == 18_000_000
+    assert floor.floor_call(pose(stress, "lin", torch.float32)) is None
+    x = np.linspace(-9, 9, 64)
+    found = x.copy()
+    floor.rows(found, 2)
+    for _ in range(2):
+        x = np.log1p(np.exp(x)) - 1 / (1 + np.exp(-x))
+    np.testing.assert_allclose(found, x, rtol=1e-13)
+
+
+@pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_the_floor_is_vector_code(kind: type) -> None:
+    # a scalar loop would put it ten times too high, and flatter the engines
+    x = np.ones(64, kind)
+    floor.rows(x, 1)
+    (text,) = (
+        floor.rows.inspect_asm(s)
+        for s in floor.rows.signatures
+        if s[0].dtype.name == np.dtype(kind).name
+    )
+    assert is_vector_code(text, loops=1)
+
+
+def test_an_engine_that_is_wrong_is_refused(small, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    right = ENGINES["loop"]
+
+    def prepare(problem):  # type: ignore[no-untyped-def]
+        call = right.prepare(problem)
+        return lambda: (call()[0], 1.01 * call()[1])
+
+    monkeypatch.setitem(ENGINES, "loop", replace(right, prepare=prepare))
+    with pytest.raises(SimulationError, match="loop differs from the exact"):
+        benchmark(options(engines=["loop"]), tmp_path)
+    assert not (tmp_path / "benchmark.json").exists()
+
+
+@pytest.mark.parametrize("arrangement", ["scan", "scan_batch_last", "diffrax_batch_last"])
+@pytest.mark.parametrize("law", ["lin", "log", "n4"])
+def test_jax(law: str, arrangement: str) -> None:
+    pytest.importorskip("jax")
+    pytest.importorskip("diffrax")
+    problem = pose(Shape("traffic", (law,), 3, 4, 3, 10, 0.02), law, torch.float32)
+    states, gradient = ENGINES[arrangement].prepare(problem)()
+    exact, wanted = ENGINES["odeint"].prepare(problem)()
+    np.testing.assert_allclose(states, exact, rtol=1e-5)
+    np.testing.assert_allclose(gradient, wanted, atol=2e-3 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"shapes": ["huge"]}, "benchmark.shapes has huge, expected some of paper"),
+        ({"engines": ["warp"]}, "benchmark.engines has warp"),
+        ({"repeats": 0}, "benchmark.repeats=0"),
+        ({"restarts": 0}, "benchmark.restarts=0"),
+    ],
+)
+def test_refusals(changes, message, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ConfigError, match=message):
+        benchmark(options(**changes), tmp_path)
+
+
+def test_script_refuses_unknown_options(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / "benchmark.py"), "benchmark.shape=[paper]"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "did you mean benchmark.shapes" in done.stderr

@@ -1,0 +1,145 @@
+"""Reading tidy tables: traffic and crowds, optional columns, walls, and bad tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nnode.data.options import TableOptions
+from nnode.data.quality import find_faults
+from nnode.data.readers.table import read_table, table_files
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+
+def rows(sequence: object, agent: object, x: np.ndarray, t0: float = 0.0, **more: object):
+    time = t0 + 0.1 * np.arange(len(x))
+    return pd.DataFrame({"sequence": sequence, "time": time, "agent": agent, "x": x, **more})
+
+
+def read(
+    tmp_path: Path, *parts: pd.DataFrame, suffix: str = ".csv", **options: object
+) -> list[Sequence]:
+    path = tmp_path / f"own{suffix}"
+    table = pd.concat(parts)
+    table.to_csv(path, index=False) if suffix == ".csv" else table.to_parquet(path)
+    options = {"domain": "traffic", "path": str(path), **options}
+    return read_table(path, TableOptions(**options))  # type: ignore[arg-type]
+
+
+LINE = np.arange(5) * 2.0
+
+
+def test_traffic_is_ordered_by_position(tmp_path: Path) -> None:
+    parts = [rows("s1", "ahead", LINE + 40), rows("s1", "behind", LINE), rows("s2", "only", LINE)]
+    first, second = read(tmp_path, *parts)
+    assert first.agents == ("behind", "ahead")
+    np.testing.assert_allclose(first.x[:, :, 0], LINE[:, None] + [0, 40])
+    np.testing.assert_allclose(first.time, 0.1 * np.arange(5))
+    assert (first.name, second.name, second.recording) == ("own/s1", "own/s2", "own")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_crowd_with_everything(tmp_path: Path, suffix: str) -> None:
+    parts = [
+        rows(1, 7, LINE, y=1.0, length=0.3, kind="child", group="g", dest_x=20.0, dest_y=1.5),
+        rows(1, 8, -LINE, y=2.0, length=np.nan, kind=None, group=None, dest_x=-20.0, dest_y=2.0),
+    ]
+    parts = [part.assign(recording="run") for part in parts]
+    (s,) = read(tmp_path, *parts, suffix=suffix, domain="crowd")
+    assert s.name == "run/1"
+    assert s.agents == ("7", "8")
+    assert s.x.shape == (5, 2, 2)
+    np.testing.assert_allclose(s.x[:, 0], np.stack([LINE, np.ones(5)], axis=-1))
+    np.testing.assert_allclose(s.destination, [[20, 1.5], [-20, 2]])
+    np.testing.assert_array_equal(s.length, [0.3, np.nan])
+    assert s.kind == ("child", "")
+    assert s.group == ("g", "")
+
+
+def test_recordings_are_chosen_by_name(tmp_path: Path) -> None:
+    parts = [rows(i, "a", LINE, recording=f"r{i}") for i in range(3)]
+    (s,) = read(tmp_path, *parts, recording=["r2"])
+    assert s.recording == "r2"
+    with pytest.raises(ConfigError, match="recording=r5: unknown recording"):
+        read(tmp_path, *parts, recording="r5")
+
+
+def test_an_absent_agent_is_a_gap(tmp_path: Path) -> None:
+    late = rows("s", "late", LINE + 50).iloc[2:]
+    (s,) = read(tmp_path, rows("s", "a", LINE), late)
+    np.testing.assert_array_equal(np.isnan(s.x[:, 1, 0]), [True, True, False, False, False])
+    (fault,) = find_faults(s, "traffic")
+    assert (fault.kind, fault.agents) == ("gap_in_time", (1,))
+    assert "2 of 5 samples" in fault.detail
+
+
+def test_walls(tmp_path: Path) -> None:
+    walls = tmp_path / "walls.csv"
+    walls.write_text("x1,y1,x2,y2\n0,0,5,0\n5,4,0,4\n")
+    part = rows(1, 1, LINE, y=1.0)
+    part.to_csv(tmp_path / "own.csv", index=False)
+    options = TableOptions(domain="crowd", path="own.csv", walls="walls.csv", source=str(tmp_path))
+    files = table_files(options)
+    (s,) = read_table(files["table"], options, files["walls"])
+    np.testing.assert_array_equal(s.walls, [[0, 0, 5, 0], [5, 4, 0, 4]])
+    walls.write_text("x1,y1,x2,y2\n0,0,5,0\n5,4,5,4\n")
+    with pytest.raises(DataError, match=r"walls.csv, line 3: a wall that begins where it ends"):
+        read_table(files["table"], options, files["walls"])
+    walls.write_text("x1,y1,x2\n0,0,5\n")
+    with pytest.raises(DataError, match=r"no column 'y2'; it has: x1, y1, x2"):
+        read_table(files["table"], options, files["walls"])
+
+
+def test_uneven_times(tmp_path: Path) -> None:
+    part = rows("s", "a", LINE)
+    part.loc[3:, "time"] += 0.1
+    with pytest.raises(DataError, match=r"line 5: sequence own/s steps from 0.2 s to 0.4 s"):
+        read(tmp_path, part)
+
+
+def test_one_agent_twice(tmp_path: Path) -> None:
+    part = rows("s", "a", LINE)
+    with pytest.raises(DataError, match=r"line 7: agent a .* at 0 s \(first in line 2\)"):
+        read(tmp_path, part, part)
+
+
+def test_properties_belong_to_the_agent(tmp_path: Path) -> None:
+    part = rows("s", "a", LINE, length=4.5)
+    part.loc[2, "length"] = 4.6
+    with pytest.raises(DataError, match=r"line 4: column 'length' holds 4.6; it belongs"):
+        read(tmp_path, part)
+
+
+@pytest.mark.parametrize(
+    ("more", "domain", "error", "message"),
+    [
+        ({"y": 1.0}, "traffic", DataError, "needs the positions x alone"),
+        ({}, "crowd", DataError, "needs the positions x and y"),
+        ({}, "road", ConfigError, "domain=road: expected traffic .* or crowd"),
+        ({"y": 1.0, "dest_x": 3.0}, "crowd", DataError, "needs the columns dest_x and dest_y"),
+        (
+            {"y": np.nan},
+            "crowd",
+            DataError,
+            r"line 2: column 'y' holds nothing \(and 4 more rows\)",
+        ),
+        ({"y": "here"}, "crowd", DataError, r"line 2: column 'y' holds 'here'"),
+    ],
+)
+def test_bad_tables(
+    tmp_path: Path, more: dict, domain: str, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        read(tmp_path, rows("s", "a", LINE, **more), domain=domain)
+
+
+def test_missing_column_names_those_that_exist(tmp_path: Path) -> None:
+    part = rows("s", "a", LINE).rename(columns={"agent": "agents"})
+    with pytest.raises(
+        DataError, match=r"it has: sequence, time, agents, x; did you mean 'agents'"
+    ):
+        read(tmp_path, part)

@@ -1,0 +1,267 @@
+"""Reading vehicle tables: units, lanes, time grid, and the cutting into sequences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nnode.data.options import VehicleTableOptions
+from nnode.data.readers.vehicles import read_vehicles, vehicle_files
+from nnode.errors import ConfigError, DataError
+
+
+def drive(vehicle: object, start: float, end: float, x0: float, **more: object) -> pd.DataFrame:
+    """A vehicle in view from ``start`` to ``end`` s at 10 m/s, at x0 + 10 t, every 0.1 s."""
+    time = np.round(np.arange(start, end + 0.05, 0.1), 6)
+    return pd.DataFrame({"vehicle": vehicle, "time": time, "x": x0 + 10 * time, **more})
+
+
+def save(path: Path, *parts: pd.DataFrame) -> Path:
+    table = pd.concat(parts)
+    if path.suffix == ".parquet":
+        table.to_parquet(path)
+    else:
+        table.to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture
+def platoon(tmp_path: Path) -> Path:
+    cars = [drive(name, 0, 4, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))]
+    return save(tmp_path / "road.csv", *cars)
+
+
+def read(path: Path, **options: object) -> list:
+    return read_vehicles(path, VehicleTableOptions(**options))  # type: ignore[arg-type]
+
+
+def test_order_times_and_positions(platoon: Path) -> None:
+    (s,) = read(platoon)
+    assert s.name == "road/000"
+    assert s.agents == ("c", "b", "a")
+    np.testing.assert_allclose(s.time, 0.2 * np.arange(21), atol=1e-9)
+    np.testing.assert_allclose(s.x[:, :, 0], s.time[:, None] * 10 + [0, 30, 60], atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_units_map_and_attributes(tmp_path: Path, suffix: str) -> None:
+    parts = []
+    for name, x0, kind in ((1, 0.0, 2), (2, 50.0, 2), (3, 90.0, 3)):
+        t = np.arange(0, 41)
+        parts.append(
+            pd.DataFrame(
+                {
+                    "id": name,
+                    "frame": t,
+                    "pos": -(x0 + t) / 0.3048,
+                    "speed_kmh": -36.0,
+                    "len": 15.0,
+                    "cls": kind,
+                }
+            )
+        )
+    path = save(tmp_path / f"t{suffix}", *parts)
+    (s,) = read(
+        path,
+        columns={
+            "vehicle": "id",
+            "time": "frame",
+            "x": "pos",
+            "speed": "speed_kmh",
+            "length": "len",
+            "kind": "cls",
+        },
+        position_unit="ft",
+        speed_unit="km/h",
+        time_unit="frame",
+        frame_rate=10.0,
+        direction=-1,
+        kinds={"2": "car", "3": "truck"},
+    )
+    assert s.kind == ("car", "car", "truck")
+    assert s.agents == ("1", "2", "3")
+    np.testing.assert_allclose(s.length, 15 * 0.3048)
+    np.testing.assert_allclose(s.x[:, 1, 0], 50 + 10 * s.time)
+    np.testing.assert_allclose(s.v, 10.0)
+
+
+def test_milliseconds(tmp_path: Path) -> None:
+    parts = [
+        drive(n, 0, 2, x0).assign(time=lambda d: d.time * 1e3) for n, x0 in (("a", 0), ("b", 9))
+    ]
+    (s,) = read(save(tmp_path / "t.csv", *parts), time_unit="ms", min_vehicles=2)
+    assert s.time[-1] == pytest.approx(2.0)
+
+
+def test_interpolates_and_never_extrapolates(tmp_path: Path) -> None:
+    parts = [drive(n, 0.13, 1.93, x0) for n, x0 in (("a", 0), ("b", 20))]
+    (s,) = read(save(tmp_path / "t.csv", *parts), min_vehicles=2)
+    assert (s.time[0], s.time[-1]) == (pytest.approx(0.2), pytest.approx(1.8))
+    np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
+
+
+def test_maximal_intervals(tmp_path: Path) -> None:
+    path = save(
+        tmp_path / "t.csv",
+        drive("lead", 0, 6, 60),
+        drive("mid", 0, 6, 30),
+        drive("late", 2, 6, 0),
+        drive("later", 4.1, 6, -30),
+    )
+    three, four = read(path)
+    assert three.agents == ("late", "mid", "lead")
+    assert (three.time[0], three.time[-1]) == (pytest.approx(2.0), pytest.approx(4.0))
+    assert four.agents == ("later", "late", "mid", "lead")
+    assert (four.time[0], four.time[-1]) == (pytest.approx(4.2), pytest.approx(6.0))
+    assert len(read(path, min_vehicles=2)) == 3
+
+
+def test_lanes_are_kept_apart(tmp_path: Path) -> None:
+    path = save(
+        tmp_path / "t.csv",
+        *(drive(f"l{i}", 0, 2, 30 * i, lane=1) for i in range(3)),
+        *(drive(f"r{i}", 0, 2, 30 * i + 10, lane=2) for i in range(4)),
+    )
+    left, right = read(path)
+    assert (left.recording, right.recording) == ("t_lane1", "t_lane2")
+    assert (left.n_agents, right.n_agents) == (3, 4)
+    (only,) = read(path, lane=2)
+    assert only.recording == "t_lane2"
+    (only,) = read(path, recording="t_lane1")
+    assert only.recording == "t_lane1"
+    with pytest.raises(ConfigError, match=r"lane=7: .* has the lanes 1, 2"):
+        read(path, lane=[1, 7])
+    with pytest.raises(ConfigError, match="recording=t_lane3: unknown recording"):
+        read(path, recording="t_lane3")
+
+
+def test_a_change_of_lane_ends_a_stay(tmp_path: Path) -> None:
+    changer = drive("x", 0, 4, 30).assign(lane=lambda d: np.where(d.time.between(1.95, 3), 2, 1))
+    others = [drive(n, 0, 4, x0, lane=1) for n, x0 in (("a", 0), ("b", 60), ("c", 90))]
+    sequences = read(save(tmp_path / "t.csv", changer, *others))
+    spans = [(s.agents, round(s.time[0], 1), round(s.time[-1], 1)) for s in sequences]
+    assert spans == [
+        (("a", "x", "b", "c"), 0.0, 1.8),
+        (("a", "b", "c"), 2.0, 3.0),
+        (("a", "x", "b", "c"), 3.2, 4.0),
+    ]
+
+
+def test_long_holes_are_not_interpolated(tmp_path: Path) -> None:
+    parts = [drive(n, 0, 4, x0) for n, x0 in (("a", 0), ("b", 30), ("c", 60))]
+    parts[1] = parts[1][(parts[1].time < 1.05) | (parts[1].time > 2.95)]
+    path = save(tmp_path / "t.csv", *parts)
+    assert [s.n_samples for s in read(path, max_hole=1.0)] == [6, 6]
+    assert [s.n_samples for s in read(path, max_hole=2.0)] == [21]
+
+
+def test_windows_share_their_boundary_sample(platoon: Path) -> None:
+    first, second = read(platoon, window=2.0)
+    assert first.n_samples == second.n_samples == 11
+    assert first.time[-1] == second.time[0] == pytest.approx(2.0)
+
+
+def test_a_window_is_cut_where_a_vehicle_is_in_view_for_a_part(tmp_path: Path) -> None:
+    whole = [drive(f"v{i}", 0, 4, 30 * i) for i in range(7)]
+    entering = drive("x", 2.5, 4, 30 * 2 + 15)  # between v2 and v3
+    ahead = drive("y", 0, 1, 30 * 6 + 15)  # ahead of everyone
+    path = save(tmp_path / "t.csv", *whole, entering, ahead)
+    low, high = read(path, window=4.0)
+    assert low.agents == ("v0", "v1", "v2")
+    assert high.agents == ("v3", "v4", "v5", "v6")
+    (high,) = read(path, window=4.0, min_vehicles=4)
+    assert high.agents == ("v3", "v4", "v5", "v6")
+
+
+@pytest.mark.real
+def test_reconstructed_motorway(real_data: Path) -> None:
+    options = VehicleTableOptions(
+        source=str(real_data),
+        path="ngsim/i80_lanes_1_2.csv",
+        columns={"vehicle": "veh", "time": "t", "speed": "v", "kind": "cls"},
+        window=10.0,
+    )
+    (path,) = vehicle_files(options).values()
+    sequences = read_vehicles(path, options)
+    raw = pd.read_csv(path)
+    assert len(sequences) > 20
+    for s in sequences:
+        lane = int(s.recording[-1])
+        rows = raw[raw.lane == lane]
+        inside = rows[(rows.t > s.time[0] - 1e-6) & (rows.t < s.time[-1] + 1e-6)]
+        # Nobody in the raw table ever drives between a follower and its leader.
+        for follower, leader in zip(s.agents, s.agents[1:], strict=False):
+            paths = inside.pivot(index="t", columns="veh", values="x")
+            back, front = paths[int(follower)], paths[int(leader)]
+            between = paths.gt(back, axis=0) & paths.lt(front, axis=0)
+            assert not between.to_numpy().any()
+        one = inside[inside.veh == int(s.agents[0])]
+        expected = np.interp(s.time, one.t, one.x)
+        np.testing.assert_allclose(s.x[:, 0, 0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt": 0.0}, "dt=0.0: expected a positive number"),
+        ({"window": 1.1}, "window=1.1 s is no whole number of steps"),
+        ({"window": 0.2}, "window=0.2 s has 2 samples, fewer than"),
+        ({"window": -1.0}, "window=-1.0: expected a positive number"),
+        ({"direction": 2}, "direction=2: expected 1 or -1"),
+        ({"position_unit": "yd"}, "position_unit=yd: expected one of m, ft, cm, km"),
+        ({"time_unit": "h"}, "time_unit=h: expected one of s, ms, frame"),
+        ({"time_unit": "frame"}, "frame_rate=None: expected a positive number"),
+        ({"time_unit": "frame", "frame_rate": -5.0}, "frame_rate=-5.0"),
+        ({"min_vehicles": 0}, "must be at least 1"),
+        ({"lane": 1}, "has no lane column"),
+        ({"columns": {"velocity": "v"}}, "data.columns.velocity is unknown; expected vehicle"),
+        ({"columns": {"x": None}}, "data.columns.x is null, but x is needed"),
+    ],
+)
+def test_bad_options(platoon: Path, options: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read(platoon, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty; expected a line of column names"),
+        ("vehicle,time,x\n", "has no rows below its columns vehicle, time, x"),
+        ("vehicle,t,x\n1,0,0\n", r"no column 'time'; it has: vehicle, t, x.*data.columns.time="),
+        ("vehicle;time;x\n1;0;0\n", "must be separated by commas"),
+        ("vehicle,time,x\n1,0,0\n\n1,0.1,abc\n", r"line 4: column 'x' holds 'abc'"),
+        ("vehicle,time,x\n1,0,0\n1,,2\n", r"line 3: column 'time' holds nothing"),
+        ("vehicle,time,x\n1,0,inf\n", r"line 2: column 'x' holds 'inf'"),
+        ("vehicle,time,x\n1,0,0\n,0.1,2\n", r"line 3: column 'vehicle' is empty"),
+        ("vehicle,time,x\n1,0,0\n2,0,9\n1,0,1\n", r"line 4: vehicle 1 at time 0 s .* in line 2"),
+        ("vehicle,time,x\n1,0,0\n1,0.1,1\n1,0.2,2\n", r"no sequence; at no time are 3 vehicles"),
+        ("vehicle,time,x\n1,0,0,5,6\n1,0\n1,2,3,4,5,6,7\n", "cannot be read as a comma-separated"),
+    ],
+)
+def test_bad_tables(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=message):
+        read(path)
+
+
+def test_damaged_parquet_and_missing_table(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    path.write_bytes(b"PAR1 no table")
+    with pytest.raises(DataError, match="cannot be read as a Parquet table"):
+        read(path)
+    with pytest.raises(DataError, match=r"data\.path: .* is not there"):
+        vehicle_files(VehicleTableOptions(path=str(tmp_path / "none.csv")))
+    with pytest.raises(ConfigError, match=r"data\.path is not set"):
+        vehicle_files(VehicleTableOptions())
+    with pytest.raises(ConfigError, match="tables are read from a folder"):
+        vehicle_files(VehicleTableOptions(path="t.csv", source="https://example.org"))
+
+
+def test_two_vehicles_where_three_are_asked_for(platoon: Path) -> None:
+    with pytest.raises(DataError, match=r"4 vehicles in one lane .*\(3 vehicles, 1 lanes\)"):
+        read(platoon, min_vehicles=4)

@@ -1,0 +1,268 @@
+"""The residuals of crowds, their derivatives, and what they tell of hidden effects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import Sequence
+from nnode.discover.crowds.engine import CrowdEngine
+from nnode.discover.crowds.walk import Walk
+from nnode.discover.crowds.windows import Windows
+from nnode.discover.locate.curves import columns_of
+from nnode.discover.residuals.engine import row_of
+from nnode.discover.residuals.fit import refine
+from nnode.discover.statistics.score import Screen, traces
+from nnode.models import Crowd, Relaxation, SocialForce
+from nnode.models.effects import CATALOGUE, Effect
+from nnode.models.effects.crowd_motion import Drift
+from nnode.models.effects.crowd_pairs import Alignment, PairRepulsion
+from nnode.models.extend import extended
+from tests.discover import walkers
+
+ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
+
+
+class Same(SocialForce):
+    """A force that is the same, but for which there is no compiled code."""
+
+
+def model(force: type[SocialForce] = SocialForce, **options: float | bool) -> Crowd:
+    law = force(walkers.A, 0.0, 0.0, B=walkers.B, **options)
+    return Crowd([Relaxation(walkers.TAU), law])
+
+
+@pytest.fixture(scope="module")
+def plain() -> list[Sequence]:
+    return walkers.crowd()
+
+
+@pytest.fixture(scope="module")
+def engine(plain: list[Sequence]) -> CrowdEngine:
+    found = CrowdEngine(plain)
+    found.settle(model(), ROW)
+    return found
+
+
+# -- simulation ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("opposing", [False, True])
+@pytest.mark.parametrize("walls", [False, True])
+def test_compiled_paths_are_those_of_the_model(
+    plain: list[Sequence], opposing: bool, walls: bool
+) -> None:
+    windows = Windows(plain)
+    rows = torch.tensor([[15.0, 0.0, 0.0], [25.0, 200.0, 30.0]], dtype=torch.float64)
+    found = []
+    for force in (SocialForce, Same):
+        system = model(force, opposing_wall_friction=opposing, walls=walls, r=0.45)
+        walk = Walk(windows, windows.scene(system), system)
+        assert walk.compiled is (force is SocialForce)
+        found.append(walk.paths(rows))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=2e-6)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=2e-5)
+    assert float((found[0][0][:, 0] - found[0][0][:, 1]).abs().max()) > 0.05
+
+
+@pytest.mark.parametrize("effect", [PairRepulsion(A_2=0.4, B_2=0.8), Alignment(c=0.5)])
+def test_effects_are_followed_to_second_order(plain: list[Sequence], effect: Effect) -> None:
+    windows = Windows(plain)
+    paths = []
+    for force in (SocialForce, Same):
+        system, _ = extended(model(force), effect)
+        walk = Walk(windows, windows.scene(system), system)
+        paths.append(walk.paths(torch.stack([row_of(system)]))[0])
+    bare = Walk(windows, windows.scene(model()), model()).paths(ROW[None])[0]
+    moved = float((paths[1] - bare).square().mean().sqrt())
+    assert moved > 0.02
+    assert float((paths[0] - paths[1]).square().mean().sqrt()) < 0.01 * moved
+
+
+def test_rows_are_independent_of_each_other(engine: CrowdEngine) -> None:
+    system, _ = extended(model(), Alignment(c=0.2))
+    rows = row_of(system) + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
+    together = engine.residuals(system, rows)
+    for k in range(2):
+        alone = engine.residuals(system, rows[k : k + 1])[0]
+        torch.testing.assert_close(together[k], alone, rtol=1e-9, atol=1e-9)
+
+
+# -- residuals -------------------------------------------------------------------------------
+
+
+def test_the_true_model_leaves_white_noise(engine: CrowdEngine) -> None:
+    residual = engine.residuals(model(), ROW[None])[0].numpy()
+    assert len(residual) == len(engine.sequence) == len(engine.cluster) == len(engine.unit)
+    each = residual.reshape(len(engine.windows.person), -1)
+    np.testing.assert_allclose((each**2).mean(0), 1.0, atol=0.35)
+    squares = engine.squares(model(), ROW)
+    assert squares.value.mean() == pytest.approx(engine.noise_floor(), rel=0.1)
+
+
+def test_a_wrong_start_does_not_show(engine: CrowdEngine) -> None:
+    before = engine.residuals(model(), ROW[None])[0]
+    kept = engine.windows.batch.x[0].clone(), engine.windows.batch.v[0].clone()
+    try:
+        engine.windows.batch.x[0] += torch.tensor([0.01, -0.02])
+        engine.windows.batch.v[0] += torch.tensor([0.02, 0.01])
+        after = engine.residuals(model(), ROW[None])[0]
+        raw = engine._differences(model(), ROW[None])
+    finally:
+        engine.windows.batch.x[0], engine.windows.batch.v[0] = kept
+    change = (after - before).square().mean().sqrt()
+    scale = engine._differences(model(), ROW[None]) - raw
+    assert float(scale.abs().max()) > 0.02
+    assert float(change) < 0.1 * float(before.square().mean().sqrt())
+
+
+def test_somebody_who_jumps_counts_little(plain: list[Sequence]) -> None:
+    x = plain[0].x.copy()
+    x[20:, 3] += 0.6
+    found = CrowdEngine([replace(plain[0], x=x), *plain[1:]])
+    found.settle(model(), ROW)
+    weight = found._settled(model(), ROW).weight
+    place = {(int(w), int(i)): k for k, (w, i) in enumerate(found.windows.person)}
+    assert weight[place[1, 3]] < 0.1
+    assert np.median(weight) > 0.8
+
+
+def test_a_run_that_flies_apart_is_bad_and_finite(engine: CrowdEngine) -> None:
+    wild = engine.residuals(model(), torch.tensor([[1e9, 0.0, 0.0], ROW.tolist()]))
+    assert bool(torch.isfinite(wild).all())
+    assert float(wild[0].square().sum()) > 1e3 * float(wild[1].square().sum())
+
+
+# -- derivatives -----------------------------------------------------------------------------
+
+
+def alike(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
+    """Cosine of the angle, and ratio of the lengths."""
+    return float(a @ b / a.norm() / b.norm()), float(a.norm() / b.norm())
+
+
+def test_tangents_are_those_of_simulations(plain: list[Sequence]) -> None:
+    system, _ = extended(model(), PairRepulsion(A_2=0.2, B_2=0.8))
+    row = row_of(system)
+    row[1] = 50.0
+    engine = CrowdEngine(plain)
+    engine.settle(system, row)
+    found = engine.tangents(system, row)
+    step = torch.tensor([0.1, 1.0, 0.5, 0.02, 0.02])
+    for k in range(len(row)):
+        change = torch.zeros_like(row)
+        change[k] = step[k]
+        both = engine.residuals(system, torch.stack([row + change, row - change]))
+        expected = (both[0] - both[1]) / (2 * step[k])
+        if float(expected.norm()) > 0:
+            cosine, ratio = alike(found[k], expected)
+            assert cosine > 0.97
+            assert ratio == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["drift", "field_of_view", "wall_repulsion", "side_preference"])
+def test_traces_are_those_of_simulations(engine: CrowdEngine, name: str) -> None:
+    effect = CATALOGUE.effects[name]
+    probe = effect.probes(engine.batch, model())[0]
+    found = engine.screen_columns(model(), ROW, effect, probe)
+    plain = engine.residuals(model(), ROW[None])[0]
+    for column, (strength, step) in zip(found, probe.steps.items(), strict=True):
+        options = {**probe.options, strength: effect.strengths[strength].neutral + step}
+        system, _ = extended(model(), effect(**options))
+        changed = engine.residuals(system, row_of(system)[None])[0]
+        cosine, ratio = alike(column, (changed - plain) / step)
+        assert cosine > 0.98
+        assert ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_numbers_of_each_person(engine: CrowdEngine) -> None:
+    """What everyone's own eta changes is his share of the common column."""
+    effect = CATALOGUE.effects["walker_heterogeneity"]
+    column = engine.individual(model(), ROW, effect, {})[0]
+    draw = np.random.default_rng(3)
+    eta = draw.normal(0, 0.05, len(engine.people))
+    people = {name: [0.0] * 6 for name in engine.names}
+    for value, ((b, i),) in zip(eta, engine.people, strict=True):
+        people[engine.names[b]][i] = float(value)
+    system, _ = extended(model(), effect(people=people))
+    change = engine.residuals(system, ROW[None])[0] - engine.residuals(model(), ROW[None])[0]
+    expected = torch.from_numpy(eta[engine.unit]) * column
+    cosine, ratio = alike(change, expected)
+    assert cosine > 0.99
+    assert ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_sine_and_cosine_of_the_gait(engine: CrowdEngine) -> None:
+    effect = CATALOGUE.effects["gait_sway"]
+    sine, cosine = engine.individual(model(), ROW, effect, {"f": 0.9})
+    phase = effect.person(np.array([0.3, 0.4]), {})  # type: ignore[attr-defined]
+    people = {name: [phase] * 6 for name in engine.names}
+    system, _ = extended(model(), effect(people=people, a=0.05, f=0.9))
+    row = row_of(system)
+    change = engine.residuals(system, row[None])[0] - engine.residuals(model(), ROW[None])[0]
+    agreement, ratio = alike(change, 0.05 * (0.6 * sine + 0.8 * cosine))
+    assert agreement > 0.97
+    assert ratio == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_flat_curve_is_a_drift(engine: CrowdEngine) -> None:
+    fit = refine(engine, model())
+    found = {(one.name, one.level): one for one in engine.variables()}
+    probe = Drift.probes(engine.batch, model())[0]
+    drift = engine.screen_columns(fit.system, torch.from_numpy(fit.row), Drift, probe)[0].numpy()
+    for name in ("position x", "position y", "clock time"):
+        columns = columns_of(engine, fit, found[name, "along x"])
+        np.testing.assert_allclose(columns.sum(1), drift, rtol=1e-6, atol=1e-9)
+    assert ("distance to the nearest wall", "away from it") in found
+
+
+# -- what it is for --------------------------------------------------------------------------
+
+
+def push(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    dx = x[:, :, None] - x[:, None]
+    d = walkers.length(dx)
+    size = 0.35 * np.exp((2 * walkers.R - d) / 0.8) * (1 - np.eye(x.shape[1])) / d
+    return (size[..., None] * dx).sum(2)
+
+
+def wind(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    return np.broadcast_to(np.array([0.1, -0.15]), x.shape)
+
+
+def walls(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    low = 0.8 * np.exp((walkers.R - x[..., 1]) / 0.5)
+    high = 0.8 * np.exp((walkers.R - (walkers.WIDTH - x[..., 1])) / 0.5)
+    return np.stack([0 * low, low - high], -1)
+
+
+@pytest.mark.parametrize(
+    ("extra", "name", "true"),
+    [
+        (push, "pair_repulsion", {"A_2": 0.35, "B_2": 0.8}),
+        (wind, "drift", {"a_x": 0.1, "a_y": -0.15}),
+        (walls, "wall_repulsion", {"A_w": 0.8, "B_w": 0.5}),
+    ],
+)
+def test_a_hidden_effect_scores_best_and_is_measured(
+    extra: walkers.Extra, name: str, true: dict[str, float]
+) -> None:
+    engine = CrowdEngine(walkers.crowd(extra, seed=4, sequences=12, noise=0.002))
+    start = model()
+    engine.settle(start, ROW)
+    fit = refine(engine, start)
+    engine.settle(fit.system, row_of(fit.system))
+    fit = refine(engine, fit.system)
+    screen = Screen(fit, engine.cluster)
+    effects = [e for e in CATALOGUE.of("crowd") if not e.individual and e.kin != "place"]
+    scores = screen.scores([t for e in effects for t in traces(engine, fit, e)])
+    assert scores[0].effect.name == name
+    system, place = extended(fit.system, scores[0].effect(**scores[0].options))
+    better = refine(engine, system)
+    for key, value in true.items():
+        found = better.row[better.names.index(f"terms.{place}.{key}")]
+        assert found == pytest.approx(value, rel=0.1, abs=0.01)
+    assert fit.cost - better.cost > 100

@@ -1,0 +1,144 @@
+"""Names are confirmed by clusters that nothing looked at, or they are leads."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nnode.app.discover import diagnose_table
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.data.clusters import least_number
+from nnode.data.sequence import Sequence
+from nnode.discover.diagnose import diagnose
+from nnode.discover.division import divide
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.report.files import sentence
+from nnode.models.effects import CATALOGUE
+from nnode.models.extend import effects_of
+from tests.discover.platoons import platoons, relative_speed
+from tests.discover.test_diagnose import MANY, law
+
+OPTIONS = DiscoverOptions(effects=["relative_speed"], structure=False, animation=False)
+KAPPA = 0.4
+
+
+def turned() -> list[Sequence]:
+    """Platoons whose sealed ones react the other way round."""
+    forth, back = (platoons(relative_speed(s * KAPPA), **MANY) for s in (1, -1))
+    sealed = divide(forth, OPTIONS).sealed
+    return [back[i] if i in sealed else one for i, one in enumerate(forth)]
+
+
+def table(sequences: list[Sequence]) -> pd.DataFrame:
+    """As a user has it."""
+    rows = [
+        (number, time, f"{number}/{n}", x)
+        for number, one in enumerate(sequences)
+        for time, places in zip(one.time, one.x[..., 0], strict=True)
+        for n, x in enumerate(places)
+    ]
+    return pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
+
+
+@pytest.fixture(scope="module")
+def unconfirmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a diagnosis whose sealed clusters contradict the open ones."""
+    folder = tmp_path_factory.mktemp("unconfirmed")
+    report = diagnose_table(
+        table(turned()), "traffic", model="lin", folder=folder / "run", options=OPTIONS
+    )
+    pd.Series(report).to_pickle(folder / "report.pkl")
+    return folder
+
+
+def test_what_is_worse_on_sealed_clusters_is_not_confirmed(unconfirmed: Path) -> None:
+    report = pd.read_pickle(unconfirmed / "report.pkl")
+    assert (report["verdict"], report["effects"]) == ("unconfirmed", [])
+    (lead,) = report["leads"]
+    assert lead["name"] == "relative_speed"
+    # the open clusters do say so: the least p that eleven of them allow
+    assert (report["clusters"]["open"], report["clusters"]["sealed"]) == (11, 5)
+    assert report["screen"]["p_value"] == lead["p_value"] == 2**-10
+    assert lead["coefficients"]["kappa"]["value"] == pytest.approx(KAPPA, abs=0.05)
+    # the sealed ones are all worse
+    assert lead["confirmed"] == report["confirmation"]["p_value"] == 1.0
+    assert report["confirmation"]["confirmed"] is False
+
+
+def test_what_is_not_confirmed_is_not_in_the_model_that_is_written(unconfirmed: Path) -> None:
+    run = unconfirmed / "run"
+    own = load_checkpoint(run / "checkpoints" / "best.pt").build()
+    assert effects_of(own) == []
+    assert set(own.physical()) == {"lin.v0", "lin.L"}
+    assert "effects: []" in (run / "model.yaml").read_text()
+    assert "name: lin_calibrated" in (run / "model.yaml").read_text()
+
+
+def test_the_page_says_first_that_nothing_is_confirmed(unconfirmed: Path) -> None:
+    page = html.unescape((unconfirmed / "run" / "report.html").read_text())
+    first = page.index(
+        "Not confirmed: in the open data the model lin seems to lack relative_speed,"
+    )
+    assert first < page.index("It is not added to the model.") < page.index("What is missing</h2>")
+    assert "Found, not confirmed</h3>" in page
+
+
+def test_four_sealed_clusters_confirm_nothing_however_much_better_they_are() -> None:
+    found = diagnose(law(), platoons(relative_speed(KAPPA), **{**MANY, "number": 12}), OPTIONS)
+    d = found.diagnosis
+    assert (d.verdict, d.effects, d.clusters.sealed) == ("unconfirmed", [], 4)
+    assert [one.name for one in d.leads] == ["relative_speed"]
+    why = "4 sealed clusters are independent of the open ones, and it takes 5 to confirm anything"
+    assert d.confirmation.reason == why
+    assert f"but {why}. It is not added to the model." in sentence(d)
+    assert effects_of(found.extended) == []
+
+
+def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() -> None:
+    sequences = platoons(relative_speed(KAPPA), **{**MANY, "number": 11})
+    found = diagnose(law(), sequences, DiscoverOptions(structure=False))
+    d = found.diagnosis
+    assert (d.verdict, d.effects, d.leads) == ("not_testable", [], [])
+    # eight open clusters have 2^7 outcomes, too few for so many effects
+    effects = [one for one in CATALOGUE.of("traffic") if not one.individual]
+    assert d.clusters.open == 8 < d.clusters.least == least_number(0.05, hypotheses=len(effects))
+    assert not any(one.testable for one in d.absences if one.name in {e.name for e in effects})
+    assert "there are 8 open " in sentence(d)
+    assert " 3 sealed " in sentence(d)
+    assert f"about {d.clusters.enough} in all would do. Nothing is named." in sentence(d)
+    # so many would do, and not many fewer
+    for number, do in ((d.clusters.enough, True), (d.clusters.enough - 3, False)):
+        parts = divide(platoons(number=number, seconds=1.0), DiscoverOptions())
+        least = d.clusters.least, d.clusters.least_sealed
+        enough = parts.number(parts.open) >= least[0] and parts.number(parts.sealed) >= least[1]
+        assert enough == do
+    # what one would look at first is told all the same
+    assert d.screen.leads[0]["name"] in ("relative_speed", "asymmetric_response")
+
+
+def test_an_effect_of_all_is_named_although_drivers_differ() -> None:
+    rng, reaction, made = np.random.default_rng(2), relative_speed(KAPPA), []
+    for s in range(16):
+        own = 1 + 0.03 * rng.normal(size=4)
+        (one,) = platoons(
+            lambda x, law, lead, own=own: reaction(x, law * own, lead),
+            number=1, seconds=20.0, driver=0.1, seed=200 + s,
+        )  # fmt: skip
+        made.append(Sequence(name=f"r/{s}", recording="r", time=one.time + 100 * s, x=one.x))
+    options = DiscoverOptions(effects=["relative_speed", "driver_heterogeneity"], structure=False)
+    d = diagnose(law(), made, options).diagnosis
+    assert d.verdict == "named"
+    assert d.effects[0].name == "relative_speed"
+    kappa = d.effects[0].coefficients["kappa"]
+    assert kappa.low < KAPPA < kappa.high
+    assert kappa.value == pytest.approx(KAPPA, abs=0.05)
+    # numbers of drivers stand beside it, and are no part of what all have in common
+    (drivers,) = d.agents
+    assert drivers.found
+    assert drivers.p_value < 0.05
+    assert drivers.later["own numbers"] < drivers.later["without numbers"]
+    assert "relative_speed" not in {one.name for one in d.absences}

@@ -1,0 +1,98 @@
+"""Figures of a diagnosis: what they show, not how they look."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from matplotlib.collections import QuadMesh
+from PIL import Image
+
+from nnode.data.sequence import Sequence
+from nnode.discover.report.deviation import Deviation
+from nnode.discover.report.figures import paths
+from nnode.discover.report.figures.maps import neighbour_maps, plane_maps, time_space_maps
+from nnode.discover.report.figures.marks import AFTER, BEFORE, sealed_costs
+from nnode.discover.report.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
+
+
+def lane_map(scale: float) -> Deviation:
+    """Vehicles everywhere; between 400 and 600 m they are slower than simulated."""
+    time, place = (c.ravel() for c in np.meshgrid(np.arange(0.0, 100), np.arange(0.0, 1000, 10)))
+    value = -scale * ((place > 400) & (place < 600))[:, None]
+    beside = np.full((len(time), 2), 20.0)
+    return Deviation(time, place[:, None], value, value, beside)
+
+
+def test_a_map_shows_the_zone_on_the_scale_before() -> None:
+    figure = time_space_maps({"before": lane_map(6.0), "after": lane_map(0.5)})
+    first, second = (
+        next(c for c in ax.collections if isinstance(c, QuadMesh)) for ax in figure.axes[:2]
+    )
+    assert first.get_clim() == second.get_clim() == (-6.0, 6.0)
+    edges = np.linspace(0, 990, 49)
+    middle = (edges[1:] + edges[:-1]) / 2
+    shown = np.asarray(first.get_array()).reshape(48, 48)
+    inside = (middle > 420) & (middle < 580)
+    assert (shown[inside] == -6.0).all()
+    assert (shown[(middle < 380) | (middle > 620)] == 0.0).all()
+
+
+def test_maps_of_arrows_need_no_data_everywhere() -> None:
+    rng = np.random.default_rng(0)
+    place = rng.uniform(0, 4, (300, 2))
+    value = np.tile([0.0, 0.3], (300, 1))
+    walls = np.array([[0.0, 0.0, 4.0, 0.0]])
+    beside = np.where(rng.uniform(size=(300, 1)) < 0.1, np.nan, place - 2)
+    given = Deviation(np.zeros(300), place, value, value, beside)
+    for figure in (plane_maps({"before": given}, walls), neighbour_maps({"before": given})):
+        quiver = figure.axes[0].collections[0]
+        shown = np.asarray(quiver.get_array(), float)
+        assert shown[np.isfinite(shown)] == pytest.approx(0.3)
+
+
+def test_sealed_costs_are_paired_in_the_order_of_before() -> None:
+    figure = sealed_costs(["a", "b", "c"], [1.0, 4.0, 2.0], [0.5, 1.0, 2.5], 0.1)
+    ax = figure.axes[0]
+    lines = {line.get_marker(): np.asarray(line.get_ydata()) for line in ax.lines}
+    assert list(lines[BEFORE["marker"]]) == [4.0, 2.0, 1.0]
+    assert list(lines[AFTER["marker"]]) == [1.0, 2.5, 0.5]
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["b", "c", "a"]
+
+
+def platoon() -> Sequence:
+    time = 0.2 * np.arange(21)
+    x = 15 * time[:, None] + np.array([0.0, 20.0, 45.0])
+    return Sequence(name="lane/1", recording="lane", time=time, x=x[..., None])
+
+
+def test_trajectories_and_moments_of_a_platoon() -> None:
+    s = platoon()
+    late = s.x - 0.5 * s.time[:, None, None]
+    both = pair(late, s.x)
+    assert rmse(s, late) == pytest.approx(float(np.sqrt(np.mean((0.5 * s.time) ** 2))))
+    assert len(trajectories(s, both).axes) == 4
+    assert len(trajectories(s, pair(late, None)).axes) == 2
+    strip = film_strip(s, both)
+    assert len(strip.axes) == 2 * paths.MOMENTS
+    last = strip.axes[-2]
+    measured, simulated = (np.asarray(line.get_xdata()) for line in last.lines)
+    assert measured - simulated == pytest.approx(0.5 * s.time[-1])
+    assert measured.mean() == pytest.approx(0.0)  # seen from the platoon's middle
+
+
+def test_a_moving_picture_takes_the_time_it_took(monkeypatch) -> None:
+    s = platoon()
+    made = moving_picture(s, pair(s.x, s.x))
+    assert made is not None
+    content, width, height = made
+    image = Image.open(io.BytesIO(content))
+    assert image.size == (width, height)
+    duration = 0
+    for k in range(image.n_frames):
+        image.seek(k)
+        duration += image.info["duration"]
+    assert duration == pytest.approx(1000 * s.time[-1], abs=250)
+    monkeypatch.setattr(paths, "BYTES", len(content) - 1)
+    assert moving_picture(s, pair(s.x, s.x)) is None

@@ -1,0 +1,240 @@
+"""The report in plain types, and the extended model as options and as a checkpoint."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from nnode.calibrate.optimizers import AdadeltaOptions
+from nnode.calibrate.options import TrainerOptions
+from nnode.discover.diagnose import _shift
+from nnode.discover.report.files import (
+    SCHEMA,
+    amount,
+    checkpoint_of,
+    estimate,
+    extended_options,
+    has_network,
+    interval,
+    model_yaml,
+    plain_report,
+    rebuilt,
+    sentence,
+    write_report,
+)
+from nnode.discover.result import (
+    Alternative,
+    Coefficient,
+    Confirmation,
+    DataFault,
+    Gap,
+    Verdict,
+)
+from nnode.models import build_model
+from nnode.models.build import add_effects
+from nnode.models.effects.traffic import SpeedZone
+from nnode.models.extend import effects_of, extended
+from tests.discover.conftest import Case
+
+
+def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -> None:
+    d = replace(traffic.found.diagnosis, gap=Gap(np.float64(2.0), 1.0, float("nan"), float("inf")))
+    path = write_report(plain_report(d), tmp_path / "report.json")
+
+    def no_constant(name: str) -> None:
+        pytest.fail(f"{name} is no JSON")
+
+    report = json.loads(path.read_text(), parse_constant=no_constant)
+    assert report["verdict"] == "named"
+    assert report["gap"] == {"before": 2.0, "after": 1.0, "noise_floor": None, "closed": None}
+    (effect,) = report["effects"]
+    assert effect["name"] == "speed_zone"
+    assert set(effect) >= {"coefficients", "where", "alternatives", "formula", "source", "p_value"}
+    assert set(effect["coefficients"]["alpha"]) == {"value", "low", "high", "unit"}
+    assert report["not_testable"] == ["reaction_delay"]
+    assert report["data_faults"] == report["leads"] == []
+    assert report["clusters"]["open"] + report["clusters"]["sealed"] == 5
+    assert set(report["screen"]) >= {"p_value", "clusters", "floor", "leads"}
+    assert report["confirmation"]["confirmed"] is True
+    (drivers,) = report["agents"]
+    assert drivers["share"] == {"recording": None, "sequence": 0.2, "agent": 0.5, "mood": 0.3}
+    assert {"name", "before", "after"} == set(report["sealed"][0])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(2035.19, "2040"), (-0.06123, "−0.0612"), (float("nan"), "–"), (None, "–"), (0.5, "0.5")],
+)
+def test_amounts_in_words(value: float | None, text: str) -> None:
+    assert amount(value) == text
+
+
+def test_coefficients_in_words(traffic: Case) -> None:
+    (effect,) = traffic.found.diagnosis.effects
+    assert interval(effect).startswith("alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m")
+
+
+@pytest.mark.parametrize(
+    ("low", "value", "high", "words"),
+    [
+        (399.756, 399.8268, 399.897, ("399.827", "399.756", "399.897")),
+        (-12.2, -11.0, -9.1, ("−11.0", "−12.2", "−9.1")),
+        (150.0, 400.0, 700.0, ("400", "150", "700")),
+        (float("nan"), 0.12345, float("nan"), ("0.1235", "–", "–")),
+    ],
+)
+def test_an_estimate_has_the_digits_that_its_interval_leaves(
+    low: float, value: float, high: float, words: tuple[str, str, str]
+) -> None:
+    assert estimate(Coefficient(value, low, high, "m")) == words
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("named", "lacks speed_zone: with it, the error on sealed sequences goes from 5 to 1 m²"),
+        ("none", "Nothing is missing from the model stand-in that these data could show"),
+        ("unknown", "Beyond speed_zone the model stand-in lacks something that is not in the"),
+        ("indistinguishable", "cannot tell whether it is speed_zone or rather inertia"),
+        (
+            "unconfirmed",
+            "Not confirmed: in the open data the model stand-in seems to lack inertia, ",
+        ),
+        ("not_testable", "Not testable with these data: "),
+    ],
+)
+def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str) -> None:
+    d = traffic.found.diagnosis
+    (effect,) = d.effects
+    d = replace(
+        d,
+        verdict=verdict,
+        effects=[replace(effect, alternatives=[Alternative("inertia", 1.0, 0.5)])],
+        leads=[replace(effect, name="inertia")] if verdict == "unconfirmed" else [],
+        confirmation=Confirmation(0.4, 5, False, "the sealed clusters are no better"),
+        gap=Gap(5.0, 1.0, 0.5, 8 / 9),
+    )
+    assert words in sentence(d)
+    assert sentence(d).endswith(".")
+    if verdict == "named":
+        assert "(89 % of what can be closed above the noise floor of 0.5 m²)" in sentence(d)
+    if verdict == "unconfirmed":
+        assert sentence(d).endswith("clusters are no better. It is not added to the model.")
+    if verdict == "not_testable":
+        assert "there are 3 open " in sentence(d)
+        assert " 2 sealed " in sentence(d)
+        assert "sequences of a recording that share an agent" in sentence(d)
+        assert sentence(d).endswith("about 17 in all would do. Nothing is named.")
+
+
+def test_faults_of_the_measurement_stand_beside_the_verdict(traffic: Case) -> None:
+    plain = traffic.found.diagnosis
+    jumps = [DataFault("jump", f"lane/{i}", ["v1"], 3.0) for i in (1, 1, 2)]
+    d = replace(plain, data_faults=jumps)
+    assert sentence(d) == (
+        f"{sentence(plain)} Beside that the measurement holds 3 faults in 2 sequences, which were "
+        "left out."
+    )
+
+
+def test_what_was_not_confirmed_is_said_beside_what_was(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    (effect,) = d.effects
+    d = replace(d, leads=[replace(effect, name="inertia")])
+    assert "lacks speed_zone" in sentence(d)
+    assert sentence(d).endswith(" inertia was found too, but not confirmed.")
+
+
+def test_numbers_of_agents_come_from_the_first_part_of_their_time(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    (effect,) = d.effects
+    assert "the first" not in sentence(d)
+    d = replace(d, effects=[effect, replace(effect, name="driver_heterogeneity")])
+    assert sentence(d).endswith("each agent's number being taken from the first.")
+
+
+@pytest.mark.parametrize("name", ["traffic", "crowd"])
+def test_the_options_give_the_extended_model(name: str, request: pytest.FixtureRequest) -> None:
+    case: Case = request.getfixturevalue(name)
+    options = extended_options(case.model, case.found.extended)
+    model = build_model(options)
+    expected = case.found.extended.state_dict()
+    found = model.state_dict()
+    assert set(found) == set(expected)
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value, rtol=0, atol=0)
+    text = model_yaml(options, False)
+    read = yaml.safe_load(text)
+    assert read.pop("defaults") == [f"{case.model['term']}_schema", "_self_"]
+    assert read == options
+    assert options["name"] in text.splitlines()[0]
+
+
+def test_without_effects_the_name_says_calibrated(traffic: Case) -> None:
+    options = extended_options(traffic.model, traffic.found.base)
+    assert options["name"] == "lin_calibrated"
+    assert options["effects"] == []
+    assert options["v0"] == 27.0
+
+
+def test_effects_find_their_parameters_in_any_order(traffic: Case) -> None:
+    system = build_model(traffic.model)
+    add_effects(system, [{"name": "relative_speed", "kappa": 0.2}])
+    add_effects(system, [{"name": "speed_zone", "alpha": 0.5, "a": 1.0, "b": 2.0}])
+    assert [e.name for e in effects_of(system)] == ["relative_speed", "speed_zone"]
+    again = rebuilt(extended_options(traffic.model, system), system)
+    assert {k: float(v) for k, (v, _) in again.physical().items()} == {
+        k: float(v) for k, (v, _) in system.physical().items()
+    }
+
+
+def test_a_network_keeps_its_weights_in_the_checkpoint(traffic: Case) -> None:
+    options = {"name": "n2", "term": "network_speed", "hidden": 2, "v0": 30.0, "box": None}
+    system = build_model({**options, "leader": "measured"}, seed=3)
+    assert has_network(system)
+    assert not has_network(traffic.found.base)
+    again = rebuilt({**options, "leader": "measured", "effects": []}, system)
+    for key, value in system.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[key], value, rtol=0, atol=0)
+    assert "these would be new" in model_yaml(options, True)
+
+
+def test_the_checkpoint_has_the_diagnosis_own_parts(traffic: Case) -> None:
+    model = extended_options(traffic.model, traffic.found.extended)
+    config = {"model": model, "seed": 0, "trainer": {**vars(TrainerOptions()), "dtype": "float64"}}
+    checkpoint = checkpoint_of(
+        traffic.found, traffic.inputs.sequences, config, {}, AdadeltaOptions()
+    )
+    assert checkpoint.split["heldout"] == traffic.found.diagnosis.split["sealed"]
+    assert checkpoint.split["train"] == traffic.found.diagnosis.split["open"]
+    # cars behind a leader at 14 to 22 m/s
+    assert checkpoint.free_speed is not None
+    assert 5 < checkpoint.free_speed < 27
+    built = checkpoint.build().physical()
+    assert {k: float(v) for k, (v, _) in built.items()} == {
+        k: float(v) for k, (v, _) in traffic.found.extended.physical().items()
+    }
+
+
+def test_a_parameter_is_compared_with_itself_whatever_joins_the_model(traffic: Case) -> None:
+    before = build_model(traffic.model)
+    add_effects(before, [{"name": "speed_period", "alpha": 0.7}])
+    # the zone stands before the period in the sum, and its parameters have the same names
+    after, _ = extended(before, SpeedZone(alpha=0.9))
+    shift = _shift(before, after)
+    period = {"before": 0.7, "after": 0.7, "unit": "1"}
+    assert shift["speed_period.alpha"] == period
+    assert [name for name in shift if name.endswith("alpha")] == ["speed_period.alpha"]
+
+
+def test_the_report_says_first_which_schema_it_follows(traffic: Case) -> None:
+    report = plain_report(traffic.found.diagnosis)
+    assert next(iter(report.items())) == ("schema", 2)
+    page = (Path(__file__).parents[3] / "docs" / "discovery.md").read_text(encoding="utf-8")
+    assert f"now {SCHEMA};" in page

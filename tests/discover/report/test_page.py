@@ -1,0 +1,187 @@
+"""The page and the events of a diagnosis, with results made by hand."""
+
+from __future__ import annotations
+
+import re
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from nnode.data.quality import Fault
+from nnode.data.sequence import Sequence
+from nnode.discover.inputs import Inputs
+from nnode.discover.report.captions import Figures, telling
+from nnode.discover.report.files import sentence
+from nnode.discover.report.page import draw, page_blocks
+from nnode.discover.result import Confirmation, DataFault
+from nnode.models import build_model
+from nnode.models.build import add_effects
+from nnode.pages.page import Heading, Text
+from tests.discover.conftest import Case
+
+CONFIG = {"data": {"name": "table"}, "model": {"name": "lin_with_speed_zone"}}
+
+
+def with_faults(case: Case) -> Inputs:
+    """The case's inputs beside a sequence in which a vehicle jumps."""
+    first = case.inputs.sequences[0]
+    x = first.x.copy()
+    x[20:, 1] += 50.0
+    bad = Sequence(name="lane/bad", recording="lane", time=first.time, x=x)
+    fault = Fault("jump", "lane/bad", (1,), float(first.time[20]), "car 1 jumps")
+    return replace(
+        case.inputs,
+        faulty=[bad],
+        faults={"lane/bad": [fault]},
+        data_faults=[DataFault("jump", "lane/bad", ["1"], fault.time, fault.detail)],
+    )
+
+
+@pytest.fixture(scope="module")
+def written(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page")
+    inputs = with_faults(traffic)
+    found = deepcopy(traffic.found)
+    found.diagnosis.data_faults = inputs.data_faults
+    write = draw(inputs, found, traffic.options, CONFIG, ["python scripts/evaluate.py X"], folder)
+    assert list(folder.iterdir()) == []  # drawn is not written
+    paths = write()
+    assert paths == {"page": folder / "report.html", "tensorboard": folder / "tensorboard"}
+    return folder
+
+
+def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Case) -> None:
+    page = (written / "report.html").read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    verdict = sentence(traffic.found.diagnosis)
+    assert page.index(verdict) < page.index("What is missing</h2>")
+    order = [
+        "What is missing",
+        "Faults of the measurement",
+        "Do agents differ?",
+        "The model's own parameters",
+        "Where model and measurement part",
+        "What is left",
+        "A sealed sequence",
+        "Using the extended model",
+        "How this page was made",
+    ]
+    heads = re.findall(r"<h2[^>]*>([^<]*)</h2>", page.replace("&#39;", "'"))
+    assert heads == order
+    for words in (
+        "python scripts/evaluate.py X",
+        "position in [400, 600] m: −6.1 ± 0.4 m/s, 71 % of the excess error",
+        "platoons at other times",
+        "car 1 jumps",
+        "made by hand",
+        "5 sequences were sealed",
+        "3 open clusters no two-sided p-value can be below 0.001.",
+        "driver_heterogeneity: not named: the last part of the sealed sequences",
+    ):
+        assert words in page, words
+
+
+def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
+    names = {path.stem for path in (written / "figures").iterdir()}
+    assert names == {
+        "coefficients", "faults", "map", "map_beside", "moments", "moving", "sealed",
+        "trajectories", "unknown", "where",
+    }  # fmt: skip
+    alts = re.findall(r'<img alt="([^"]*)"', (written / "report.html").read_text())
+    assert len(alts) == len(names)
+    assert all(len(alt) > 20 for alt in alts)
+    table = pd.read_csv(written / "coefficients.csv")
+    assert list(table["coefficient"]) == ["alpha", "a", "b"]
+    assert list(pd.read_csv(written / "data_faults.csv")["sequence"]) == ["lane/bad"]
+    assert (written / "figures" / "moving.gif").read_bytes()[:6] == b"GIF89a"
+
+
+def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> None:
+    events = EventAccumulator(str(written / "tensorboard")).Reload()
+    gap = traffic.found.diagnosis.gap
+    assert [e.value for e in events.Scalars("gap/sealed")] == pytest.approx([gap.before, gap.after])
+    assert [e.value for e in events.Scalars("parameters/lin.v0")] == [24.0, 27.0]
+    assert [e.value for e in events.Scalars("effects/speed_zone/alpha")] == pytest.approx([0.65])
+    assert "diagnosis/map" in events.Tags()["images"]
+
+
+def test_a_crowd_s_page(crowd: Case, tmp_path: Path) -> None:
+    still = replace(crowd.options, animation=False)
+    draw(crowd.inputs, crowd.found, still, CONFIG, [], tmp_path)()
+    page = (tmp_path / "report.html").read_text()
+    assert "Mean of measured minus simulated acceleration by place" in page
+    assert "made_up_wind" in page
+
+
+def plain(case: Case, **changes: object) -> list[str]:
+    """The words of a page without figures."""
+    found = deepcopy(case.found)
+    found.diagnosis = replace(found.diagnosis, **changes)
+    blocks = page_blocks(case.inputs, found, Figures(), [], Path("run"))
+    return [b.markdown if isinstance(b, Text) else b.text
+            for b in blocks if isinstance(b, Text | Heading)]  # fmt: skip
+
+
+def test_a_page_of_nothing_found(traffic: Case) -> None:
+    words = plain(traffic, effects=[], verdict="none", unknown=None, places=[], absences=[],
+                  not_testable=[], sealed=[], base={}, notes=[], agents=[])  # fmt: skip
+    assert "No effect of the catalogue was added to the model." in words
+    assert "None: every sequence was used." in words
+    assert "No structure that a flexible fit would find." in words
+    assert "None was left to look for." in words
+    assert not any("network" in text for text in words)
+    assert "Do agents differ?" not in words
+    assert "Found, not confirmed" not in words
+
+
+def test_what_was_not_confirmed_is_a_lead(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    no = Confirmation(0.4, 5, False, "the sealed clusters are not predicted better with it")
+    words = plain(traffic, effects=[], verdict="unconfirmed", leads=d.effects, confirmation=no)
+    assert "No effect of the catalogue was added to the model." in words
+    lead = "A lead to follow, not a finding: the sealed clusters are not predicted better with it."
+    assert words[words.index("Found, not confirmed") + 1] == lead
+
+
+def test_where_nothing_can_be_tested_the_first_screen_is_described(traffic: Case) -> None:
+    words = plain(traffic, effects=[], verdict="not_testable")
+    assert words[words.index("What one would look at first") + 1].startswith("A description of")
+
+
+def test_a_network_is_told_to_hide_effects(traffic: Case) -> None:
+    case = deepcopy(traffic)
+    options = {"name": "n2", "term": "network_speed", "hidden": 2, "v0": 30.0, "box": None}
+    case.found.base = build_model({**options, "leader": "measured"})
+    words = plain(case)
+    assert any(text.startswith("**The model is a network.**") for text in words)
+    assert any("weights of the network are in the checkpoint alone" in text for text in words)
+
+
+def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> None:
+    case = deepcopy(traffic)
+    people = {case.inputs.sequences[0].name: [0.1, 0.0, -0.1, 0.0]}
+    add_effects(case.found.extended, [{"name": "driver_heterogeneity", "people": people}])
+    (own,) = case.found.diagnosis.agents
+    words = plain(case, agents=[replace(own, named=True, reason="")])
+    assert any("driver_heterogeneity has a number for every agent" in text for text in words)
+    assert any("with numbers from its first part" in text for text in words)
+    assert any("for all others it does not act" in text for text in words)
+
+
+def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
+    found = deepcopy(traffic.found)
+    names = [traffic.inputs.sequences[i].name for i in found.sealed]
+    rows = [{"name": names[0], "before": 5.0, "after": 4.5},
+            {"name": names[1], "before": 4.0, "after": 1.0}]  # fmt: skip
+    found.diagnosis = replace(found.diagnosis, sealed=rows)
+    chosen = telling(found, traffic.inputs.sequences)
+    assert chosen is not None
+    assert chosen.name == names[1]
+    found.diagnosis = replace(found.diagnosis, effects=[])
+    chosen = telling(found, traffic.inputs.sequences)
+    assert chosen is not None
+    assert chosen.name == names[0]

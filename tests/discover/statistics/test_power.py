@@ -1,0 +1,97 @@
+"""With what probability an effect is named: against simulations of all that comes in a search."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nnode.data.clusters import better
+from nnode.discover.judge.confirm import LEVEL
+from nnode.discover.name.search import BETTER
+from nnode.discover.residuals.fit import Fit, sums
+from nnode.discover.statistics.paired import compare, gains, heldout
+from nnode.discover.statistics.power import RUNS, Way
+from nnode.discover.statistics.score import Score, Screen, Trace
+from nnode.models import System
+from nnode.models.effects import Probe
+from nnode.models.effects.following import RelativeSpeed
+
+OPEN, EACH, ALPHA = 30, 12, 0.05
+
+#: What one parameter of a model and the effect do to the residuals of open and sealed clusters.
+RNG = np.random.default_rng(8)
+LABEL = np.repeat(np.arange(OPEN), EACH)
+ROWS = np.arange(OPEN * EACH).reshape(OPEN, EACH)
+PARAMETER, EFFECT = RNG.normal(size=(2, OPEN * EACH))
+KNOWN = RNG.uniform(0.5, 1.5, OPEN)[LABEL]
+
+
+def drawn(rng: np.random.Generator, label: np.ndarray) -> np.ndarray:
+    """Errors that depend on each other within a cluster."""
+    size = rng.normal(size=int(label.max()) + 1)
+    return np.asarray(rng.normal(size=len(label)) + 0.4 * size[label])
+
+
+def fitted(columns: np.ndarray, residual: np.ndarray) -> Fit:
+    """The least squares of a linear model whose residuals at zero are given."""
+    row = -np.linalg.lstsq(columns, residual, rcond=None)[0]
+    names = [f"p{i}" for i in range(len(row))]
+    free = np.ones(len(row), dtype=bool)
+    return Fit(System([]), names, row, residual + columns @ row, columns, free)
+
+
+def scored(residual: np.ndarray, seed: int = 0) -> tuple[Fit, Screen, Score]:
+    """The score of the effect in open clusters."""
+    fit = fitted((PARAMETER * KNOWN)[:, None], residual)
+    screen = Screen(fit, LABEL, seed, flips=499)
+    probe = Probe({}, {"kappa": 0.05})
+    (score,) = screen.scores([Trace(RelativeSpeed, [probe], (EFFECT * KNOWN)[:, None])])
+    return fit, screen, score
+
+
+def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
+    """One search on fresh clusters in which the effect has a size."""
+    fit, _, score = scored(drawn(rng, LABEL) - size * EFFECT * KNOWN)
+    columns = np.stack([PARAMETER, EFFECT], 1) * KNOWN[:, None]
+    wider = fitted(columns, fit.residual - fit.jacobian @ fit.row)
+    test = compare(heldout(fit, LABEL), heldout(wider, LABEL))
+    low, high = wider.intervals(LABEL)[1]
+    if score.p_value > ALPHA or test.p_value >= BETTER or low <= 0 <= high:
+        return False
+    # sealed clusters are like the open ones
+    picked = ROWS[rng.integers(0, OPEN, sealed)].ravel()
+    label = np.repeat(np.arange(sealed), EACH)
+    there = drawn(rng, label) - size * columns[picked, 1]
+    before = sums((there + columns[picked, 0] * fit.row[0]) ** 2, label)
+    after = sums((there + columns[picked] @ wider.row) ** 2, label)
+    return better(gains(before, after)) <= LEVEL
+
+
+@pytest.mark.parametrize(("size", "sealed"), [(0.25, 5), (0.4, 16)])
+def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> None:
+    rng = np.random.default_rng(1)
+    often = np.mean([is_named(rng, size, sealed) for _ in range(RUNS)])
+    # the power is judged from residuals in which nothing is hidden, of other data each time
+    powers = []
+    for seed in range(40):
+        _, screen, score = scored(drawn(rng, LABEL), seed)
+        way = Way(screen, ALPHA, BETTER, sealed, LEVEL)
+        powers.append(way.power(score, score.evidence[0], size, seed))
+    error = np.sqrt(often * (1 - often) / RUNS + np.var(powers, ddof=1) / len(powers))
+    assert 0.05 < often < 0.95
+    assert abs(np.mean(powers) - often) < 3 * error
+
+
+def test_four_sealed_clusters_leave_no_power() -> None:
+    _, screen, score = scored(drawn(np.random.default_rng(2), LABEL))
+    one, many = (Way(screen, ALPHA, BETTER, sealed, LEVEL) for sealed in (4, 5))
+    assert one.power(score, score.evidence[0], 3.0) == 0.0
+    assert one.detectable(score, score.evidence[0], 1.0) == np.inf
+    assert many.power(score, score.evidence[0], 3.0) == 1.0
+
+
+def test_the_detectable_size_is_found_with_the_power_that_is_asked_for() -> None:
+    _, screen, score = scored(drawn(np.random.default_rng(3), LABEL))
+    way = Way(screen, ALPHA, BETTER, 8, LEVEL)
+    size = way.detectable(score, score.evidence[0], 0.3)
+    assert way.power(score, score.evidence[0], size, seed=5) == pytest.approx(0.8, abs=0.08)
