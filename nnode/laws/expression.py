@@ -123,11 +123,6 @@ class Expr:
         """Whether this is a number, or that number."""
         return self.op == "const" and (value is None or self.value == value)
 
-    def __repr__(self) -> str:
-        from nnode.laws.text import plain
-
-        return plain(self)
-
     def __reduce__(self) -> Any:
         return _made, (self.op, self.args, self.value)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from nnode.errors import ConfigError
 from nnode.laws.expression import Expr, below
+from nnode.laws.text import plain
 
 Dimension = tuple[Fraction, Fraction, Fraction]
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
@@ -96,7 +97,7 @@ def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
     """
     found, expected = unit_of(node, units), dimension(wanted)
     if found is not None and expected is not None and found != expected and not _zero(node):
-        raise ConfigError(f"{name} = {node!r} has the unit {shown(found)}, expected {wanted}")
+        raise ConfigError(f"{name} = {plain(node)} has the unit {shown(found)}, expected {wanted}")
 
 
 def _zero(node: Expr) -> bool:
@@ -128,8 +129,9 @@ def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Di
             own = of[0]
             return own and (factor * own[0], factor * own[1], factor * own[2])
     if of[0] not in (None, NONE):
+        argument = plain(part.args[0])
         raise ConfigError(
-            f"{part!r}: the argument {part.args[0]!r} of {part.op} has the unit {shown(of[0])}, "
+            f"{plain(part)}: the argument {argument} of {part.op} has the unit {shown(of[0])}, "
             "expected a number without one; divide by a scale of the same unit"
         )
     return NONE
@@ -140,7 +142,7 @@ def _same(part: Expr, pairs: list[tuple[Expr, Dimension | None]]) -> Dimension |
     for a, own in known[1:]:
         if own != known[0][1]:
             raise ConfigError(
-                f"{part!r} puts together {known[0][0]!r}, which has the unit "
-                f"{shown(known[0][1])}, and {a!r}, which has the unit {shown(own)}"
+                f"{plain(part)} puts together {plain(known[0][0])}, which has the unit "
+                f"{shown(known[0][1])}, and {plain(a)}, which has the unit {shown(own)}"
             )
     return known[0][1] if known else (None if any(o is None for _, o in pairs) else NONE)

@@ -18,6 +18,7 @@ from nnode.laws.differentiate import pull
 from nnode.laws.expression import Expr, apply, const, symbol
 from nnode.laws.lane import Lane
 from nnode.laws.tensors import SAFE
+from nnode.laws.text import plain
 from nnode.simulate.lane_templates import HEAD, RESPONSE, SIMULATE
 from nnode.simulate.loops import Loop
 
@@ -143,8 +144,8 @@ class LaneSource:
             f"_{row} = np.uint64({i * self.stride})\n" for i, row in enumerate(self.rows)
         )
         weights, times = TABLEAUS[self.method]
-        formula = "\n".join(f"d{s}/dt = {rate!r}" for s, rate in self.lane.rates.items())
-        formula += f"\nleader: {self.lane.leader!r}"
+        formula = "\n".join(f"d{s}/dt = {plain(rate)}" for s, rate in self.lane.rates.items())
+        formula += f"\nleader: {plain(self.lane.leader)}"
         head = HEAD.format(
             formula=formula, stride=self.stride, states=len(self.states),
             rows=len(self.rows), places=places, weights=weights, times=times,
