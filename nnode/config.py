@@ -36,6 +36,7 @@ from nnode.data.options import (
 )
 from nnode.discover.options import DiscoverOptions
 from nnode.models.options import (
+    FormulaOptions,
     LawOptions,
     NetworkForceOptions,
     NetworkSpeedOptions,
@@ -123,6 +124,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "discover_schema"): DiscoverConfig,
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
+    ("model", "formula_schema"): FormulaOptions(term="formula"),
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),
     ("model", "network_force_schema"): NetworkForceOptions(term="network_force"),

@@ -29,6 +29,11 @@ def check_model(system: System) -> None:
     Raises:
         ConfigError: names the term and what to do.
     """
+    if system.domain == "traffic" and system.order > 1:
+        raise ConfigError(
+            "the diagnosis of lanes simulates laws of first order, and this one says an "
+            "acceleration; it can be trained and evaluated, but not yet diagnosed"
+        )
     for term in system.terms if system.domain == "crowd" else ():
         if term.memory:
             raise ConfigError(

@@ -11,6 +11,7 @@ gap, gap_1      m       x_1 - x, x_2 - x_1
 dv              m/s     v - v_1
 dx_1            m/s     the speed of the vehicle ahead, as the whole model makes it
 t, clock        s       time since the first sample, and time of the day
+length_1        m       length of the vehicle ahead; 0 where no length is known
 second          1       1 where there is a second vehicle ahead
 measured        m/s     measured speed, for a leader
 W               m/s(²)  what the law and the effects before say
@@ -33,7 +34,7 @@ from nnode.laws.units import check
 UNITS = {
     "x": "m", "x_1": "m", "x_2": "m", "gap": "m", "gap_1": "m",
     "v": "m/s", "v_1": "m/s", "v_2": "m/s", "dv": "m/s", "dx_1": "m/s", "measured": "m/s",
-    "t": "s", "clock": "s", "second": "1",
+    "length_1": "m", "t": "s", "clock": "s", "second": "1",
 }  # fmt: skip
 #: Of these the others are made.
 _MADE = {
@@ -110,6 +111,8 @@ class Lane:
     def flat(self) -> Lane:
         """With everything that is made of other quantities written out."""
         made = {**_MADE, "clock": symbol("start") + symbol("t"), **self.fixed}
+        if self.order > 1:
+            made["dx_1"] = symbol("v_1")
         rates = {state: substitute(rate, made) for state, rate in self.rates.items()}
         return replace(self, rates=rates, leader=substitute(self.leader, made))
 

@@ -68,13 +68,19 @@ def _of_quantity(quantity: Any) -> Dimension:
 
 
 def shown(found: Dimension) -> str:
-    """A dimension as a unit."""
-    parts = [
-        name + ("" if power == 1 else f"^{power}")
-        for name, power in zip(_NAMES, found, strict=True)
-        if power
-    ]
-    return " ".join(parts) or "1"
+    """A dimension as a unit, such as m/s²."""
+    order = sorted(zip(_NAMES, found, strict=True), key=lambda one: one[0] != "kg")
+    over = [_raised(name, power) for name, power in order if power > 0]
+    under = [_raised(name, -power) for name, power in order if power < 0]
+    top = " ".join(over) or "1"
+    if not under:
+        return top
+    return f"{top}/{under[0]}" if len(under) == 1 else f"{top}/({' '.join(under)})"
+
+
+def _raised(name: str, power: Fraction) -> str:
+    whole = {1: "", 2: "²", 3: "³"}
+    return name + (whole[int(power)] if power in whole else f"^{float(power):g}")
 
 
 def unit_of(node: Expr, units: Mapping[str, str]) -> Dimension | None:

@@ -14,6 +14,7 @@ from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import VARIABLE, load_own
+from nnode.models.own_law import law_from
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
 
@@ -35,6 +36,17 @@ def _lin(options: Options, generator: torch.Generator) -> System:
 
 def _log(options: Options, generator: torch.Generator) -> System:
     return _traffic(Logarithmic(options["v0"], options["L"], options["L_min"]), options)
+
+
+def _formula(options: Options, generator: torch.Generator) -> System:
+    law = law_from(str(options["name"]), options["law"])
+    leader = str(getattr(options["leader"], "value", options["leader"]))
+    if leader == "constant" and law.order == 1 and "v0" not in law.scalars:
+        raise ConfigError(
+            "model.leader=constant needs a law with a parameter v0, the speed of the first "
+            "vehicle; name one, or take model.leader=measured"
+        )
+    return Traffic([law], leader=leader)
 
 
 def _network_speed(options: Options, generator: torch.Generator) -> System:
@@ -80,6 +92,7 @@ def _network_force(options: Options, generator: torch.Generator) -> System:
 MODELS: dict[str, Callable[[Options, torch.Generator], System]] = {
     "lin": _lin,
     "log": _log,
+    "formula": _formula,
     "network_speed": _network_speed,
     "social_force": _social_force,
     "network_force": _network_force,

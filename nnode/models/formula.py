@@ -11,15 +11,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nnode.laws.expression import Expr, symbol
+from nnode.laws.expression import Expr, substitute, symbol
 from nnode.laws.lane import Lane, Rule, changed
-from nnode.laws.tensors import Code, LaneRates
+from nnode.laws.tensors import Code, LaneRates, computed
 from nnode.models.scene import Scene
 from nnode.models.term import State, Term
 
 
 class Law(Term):
-    """A term that others change."""
+    """A term that others change.
+
+    Attributes:
+        order: 1: it says a speed; 2: an acceleration.
+    """
+
+    order = 1
 
     @property
     def speaks(self) -> bool:
@@ -34,10 +40,23 @@ class Law(Term):
         """Its formula, by symbols that begin with the owner's name."""
         raise NotImplementedError  # pragma: no cover - every law defines its own
 
+    def speed(self, gap: Tensor) -> Tensor:
+        """Speed, m/s, at a gap, m, elementwise: of a law of second order that in equilibrium."""
+        raise NotImplementedError  # pragma: no cover - every law defines its own
+
+    def evaluated(self, values: Mapping[str, Tensor]) -> Tensor:
+        """What its formula says of the quantities in it."""
+        lane = lane_of([self])
+        assert lane is not None, "a law without a formula defines its speed"
+        own = dict(zip(lane.owned, values_of(lane, own_values([self], lane)), strict=True))
+        return computed([substitute(lane.law, lane.fixed)], {**own, **values})[0]
+
 
 def rule_of(term: Term) -> Rule | None:
     """What a term says of itself; None where its class, or one between it and the one that says
     so, is code of its own."""
+    if "rule" in vars(term):
+        return term.rule
     for kind in type(term).__mro__:
         if "rule" in vars(kind):
             return kind.rule  # type: ignore[attr-defined]
@@ -85,10 +104,18 @@ def with_effect(lane: Lane, term: Term, owner: str, place: int) -> Lane:
 
 def inputs_of(terms: Sequence[Any], lane: Lane, scene: Scene) -> dict[str, Tensor]:
     """Symbol to ``(B, N)`` values of what vehicles have from the data, for a lane's formula."""
-    found = {}
+    found = {"length_1": _length_ahead(scene)} if "length_1" in lane.symbols else {}
     for name, (place, part) in lane.inputs.items():
         found[name] = terms[place].inputs(scene)[part]
     return found
+
+
+def _length_ahead(scene: Scene) -> Tensor:
+    """``(B, N)`` m; the mean of those that are known where it is not, 0 where none is."""
+    known = torch.isfinite(scene.length)
+    mean = torch.where(known, scene.length, 0.0).sum() / known.sum().clamp(min=1)
+    length = torch.where(known, scene.length, mean)
+    return torch.cat([length[:, 1:], torch.zeros_like(length[:, :1])], 1)
 
 
 def values_of(lane: Lane, parameters: Mapping[str, Tensor]) -> list[Tensor]:

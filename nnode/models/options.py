@@ -37,6 +37,15 @@ class LawOptions(ModelOptions):
 
 
 @dataclass
+class FormulaOptions(ModelOptions):
+    """IDM and others, and laws of one's own: a formula with its parameters and units."""
+
+    leader: Leader = Leader.measured
+    # {parameters: {v0: 30 m/s, ...}, where: {...}, rate: {v: "..."}, source: ...}
+    law: Any = MISSING
+
+
+@dataclass
 class NetworkSpeedOptions(ModelOptions):
     """N2, N4, N10: speed as a network of the gap."""
 

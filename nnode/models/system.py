@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.laws.lane import Lane
-from nnode.models.formula import lane_of, rates_of
+from nnode.models.formula import Law, lane_of, rates_of
 from nnode.models.scene import Scene
 from nnode.models.term import Interval, State, Term, physical_parameters, short_names
 
@@ -125,7 +125,7 @@ class System(nn.Module):
 
 
 class Traffic(System):
-    """First order, one lane: dx_i/dt is the sum of the terms.
+    """One lane: dx_i/dt is the sum of the terms, or dv_i/dt where the law says an acceleration.
 
     Args:
         leader: ``constant``: the leader drives at its law's v0; ``measured``: it follows its
@@ -141,6 +141,8 @@ class Traffic(System):
         if leader not in ("constant", "measured"):
             raise ValueError(f"leader={leader} is unknown, expected constant or measured")
         self.leader = leader
+        first = self.terms[0] if len(self.terms) else None
+        self.order = first.order if isinstance(first, Law) else 1
 
     @property
     def lane(self) -> Lane | None:
@@ -153,16 +155,23 @@ class Traffic(System):
 
     def rates_behind(self, t: Tensor, y: Tensor, scene: Scene, place: Tensor | None) -> Tensor:
         """The right-hand side where the leader's ``place`` (m) is given, if it is measured."""
-        x, memory = y[..., :1], y[..., 1:]
         lead = scene.leader[..., None]
         if place is not None:
-            x = torch.where(lead, place, x)
-        # a law alone is what it computes anyway
-        lane = self.lane if len(self.terms) > 1 else None
+            measured = [place, scene.measured_rate_at(t)][: self.order]
+            y = torch.cat(
+                [
+                    torch.where(lead, torch.cat(measured, -1), y[..., : self.order]),
+                    y[..., self.order :],
+                ],
+                -1,
+            )
+        # a law that is a class of its own is what it computes anyway
+        alone = len(self.terms) == 1 and "rule" not in vars(self.terms[0])
+        lane = None if alone else self.lane
         if lane is not None:
-            y = torch.cat([x, memory], -1)
             rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
             return rate if place is None else rate.masked_fill(lead, 0.0)
+        x, memory = y[..., :1], y[..., 1:]
         rate, own = self._rates(State(t, x, None, scene), memory)
         if place is not None:
             # the leader's state is never read: its place is known at every time
@@ -177,12 +186,12 @@ class Traffic(System):
         return torch.where(state.scene.leader[..., None], speed, rate)
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
-        x = y[..., :1]
+        x, v = y[..., :1], y[..., 1:2] if self.order > 1 else None
         if self.leader == "constant":
-            return x, None
+            return x, v
         number = batch.agent.sum(1)
-        lead = torch.arange(y.shape[2], device=y.device) == (number - 1)[:, None]
-        return torch.where(lead[..., None], batch.x, x), None
+        lead = (torch.arange(y.shape[2], device=y.device) == (number - 1)[:, None])[..., None]
+        return torch.where(lead, batch.x, x), None if v is None else torch.where(lead, batch.v, v)
 
 
 class Crowd(System):

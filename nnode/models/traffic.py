@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nnode.laws.expression import Expr, apply, call, substitute, symbol
+from nnode.laws.expression import Expr, apply, call, symbol
 from nnode.laws.lane import Lane, Rule, begun, of_rule
-from nnode.laws.tensors import Code, computed
-from nnode.models.formula import Law, lane_of, own_values, parameters_of, rule_of, values_of
+from nnode.laws.tensors import Code
+from nnode.models.formula import Law, parameters_of, rule_of
 from nnode.models.network import FeedForward
 from nnode.models.term import Interval, State
 
@@ -52,11 +52,7 @@ class FollowTheLeader(Law):
 
     def speed(self, gap: Tensor) -> Tensor:
         """W: gap in m to speed in m/s, elementwise."""
-        lane = lane_of([self])
-        assert lane is not None, "a law without a formula defines its speed"
-        own = dict(zip(lane.owned, values_of(lane, own_values([self], lane)), strict=True))
-        found: Tensor = computed([substitute(lane.law, lane.fixed)], {**own, "gap": gap})[0]
-        return found
+        return self.evaluated({"gap": gap})
 
     def forward(self, state: State) -> Tensor:
         x, scene = state.x[..., 0], state.scene

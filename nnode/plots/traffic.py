@@ -15,8 +15,9 @@ from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
-from nnode.models import FollowTheLeader, System
+from nnode.models import System
 from nnode.models.extend import beside
+from nnode.models.formula import Law
 from nnode.plots.style import (
     GREY,
     OKABE_ITO,
@@ -37,13 +38,13 @@ SAMPLES = 481
 BINS = 48
 
 
-def follow_law(system: System, name: str = "model") -> FollowTheLeader:
+def follow_law(system: System, name: str = "model") -> Law:
     """The first follow-the-leader law among the terms of ``system``.
 
     Raises:
         ConfigError: there is none.
     """
-    law = system.find(FollowTheLeader)
+    law = system.find(Law)
     if law is None:
         raise ConfigError(
             f"{name}: a speed curve needs a traffic model with a law of the gap, found a "
@@ -88,7 +89,8 @@ def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
     columns = {}
     for name, system in models.items():
         law = follow_law(system, name)
-        speed = law.speed(torch.tensor(gaps, dtype=law.v0.dtype, device=law.v0.device))
+        like = next(law.parameters())
+        speed = law.speed(torch.tensor(gaps, dtype=like.dtype, device=like.device))
         columns[name] = speed.double().cpu().numpy()
     return pd.DataFrame(columns, index=pd.Index(gaps, name="gap"))
 
@@ -121,9 +123,9 @@ def speed_curves(
         raise ConfigError(f"span must be two gaps in m with 0 < low < high, got {span}")
     table = curve_table(models, np.linspace(low, high, SAMPLES))
     leaders = {
-        name: float(follow_law(system).v0.detach())
+        name: float(follow_law(system).get_parameter("v0").detach())
         for name, system in models.items()
-        if getattr(system, "leader", "constant") == "constant"
+        if getattr(system, "leader", "constant") == "constant" and system.order == 1
     }
     if gaps is None:
         figure = new_figure(6.4, 4.0)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from nnode.laws.differentiate import pull
-from nnode.laws.expression import Expr, apply, const, symbol
+from nnode.laws.expression import Expr, apply, const, symbol, symbols
 from nnode.laws.lane import Lane
 from nnode.laws.tensors import SAFE
 from nnode.laws.text import plain
@@ -25,6 +25,7 @@ from nnode.simulate.loops import Loop
 #: Weights and times of the stages of a method.
 TABLEAUS = {
     "euler": ((1.0,), (0.0,)),
+    "ballistic": ((1.0,), (0.0,)),
     "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0)),
 }
 
@@ -35,7 +36,7 @@ class LaneSource:
 
     Attributes:
         lane: flat.
-        method: ``euler`` or ``rk4``.
+        method: ``euler``, ``ballistic`` or ``rk4``.
         own: whether every simulation has parameters of its own.
         stride: numbers between two rows.
     """
@@ -67,12 +68,23 @@ class LaneSource:
     @cached_property
     def fields(self) -> list[str]:
         """What vehicles have from the data."""
-        return [name for name in [*self.lane.inputs, "start"] if name in self.lane.symbols]
+        return [
+            name for name in [*self.lane.inputs, "start", "length_1"] if name in self.lane.symbols
+        ]
 
     @cached_property
     def measured(self) -> bool:
         """Whether the measured speed of leaders is needed."""
         return "measured" in self.lane.symbols or self.recursive
+
+    @cached_property
+    def rates(self) -> dict[str, Expr]:
+        """State to its rate in a step of the method."""
+        rates = dict(self.lane.rates)
+        if self.method == "ballistic" and self.lane.order > 1:
+            # the speed in the middle of the step
+            rates["x"] = rates["x"] + 0.5 * symbol("dt") * rates["v"]
+        return rates
 
     @cached_property
     def inputs(self) -> list[str]:
@@ -91,7 +103,7 @@ class LaneSource:
         """Row to formula of everybody but the first row."""
         behind, move = symbol("behind"), symbol("move")
         speed, found = self._leader(), {}
-        for s, rate in self.lane.rates.items():
+        for s, rate in self.rates.items():
             every = apply("choose", behind, rate, speed if s == "x" else const(0))
             if self.recursive and s == "x":
                 found["R"] = every
@@ -160,7 +172,7 @@ class LaneSource:
     def _pieces(self) -> dict[str, str]:
         return {
             "measured": str(self.measured),
-            "recursive": str(self.recursive),
+            "speeds": str(self.lane.order > 1),
             "own": str(self.own),
             "parameters": str(len(self.parameters)),
             "fields": _lines(
@@ -215,13 +227,16 @@ class LaneSource:
         rows = {f"A_{s}": s for s in self.states}
         rows |= {f"D_{i}": i for i in self.inputs if i not in self.states}
         grads = {f"G_{p}": p for p in self.parameters} if self.own else {}
-        kept = [f"A_{s}" for s in self.states] if self.method == "euler" else []
+        kept = [f"A_{s}" for s in self.states] if self.method != "rk4" else []
         onto = [*kept, *grads]
         text = self.loop.pulled("follow_pull", self._seeds(self.follower), {**rows, **grads}, onto)
-        # nothing of the first row depends on states
-        own = {} if kept else {f"A_{s}": s for s in self.states}
+        # of the first row only a leader's own speed can matter
+        mine = [f"A_{s}" for s in self.states if not kept or s in symbols(self.first.values())]
         text += self.loop.pulled(
-            "first_pull", self._seeds(self.first), {**own, **grads}, list(grads)
+            "first_pull",
+            self._seeds(self.first),
+            {**{row: row[2:] for row in mine}, **grads},
+            [*(row for row in mine if row in kept), *grads],
         )
         text += "\n\n@njit(**INLINE)\ndef pull(room, q, t, dt, drives, w, agents, total):\n"
         if self.recursive:

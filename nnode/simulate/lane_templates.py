@@ -62,6 +62,8 @@ def advance_compensated(room, n):
 def leaders(room, path, number, drives, step, per, fraction, low, width, w):
     if drives == 0:
         lead_places(room, path[0], number, step, per, fraction, low, width, w)
+        if {speeds}:
+            lead_places(room[S:], path[1], number, step, per, fraction, low, width, w)
     if {measured}:
         lead_places(room[_measured:], path[1], number, step, per, fraction, low, width, w)
 

@@ -145,7 +145,7 @@ def simulate(
         threads: at most so many threads work on it.
         parameters: the system's parameters by name, each with a leading axis of R runs;
             None makes one run with the system's own.
-        method: ``euler`` or ``rk4``.
+        method: ``euler``, ``ballistic`` or ``rk4``.
 
     Returns:
         ``(K, R, B, N, M)`` states at the samples; it can be differentiated by the parameters

@@ -34,9 +34,9 @@ def test_what_goes_together(text: str, unit: str) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("v0*gap", r"it = v0\*gap has the unit m\^2 s\^-1, expected m/s"),
+        ("v0*gap", r"it = v0\*gap has the unit m²/s, expected m/s"),
         ("exp(gap)", r"exp\(gap\): the argument gap of exp has the unit m.*divide by a scale"),
-        ("v0 + gap", r"v0 \+ gap puts together v0, .*unit m s\^-1, and gap, .*unit m"),
+        ("v0 + gap", r"v0 \+ gap puts together v0, .*unit m/s, and gap, .*unit m"),
         ("v0*(1 - gap)", r"1 - gap puts together 1, .*unit 1, and gap, .*unit m"),
         ("max(v, gap)", r"max\(v, gap\) puts together"),
         ("v**n", r"log\(v\): the argument v"),
@@ -49,7 +49,7 @@ def test_what_does_not(text: str, problem: str) -> None:
 
 
 def test_quantities() -> None:
-    assert in_si("120 km/h") == (pytest.approx(120 / 3.6), "m s^-1")
+    assert in_si("120 km/h") == (pytest.approx(120 / 3.6), "m/s")
     assert in_si("1.5") == (1.5, "1")
     assert dimension("kg/(m s)") == (-1, -1, 1)
     for wrong in ("30 furlongs per", "fast", "os.system('x')"):

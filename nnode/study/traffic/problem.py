@@ -143,7 +143,7 @@ def speeds(system: System) -> list[float]:
     """Speed (m/s) at :data:`GAPS`."""
     law = follow_law(system)
     with torch.no_grad():
-        return law.speed(torch.tensor(GAPS, dtype=law.v0.dtype)).tolist()
+        return law.speed(torch.tensor(GAPS, dtype=next(law.parameters()).dtype)).tolist()
 
 
 def named(cost: EnsembleCost, row: Tensor) -> dict[str, Any]:

@@ -1,0 +1,144 @@
+"""Laws that are one formula: a user's own, and those of the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nnode.errors import ConfigError
+from nnode.laws.expression import symbol
+from nnode.laws.lane import Lane, Rule, of_rule
+from nnode.laws.units import in_si
+from nnode.models.formula import Law, parameters_of
+from nnode.models.term import Interval, State
+
+#: What is 0 where everybody drives at one speed, as far as a law may name it.
+_AT_REST = ("dv", "t", "clock", "x", "x_1", "x_2", "v_2", "length_1", "gap_1", "dx_1", "v", "v_1")
+#: No vehicle is faster, m/s.
+FASTEST = 100.0
+#: What a law's description may say.
+_KEYS = ("parameters", "where", "rate", "source")
+_PARAMETER = ("value", "low", "high")
+
+
+class FormulaLaw(Law):
+    """A law of a lane, written as a formula; of first order if it says dx/dt, of second if dv/dt.
+
+    Args:
+        name: of the law.
+        parameters: name to a quantity with its unit, ``30 m/s``, or to a mapping of ``value``,
+            ``low`` and ``high``.
+        rate: ``{x: formula}``, m/s, or ``{v: formula}``, m/s²; what it may name stands in
+            :mod:`nnode.laws.lane`.
+        where: name to formula of parts.
+        source: where it comes from.
+
+    A leader that drives by itself keeps the speed v0 in a law of first order, which must have
+    such a parameter then, and its first speed in one of second order.
+
+    Raises:
+        ConfigError: what is missing, cannot be read, or has the wrong unit.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Mapping[str, Any],
+        rate: Mapping[str, str],
+        where: Mapping[str, str] | None = None,
+        source: str = "",
+    ) -> None:
+        super().__init__()
+        self.name, self.source = str(name), str(source)  # type: ignore[misc]
+        if not isinstance(rate, Mapping) or list(rate) not in (["x"], ["v"]):
+            raise ConfigError(
+                f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
+                "or v: a formula of an acceleration (second order)"
+            )
+        ((state, text),) = rate.items()
+        self.order = 1 if state == "x" else 2
+        self.formula = str(text)  # type: ignore[misc]
+        parts = {str(k): str(v) for k, v in (where or {}).items()}
+        self.rule = Rule(rate=str(text), where=parts)  # type: ignore[misc]
+        for own, value in parameters.items():
+            self._declare(str(own), value)
+        self.lane(self.name)  # says what is wrong with the formula
+
+    def _declare(self, name: str, given: Any) -> None:
+        if not name.isidentifier() or "__" in name or hasattr(self, name):
+            raise ConfigError(f"model.law.parameters: {name} cannot be the name of a parameter")
+        entry = given if isinstance(given, Mapping) else {"value": given}
+        unknown = sorted(set(entry) - set(_PARAMETER))
+        if unknown or "value" not in entry:
+            raise ConfigError(
+                f"model.law.parameters.{name}={given}: expected a quantity such as 30 m/s, or "
+                "{value: 30 m/s, low: 0 m/s, high: 60 m/s}"
+            )
+        found = {key: in_si(str(value)) for key, value in entry.items()}
+        units = {unit for _, unit in found.values()}
+        if len(units) > 1:
+            raise ConfigError(
+                f"model.law.parameters.{name} has the units {', '.join(sorted(units))}; value, "
+                "low and high need the same kind of unit"
+            )
+        bounds = {key: value for key, (value, _) in found.items() if key != "value"}
+        self.declare(
+            name, found["value"][0], unit=units.pop(), bounds=Interval(**bounds) if bounds else None
+        )
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, self.name, self.order, repr(self.rule), tuple(self.units.items()))
+
+    def lane(self, owner: str) -> Lane:
+        parameters, owned, units = parameters_of(self, owner, 0)
+        leader = symbol("v")
+        if self.order == 1:
+            leader = parameters.get("v0", symbol("measured"))
+        assert self.rule is not None
+        return of_rule(owner, self.rule, self.order, parameters, leader, owned, units)
+
+    def speed(self, gap: Tensor) -> Tensor:
+        """W at a gap (m) where everybody drives at one speed, m/s; the least such speed of an
+        acceleration that is not negative at rest, up to 100 m/s."""
+        zero = torch.zeros_like(gap)
+        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap}
+        if self.order == 1:
+            return self.evaluated(known).expand_as(gap)
+
+        def wants(v: Tensor) -> Tensor:
+            return self.evaluated({**known, "v": v, "v_1": v, "dx_1": v}).expand_as(gap)
+
+        low, high = zero, torch.full_like(gap, FASTEST)
+        for _ in range(60):
+            half = (low + high) / 2
+            faster = wants(half) > 0
+            low, high = torch.where(faster, half, low), torch.where(faster, high, half)
+        return torch.where(wants(zero) > 0, low, zero)
+
+    def forward(self, state: State) -> Tensor:
+        raise ConfigError(
+            f"the law {self.name} is a formula and cannot be mixed with terms that are code"
+        )
+
+
+def law_from(name: str, description: Any) -> FormulaLaw:
+    """A law from its entry in a configuration or a checkpoint.
+
+    Raises:
+        ConfigError: an entry that is missing or unknown, or a formula that cannot be used.
+    """
+    if not isinstance(description, Mapping) or not {"parameters", "rate"} <= set(description):
+        raise ConfigError(
+            "model.law needs parameters and rate, as in {parameters: {v0: 30 m/s, L: 5 m}, "
+            "rate: {x: v0*(1 - L/gap)}}"
+        )
+    unknown = sorted(set(map(str, description)) - set(_KEYS))
+    if unknown:
+        raise ConfigError(
+            f"model.law has the unknown entries {', '.join(unknown)}; there are {', '.join(_KEYS)}"
+        )
+    return FormulaLaw(name, **{str(key): value for key, value in description.items()})
