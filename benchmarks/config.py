@@ -14,9 +14,17 @@ from nnode.calibrate.options import Precision
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`benchmarks.speed.run`."""
 
-    # problems: paper | stress | steps | crowd | people | scale
+    # problems: paper | stress | effects | steps | crowd | people | scale
     shapes: list[str] = field(
-        default_factory=lambda: ["paper", "stress", "steps", "crowd", "people", "scale"]
+        default_factory=lambda: [
+            "paper",
+            "stress",
+            "effects",
+            "steps",
+            "crowd",
+            "people",
+            "scale",
+        ]
     )
     engines: list[str] | None = None  # null times all that cover a problem
     repeats: int = 5  # timings of each, of which the median counts

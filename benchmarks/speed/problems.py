@@ -10,7 +10,7 @@ import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.models import Crowd, NetworkForce, Relaxation, SocialForce, System, Traffic
-from nnode.models.build import MODELS
+from nnode.models.build import MODELS, add_effects
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,26 @@ SHAPES: dict[str, tuple[Shape, ...]] = {
     "steps": tuple(
         Shape("traffic", ("n4",), 34, 4, samples, 100, 0.002) for samples in (1, 3, 10, 30, 100)
     ),
+    # a law, the same with one and three effects, and a law of second order
+    "effects": (Shape("traffic", ("lin", "lin+1", "lin+3", "idm"), 100, 10, 50, 100, 0.002),),
     "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
     # one hall: few enough people for every engine, then as many as cell lists allow
     "people": tuple(_hall(people) for people in (50, 100, 200)),
     "scale": tuple(_hall(people) for people in (500, 1000, 2000, 5000, 10000)),
+}
+
+
+#: What is added to a law, in this order.
+EFFECTS = (
+    {"name": "relative_speed", "kappa": 0.3},
+    {"name": "speed_zone", "alpha": 0.8, "a": 100.0, "b": 300.0},
+    {"name": "multi_anticipation", "c": 0.1},
+)
+#: The Intelligent Driver Model, gaps from front to front (Treiber, Hennecke & Helbing 2000).
+IDM = {
+    "parameters": {"v0": "30 m/s", "T": "1.2 s", "s0": "2 m", "a": "1.3 m/s²", "b": "1.7 m/s²"},
+    "where": {"wish": "s0 + max(v*T + v*dv/(2*sqrt(a*b)), 0)"},
+    "rate": {"v": "a*(1 - (v/v0)**4 - (wish/gap)**2)"},
 }
 
 
@@ -128,13 +144,16 @@ def _system(model: str) -> System:
         return Crowd([Relaxation(), SocialForce(5.0, 30.0, 10.0, B=0.1)])
     if model == "nn":
         return Crowd([Relaxation(), NetworkForce(4, generator=generator)])
+    extra: dict[str, Any]
     if model.startswith("n"):
-        term = "network_speed"
-        extra: dict[str, Any] = {"hidden": int(model[1:]), "box": None}
+        term, extra = "network_speed", {"hidden": int(model[1:]), "box": None}
+    elif model == "idm":
+        term, extra = "formula", {"name": "idm", "law": IDM}
     else:
-        term, extra = model, {"L": 4.0, "L_min": 2.0}
+        term, extra = model.partition("+")[0], {"L": 4.0, "L_min": 2.0}
     system = MODELS[term]({"v0": 18.0, "leader": "constant", **extra}, generator)
     assert isinstance(system, Traffic)
+    add_effects(system, EFFECTS[: int(model.partition("+")[2] or 0)])
     return system
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from nnode.calibrate.cost import Convention, sequence_costs, squared_error
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
+from nnode.laws.lane import Rule
 from nnode.models import FollowTheLeader, Relaxation, System, Traffic
 from nnode.solvers.base import Solver, Trajectory
 
@@ -27,9 +28,10 @@ class FreeFlow(FollowTheLeader):
     name = "free_flow"
     formula = "v0"
     source = "the absence of interaction"
+    rule = Rule(rate="v0")
 
     def speed(self, gap: Tensor) -> Tensor:
-        return self.v0.expand_as(gap)
+        return super().speed(gap).expand_as(gap)
 
 
 @dataclass

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -214,13 +214,17 @@ def call(name: str, *args: Expr) -> Expr:
     return _made("call", args, name)
 
 
-def below(outputs: Iterable[Expr]) -> list[Expr]:
-    """All nodes of formulas, each after what it is made of; in the same order every time."""
+def below(outputs: Iterable[Expr], known: Container[Expr] = ()) -> list[Expr]:
+    """All nodes of formulas, each after what it is made of; in the same order every time.
+
+    Args:
+        known: nodes that are left out, with what only they are made of.
+    """
     found: dict[Expr, None] = {}
     stack = [(node, False) for node in reversed(list(outputs))]
     while stack:
         node, done = stack.pop()
-        if node in found:
+        if node in found or node in known:
             continue
         if done:
             found[node] = None

@@ -77,7 +77,7 @@ class Lane:
         order: 1: ``x`` alone is a state of motion; 2: ``x`` and ``v``.
         rates: state to its rate, of followers; ``x`` first.
         leader: speed of a leader that drives by itself, m/s.
-        law: the law alone.
+        law: the law alone; None: effects cannot name it.
         owned: parameters' symbols to what they are, as the builder named it.
         inputs: what vehicles have from the data, symbol to whose it is.
         units: of all symbols.
@@ -87,7 +87,7 @@ class Lane:
     order: int
     rates: dict[str, Expr]
     leader: Expr
-    law: Expr
+    law: Expr | None
     owned: dict[str, Any]
     inputs: dict[str, Any]
     units: dict[str, str]

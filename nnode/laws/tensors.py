@@ -50,9 +50,7 @@ def computed(
     """
     found: dict[Expr, Tensor] = {} if known is None else known
     like = next(iter(values.values()))
-    for node in below(outputs):
-        if node in found:
-            continue
+    for node in below(outputs, dict(found)):
         if node.op == "const":
             found[node] = torch.tensor(node.value, dtype=like.dtype, device=like.device)
         elif node.op == "symbol":

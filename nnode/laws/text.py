@@ -51,7 +51,7 @@ def _plain(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
         case "const":
             return number(part.value), _ATOM if part.value >= 0 else _SIGN
         case "symbol":
-            return part.value, _ATOM
+            return part.value.replace("__", "."), _ATOM  # a parameter by its address
         case "add" | "sub":
             sign = "+" if part.op == "add" else "-"
             return f"{_in(of[0], _SUM)} {sign} {_in(of[1], _SUM + (part.op == 'sub'))}", _SUM

@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from nnode.laws.expression import Expr, substitute, symbol
-from nnode.laws.lane import Lane, Rule, changed
+from nnode.laws.lane import UNITS, Lane, Rule, changed
 from nnode.laws.tensors import Code, LaneRates, computed
 from nnode.models.scene import Scene
 from nnode.models.term import State, Term
@@ -48,6 +48,7 @@ class Law(Term):
         """What its formula says of the quantities in it."""
         lane = lane_of([self])
         assert lane is not None, "a law without a formula defines its speed"
+        assert lane.law is not None
         own = dict(zip(lane.owned, values_of(lane, own_values([self], lane)), strict=True))
         return computed([substitute(lane.law, lane.fixed)], {**own, **values})[0]
 
@@ -188,22 +189,19 @@ def beyond(term: Term, state: State) -> Tensor:
     assert state.system is not None
     before = torch.zeros_like(state.x) if state.rate is None else state.rate
     law = state.system.terms[0]
-    assert isinstance(law, Law), f"{term.name} needs a model that begins with a law of the gap"
     if rule_of(term) is None:
         raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
     key = (law.shape, term.shape)
     if key not in _BEYOND:
-        alone = law.lane(law.name)
-        alone = replace(
-            alone,
-            rates={**alone.rates, alone.top: symbol("before")},
-            leader=symbol("before"),
-            units={**alone.units, "before": "m/s"},
-        )
+        before_it, units = symbol("before"), {**UNITS, "before": "m/s"}
+        alone = Lane(1, {"x": before_it}, before_it, None, {}, {}, units)
+        if isinstance(law, Law) and law.speaks:
+            own = law.lane(law.name)
+            alone = replace(own, rates=alone.rates, leader=before_it, units={**own.units, **units})
         _BEYOND[key] = with_effect(alone, term, term.name, 1).flat()
     y = state.x if state.memory is None else torch.cat([state.x, state.memory], -1)
     more = {"before": before[..., 0]}
-    found = rates_of([law, term], _BEYOND[key], y, state.t, state.scene, False, more)
+    found = rates_of([cast(Term, law), term], _BEYOND[key], y, state.t, state.scene, False, more)
     followers = state.scene.follower | state.scene.leader
     change = torch.where(followers, found[..., 0] - before[..., 0], 0.0)
     return torch.cat([change[..., None], found[..., 1:]], -1)

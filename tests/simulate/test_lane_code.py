@@ -140,7 +140,7 @@ def test_the_source_can_be_read() -> None:
     model = Traffic([Linear(), RelativeSpeed(kappa=0.2)])
     text = source(model)
     compile(text, "generated", "exec")
-    assert "relative_speed__kappa" in text.split('"""')[1]
+    assert "relative_speed.kappa" in text.split('"""')[1]
 
 
 SCRIPT = """

@@ -23,6 +23,7 @@ FORCE = {
 EFFECTS: dict[str, list[dict[str, Any]]] = {
     "one": [{"name": "relative_speed", "kappa": 0.3}],
     "zone": [{"name": "speed_zone", "alpha": 0.7, "a": 10.0, "b": 40.0}],
+    "both": [{"name": "reaction_delay", "T": 0.4}, {"name": "relative_speed", "kappa": 0.3}],
     "memory": [{"name": "reaction_delay", "T": 0.4}, {"name": "inertia", "tau_v": 0.5}],
 }
 

@@ -1,0 +1,44 @@
+"""What the pages say of formulas holds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from nnode.laws import differentiate, expression, parse, tensors
+from nnode.models import build_model
+from nnode.simulate import loops, source
+
+METHOD = (
+    Path("docs/method.md").read_text("utf-8").split("## A law is one formula")[1].split("\n## ")[0]
+)
+
+
+def test_your_own_law_in_one_line() -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", METHOD, re.S)
+    given = {k: v for k, v in yaml.safe_load(text).items() if k != "defaults"}
+    model = build_model({"term": "formula", "effects": [], **given})
+    values = {name: float(value) for name, (value, _) in model.physical().items()}
+    assert values == pytest.approx({"saturation.v0": 30.0, "saturation.reach": 12.0})
+    gap = torch.tensor([6.0, 12.0], dtype=torch.float64)
+    speed = model.terms[0].speed(gap).detach()  # type: ignore[union-attr, operator]
+    torch.testing.assert_close(speed, 30 * (1 - torch.exp(-gap / 12)), rtol=1e-14, atol=0)
+    assert "saturation.reach" in source(model)  # type: ignore[arg-type]
+
+
+def test_every_function_is_known_everywhere() -> None:
+    operations = set(tensors.OPERATIONS)
+    assert operations == set(loops.OPERATIONS)
+    assert set(expression.UNARY) < operations
+    for name in operations:
+        arguments = {"choose": 3, "max": 2, "min": 2, "add": 2, "sub": 2, "mul": 2}.get(name, 1)
+        args = tuple(expression.symbol(n) for n in "abc"[:arguments])
+        node = expression._made(name, args)
+        assert len(differentiate.slopes(node)) == arguments
+    for name in set(parse.FUNCTIONS) - {"abs", "clip"}:
+        assert name in operations
+        assert name in METHOD
