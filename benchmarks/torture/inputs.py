@@ -15,6 +15,39 @@ NASTY = (
 _TOKEN = re.compile(rb"[^\s,\[\]{}:]+")
 
 
+#: Parts of formulas, and of what is none.
+_PARTS = (
+    "(", ")", "()", "*", "**", "/", "-", "+", ",", ".", "[", "]", "{", "}", "'", '"', ":", ":=",
+    "=", "==", "@", "%", "lambda", "if", "else", "for", "in", "await", "yield", "import", "eval",
+    "__import__", "__class__", "os", "os.system", "exec", "open", "law", "law(gap=gap)", "NN",
+    "gap", "x_2", "v", "t", "exp", "log", "max(", "1e400", "9**9**9", "0", "1j", "0x1F", "True",
+    "None", "...", "\\", "\n", "\x00", "é", "_", "\ud800",
+)  # fmt: skip
+
+
+def damaged_formula(content: bytes, rng: random.Random) -> bytes:
+    """Tokens of a formula repeated, swapped, nested, or strange ones in their place."""
+    tokens = re.findall(r"\w+|\S", content.decode())
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(tokens))
+        match rng.randrange(6):
+            case 0:
+                tokens[at] = rng.choice(_PARTS)
+            case 1:
+                tokens.insert(at, rng.choice(_PARTS))
+            case 2:
+                tokens.insert(at, tokens[rng.randrange(len(tokens))])
+            case 3:
+                other = rng.randrange(len(tokens))
+                tokens[at], tokens[other] = tokens[other], tokens[at]
+            case 4:
+                number = rng.choice((5, 60, 300, 3000))
+                tokens[at] = rng.choice(("(", "-", "exp(")) * number + tokens[at] + ")" * number
+            case _:
+                tokens = tokens[at:] + tokens[:at]
+    return " ".join(tokens).encode("utf-8", "surrogatepass")
+
+
 def damaged_bytes(content: bytes, rng: random.Random) -> bytes:
     """One to three of: flipped bits, cut, inserted, repeated, zeroed, dropped bytes."""
     data = bytearray(content)

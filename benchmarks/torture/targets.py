@@ -16,7 +16,7 @@ import torch
 from scipy.io import savemat
 
 from benchmarks.torture.gadgets import evil_checkpoint, strange_checkpoint
-from benchmarks.torture.inputs import damaged_bytes, damaged_text
+from benchmarks.torture.inputs import damaged_bytes, damaged_formula, damaged_text
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
 from nnode.data.options import JuelichOptions, TableOptions, VehicleTableOptions
@@ -26,10 +26,21 @@ from nnode.data.readers.table import read_table
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
-from nnode.models import build_model
+from nnode.models import Traffic, build_model
+from nnode.models.own_law import law_from
+from nnode.simulate import source
 from nnode.study.runner import KEPT, Task, run_tasks
 
 Damage = Callable[[bytes, random.Random], bytes]
+
+
+#: Accelerations that can be read.
+_FORMULAS = (
+    "a*(1 - (v/v0)**4 - ((s0 + max(v*T + v*dv/(2*sqrt(a*b)), 0))/gap)**2)",
+    "choose(dv, -b*tanh(dv/v0), a*exp(-gap/s0)) - clip(v/T, 0, b)",
+    "(v0*log(max(gap, s0)/s0) - v)/T + softplus(v/v0)*min(a, b)*abs(v)/v0",
+)
+_QUANTITIES = {"v0": "30 m/s", "T": "1.2 s", "s0": "2 m", "a": "1.3 m/s²", "b": "1.7 m/s²"}
 
 
 @dataclass(frozen=True)
@@ -149,6 +160,13 @@ def _read_kept(path: Path) -> None:
     assert found == {"one": {"x": 1.0}} or json.loads(path.read_text())["result"] == found["one"]
 
 
+def _read_formula(path: Path) -> None:
+    """A law and its compiled form, up to the source text."""
+    text = path.read_bytes().decode(errors="replace")
+    model = Traffic([law_from("law", {"parameters": _QUANTITIES, "rate": {"v": text}})])
+    compile(source(model), "law", "exec")
+
+
 def targets(scratch: Path, outside: Path) -> list[Target]:
     """All targets.
 
@@ -194,6 +212,8 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
                lambda data, rng: evil_checkpoint(data, rng, outside), _open_checkpoint),
         Target("checkpoint, values", "values.pt", [checkpoint], strange_checkpoint,
                _open_checkpoint),
+        Target("formula", "law.txt", [text.encode() for text in _FORMULAS], damaged_formula,
+               _read_formula),
         Target("store, manifest", f"manifest/{MANIFEST}", [manifest], damaged_text, _read_store),
         Target("store, table", f"table/{TABLE}", [table], damaged_bytes, _read_store),
         Target("kept result", f"kept/{KEPT}/one.json", [kept], damaged_text, _read_kept),
