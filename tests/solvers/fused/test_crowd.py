@@ -256,7 +256,7 @@ def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_loops_are_vector_code(dtype: type) -> None:
     # losing this makes everything ten times slower and nothing else would tell
-    from tests.solvers.fused.test_generate import PACKED, platform
+    from tests.simulate.test_lane_code import PACKED, platform
 
     if platform.machine() not in PACKED:
         pytest.skip("unknown instruction set")

@@ -1,0 +1,60 @@
+"""What laws, forces and effects there are: ``python -m nnode.laws``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+
+from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
+from nnode.models.effects import CATALOGUE
+from nnode.models.effects.base import Effect
+from nnode.models.formula import rule_of
+from nnode.models.term import Interval, Term
+
+
+def main() -> None:
+    """Print every law, force and effect with formula, units and source."""
+    print("\n".join(lines()))
+
+
+def lines() -> Iterator[str]:
+    """The catalogue, line by line."""
+    yield "Laws of lanes (a law of your own: docs/method.md)"
+    for law in (Linear(), Logarithmic(), NetworkSpeed(4)):
+        yield from _of(law, "dx/dt = ")
+    for domain, title in (("traffic", "Effects in lanes; W is what law and effects before say"),
+                          ("crowd", "Effects in crowds")):  # fmt: skip
+        if domain == "crowd":
+            yield "Forces on people"
+            for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
+                yield from _of(force, "dv/dt = ")
+        yield title
+        for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
+            yield from _of(effect(), "W becomes " if domain == "traffic" else "")
+
+
+def _of(term: Term, left: str) -> Iterator[str]:
+    rule = rule_of(term)
+    written = rule is not None and not isinstance(term, NetworkSpeed)
+    yield f"  {term.name}: {(inspect.getdoc(term) or '').splitlines()[0]}"
+    if rule is None or not written:
+        yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
+    else:
+        yield f"    {left}{rule.rate}" if rule.rate else f"    a leader's W becomes {rule.leader}"
+        for name, (_, rate) in rule.states.items():
+            yield f"    d{name}/dt = {rate}"
+        for name, text in rule.where.items():
+            yield f"    {name} = {text}"
+        for name, (value, unit) in rule.constants.items():
+            yield f"    {name} = {value:g} {unit}"
+        for name, unit in rule.inputs.items():
+            yield f"    {name}: of each vehicle, from the data{'' if unit == '1' else f' ({unit})'}"
+    for name, unit in term.units.items():
+        yield f"    {name}: {'a number' if unit == '1' else unit}{_bounds(term.bounds.get(name))}"
+    yield f"    source: {term.source}"
+
+
+def _bounds(interval: Interval | None) -> str:
+    if interval is None or (interval.low, interval.high) == (-float("inf"), float("inf")):
+        return ""
+    return f", in [{interval.low:g}, {interval.high:g}]"

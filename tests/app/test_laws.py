@@ -1,0 +1,23 @@
+"""The printed catalogue of laws and effects."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from nnode.models.effects import CATALOGUE
+
+
+def test_the_catalogue_is_printed_whole() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "nnode.laws"], capture_output=True, text=True, check=True
+    )
+    for name in ("lin", "log", "network_speed", "social_force", "network_force"):
+        assert f"\n  {name}: " in done.stdout
+    for domain in ("traffic", "crowd"):
+        for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
+            assert f"\n  {effect.name}: " in done.stdout
+            assert effect.source in done.stdout
+    assert "W becomes W + kappa*(dx_1 - W)" in done.stdout
+    assert "dx/dt = v0 - v0*L/gap" in done.stdout
+    assert "\\" not in done.stdout
