@@ -16,7 +16,7 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.laws.lane import Lane
-from nnode.models.formula import inputs_of, values_of
+from nnode.models.formula import inputs_of
 from nnode.models.system import System, Traffic
 from nnode.models.term import Term
 from nnode.simulate import _math, _polynomials, lane_rows
@@ -154,7 +154,7 @@ def simulate(
     dtype = batch.x.dtype
     if parameters is None:
         parameters = {name: p[None] for name, p in system.named_parameters()}
-    q = torch.stack(torch.broadcast_tensors(*values_of(lane, parameters)), -1).to(dtype)
+    q = _row(lane, parameters).to(dtype)
     runs = len(q)
     y0 = starts(system, lane, batch, parameters)
     simulations, agents = y0.shape[2:4]
@@ -166,6 +166,20 @@ def simulate(
     plan = planned(system, lane, batch, substeps, threads, runs, own=own, method=method)
     out: Tensor = _Simulate.apply(plan, y0, q)
     return out.reshape(len(out), batch.n_samples, runs, simulations, agents).permute(1, 2, 3, 4, 0)
+
+
+def _row(lane: Lane, parameters: Mapping[str, Tensor]) -> Tensor:
+    """``(R, P)`` the parameters' symbols, in few operations: each is one more on the way back."""
+    first: dict[str, int] = {}
+    parts, total = [], 0
+    for name, _, axes in lane.owned.values():
+        if name not in first:
+            value = parameters[name]
+            parts.append(value[..., None] if axes is None else value.flatten(value.ndim - axes))
+            first[name], total = total, total + parts[-1].shape[-1]
+    flat = torch.cat(parts, -1)
+    places = [first[name] + place for name, place, _ in lane.owned.values()]
+    return flat if places == list(range(total)) else flat[..., places]
 
 
 def starts(system: System, lane: Lane, batch: Batch, parameters: Mapping[str, Tensor]) -> Tensor:
@@ -212,17 +226,16 @@ def planned(
     def tiled(values: Tensor) -> np.ndarray:
         return np.tile(values.numpy(), (runs,) + (1,) * (values.ndim - 1))
 
-    scene = system.scene(batch)
-    given = {
-        **inputs_of(cast(list[Term], list(system.terms)), lane, scene),
-        "start": batch.start[:, None].expand(-1, agents),
-    }
+    given: dict[str, Tensor] = {}
+    if source.fields:
+        given = inputs_of(cast(list[Term], list(system.terms)), lane, system.scene(batch))
+        given["start"] = batch.start[:, None].expand(-1, agents)
     fields = [tiled(given[name].to(x.dtype)) for name in source.fields]
-    lead = (batch.agent.sum(1) - 1)[None, :, None].expand(samples, -1, 1)
-    path = torch.stack([x[..., 0], batch.v.detach()[..., 0]]).gather(
-        3, lead[None].expand(2, -1, -1, -1)
-    )
-    path = path[..., 0].repeat(1, 1, runs)
+    path = x.new_empty(2, 0, 0)
+    if system.leader == "measured" or source.measured:
+        lead = (batch.agent.sum(1) - 1)[None, None, :, None].expand(2, samples, -1, 1)
+        both = torch.stack([x[..., 0], batch.v.detach()[..., 0]])
+        path = both.gather(3, lead)[..., 0].repeat(1, 1, runs)
     return Plan(
         source=source,
         module=compiled(source),
