@@ -22,6 +22,8 @@ STEP = 0.13
 INTERVAL = 0.1
 #: Fewest samples of a window: four numbers of each coordinate pair go into the start.
 LEAST = 5
+#: Windows are so short that at most this share of the sequences that allow any is shorter.
+LEFT_OUT = 0.1
 #: A wall point further away than r + CUT * B is left out: exp(-CUT) of the force at contact.
 CUT = 11.0
 #: How far a simulated person may stray from the measured path before walls are missed, m.
@@ -107,13 +109,16 @@ class Windows:
         dt = sequences[0].dt
         stride = max(1, round(INTERVAL / dt))
         count = [(item.n_samples + stride - 1) // stride for item in sequences]
-        length = min(max(LEAST + 1, round(window / (stride * dt))), max(count))
-        self.used = [i for i, number in enumerate(count) if number >= length]
-        if length < LEAST:
+        enough = sorted(number for number in count if number >= LEAST)
+        if not enough:
             raise DataError(
                 f"the longest sequence has {max(item.n_samples for item in sequences)} samples "
                 f"of {dt:g} s, a window needs {LEAST * stride}; use longer sequences"
             )
+        # one long sequence among short ones is no reason to leave the short ones out
+        most = enough[int(LEFT_OUT * len(enough))]
+        length = min(max(LEAST + 1, round(window / (stride * dt))), most)
+        self.used = [i for i, number in enumerate(count) if number >= length]
         smoother = Smoother([sequences[i] for i in self.used])
         self.variance = smoother.variance
         self.sub = max(1, int(np.ceil(stride * dt / STEP)))

@@ -50,7 +50,7 @@ def test_sequences_that_cannot_be_smoothed() -> None:
 
 def test_windows_share_the_sequence_and_leave_no_two_samples_in_common() -> None:
     x = np.zeros((100, 3, 2)) + np.arange(100)[:, None, None]
-    short = track(x[:9], "r/short")
+    short = track(x[:4], "r/short")
     windows = Windows([track(x), short], window=1.5)
     assert windows.length == 15
     assert windows.used == [0]
@@ -67,3 +67,10 @@ def test_fast_cameras_are_thinned_out_and_slow_ones_simulated_in_steps() -> None
     assert (slow.length, slow.sub, slow.step) == (6, 2, 0.125)
     with pytest.raises(DataError, match="longer sequences"):
         Windows([track(np.zeros((4, 2, 2)))])
+
+
+def test_one_long_sequence_leaves_no_short_ones_out() -> None:
+    short = [track(np.zeros((8, 2, 2)), f"r/{i}") for i in range(10)]
+    windows = Windows([*short, track(np.zeros((40, 2, 2)), "r/long")])
+    assert windows.length == 8
+    assert windows.used == list(range(11))
