@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.base import Effect
+from nnode.models.field import FIELD
 from nnode.models.formula import rule_of
+from nnode.models.own_law import FormulaLaw, law_from
 from nnode.models.term import Interval, Term
 
 
@@ -22,6 +24,9 @@ def lines() -> Iterator[str]:
     yield "Laws of lanes (a law of your own: docs/method.md)"
     for law in (Linear(), Logarithmic(), NetworkSpeed(4)):
         yield from _of(law, "dx/dt = ")
+    for name, description in FIELD.items():
+        own = law_from(name, description)
+        yield from _of(own, "dx/dt = " if own.order == 1 else "dv/dt = ")
     for domain, title in (("traffic", "Effects in lanes; W is what law and effects before say"),
                           ("crowd", "Effects in crowds")):  # fmt: skip
         if domain == "crowd":
@@ -36,7 +41,8 @@ def lines() -> Iterator[str]:
 def _of(term: Term, left: str) -> Iterator[str]:
     rule = rule_of(term)
     written = rule is not None and not isinstance(term, NetworkSpeed)
-    yield f"  {term.name}: {(inspect.getdoc(term) or '').splitlines()[0]}"
+    about = "" if isinstance(term, FormulaLaw) else (inspect.getdoc(term) or "").splitlines()[0]
+    yield f"  {term.name}: {about}".rstrip()
     if rule is None or not written:
         yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
     else:

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from nnode.data.options import TableOptions
 from nnode.errors import ConfigError
+from nnode.models.field import FIELD
 
 #: Models by the names that ``conf/model`` gives them.
 MODELS: dict[str, dict[str, Any]] = {
@@ -19,6 +20,8 @@ MODELS: dict[str, dict[str, Any]] = {
     "n2": {"term": "network_speed", "hidden": 2},
     "n4": {"term": "network_speed", "hidden": 4},
     "n10": {"term": "network_speed", "hidden": 10},
+    "idm": {"term": "formula", "law": FIELD["idm"]},
+    "formula": {"term": "formula"},
     "sf": {"term": "social_force"},
     "nn": {"term": "network_force"},
 }
@@ -42,7 +45,7 @@ def model_options(model: str | Mapping[str, Any], leader: str) -> dict[str, Any]
     term = str(given.get("term", ""))
     schema = SCHEMAS.get(("model", f"{term}_schema"))
     if schema is None:
-        known = [name.removesuffix("_schema") for group, name in SCHEMAS if group == "model"]
+        known = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
         raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(known)}")
     if hasattr(schema, "leader"):
         given.setdefault("leader", leader)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from nnode.errors import ConfigError
 from nnode.models import Linear, Traffic, build_model
+from nnode.models.field import FIELD
 from nnode.simulate import lanes
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from tests.solvers.fused.compare import difference, gradient, single
@@ -18,7 +18,7 @@ from tests.solvers.fused.compare import difference, gradient, single
 DT = 0.02
 IDM = {
     "term": "formula", "name": "idm", "leader": "measured", "effects": [],
-    "law": OmegaConf.to_container(OmegaConf.load("conf/model/idm.yaml"))["law"],  # type: ignore[call-overload, index]
+    "law": FIELD["idm"],
 }  # fmt: skip
 OWN = {
     "term": "formula", "name": "mine", "leader": "constant", "effects": [],

@@ -32,7 +32,7 @@ def _schemas() -> None:
         (["modle=lin"], "did you mean model"),
         (["trainr.max_epochs=3"], r"did you mean trainer\.max_epochs"),
         (["~trainer.patience"], "cannot be deleted"),
-        (["model=n5"], "expected one of lin, log, n2, n4, n10, nn, sf"),
+        (["model=n5"], "expected one of formula, idm, lin, log, n2, n4, n10, nn, sf"),
         (["model=lin_schema"], "model=lin_schema is unknown"),
         (["model.hidden=3"], "option model.hidden is unknown"),
         (["model=n4", "model.hiden=3"], "did you mean model.hidden"),

@@ -66,7 +66,7 @@ WRONG = [
     # names
     ("train modle=lin", "did you mean model?"),
     ("train model=linn", "did you mean lin?"),
-    ("train model=null", "expected one of lin, log, n2, n4, n10, nn, sf"),
+    ("train model=null", "expected one of formula, idm, lin, log, n2, n4, n10, nn, sf"),
     ("train optimizer=sgd", "expected one of adadelta, adam, cbo, lbfgs"),
     ("train experiment=demo", "did you mean demo_crowd?"),
     ("train experiment=[demo_traffic,paper_traffic]", "expected one of demo_crowd"),
