@@ -284,15 +284,19 @@ def test_the_fused_solver_trains_to_the_same_numbers(
     assert metrics["J"] == pytest.approx(found["fused"]["cost_heldout"], rel=1e-9)
 
 
-@pytest.mark.parametrize("effects", ["[]", "[{name: relative_speed}]"])
+@pytest.mark.parametrize(
+    ("data", "model", "effect"),
+    [("demo_traffic", "lin", "relative_speed"), ("demo_crowd", "nn", "preferred_speed")],
+)
 def test_a_run_without_compiled_code_says_so(
-    script: Script, raw: Path, tmp_path: Path, effects: str
+    script: Script, raw: Path, tmp_path: Path, data: str, model: str, effect: str
 ) -> None:
     done = script(
         "train",
-        "experiment=demo_traffic",
+        f"data={data}",
+        f"model={model}",
         "solver=fused",
-        f"model.effects={effects}",
+        f"model.effects=[{{name: {effect}}}]",
         "trainer.max_epochs=0",
         f"data.source={raw}",
         f"hydra.run.dir={tmp_path}",
@@ -300,9 +304,9 @@ def test_a_run_without_compiled_code_says_so(
     assert done.returncode == 0, done.stderr
     shown = done.stdout + done.stderr
     solver = json.loads((tmp_path / "result.json").read_text())["solver"]
-    if effects == "[]":
+    if data == "demo_traffic":
         assert solver == {"name": "fused", "uncompiled": None}
         assert "batched PyTorch" not in shown
     else:
-        assert solver == {"name": "fused", "uncompiled": "it does not cover relative_speed"}
+        assert solver == {"name": "fused", "uncompiled": f"it does not cover {effect}"}
         assert shown.count("batched PyTorch and not in compiled code") == 1
