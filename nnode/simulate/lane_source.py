@@ -14,12 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from nnode.laws.differentiate import pull
 from nnode.laws.expression import Expr, apply, const, symbol, symbols
 from nnode.laws.lane import Lane
 from nnode.laws.tensors import SAFE
 from nnode.laws.text import plain
-from nnode.simulate.lane_templates import HEAD, RESPONSE, SIMULATE
+from nnode.simulate.lane_templates import HEAD, SIMULATE
 from nnode.simulate.loops import Loop
 
 #: Weights and times of the stages of a method.
@@ -145,7 +144,6 @@ class LaneSource:
         every += [f"{s}_{j}" for s, j in self.ahead]
         every += ["behind", "second", "move", "first_move", "measured", "dx_1", "R", "RBAR"]
         every += self.fields + [f"D_{i}" for i in self.inputs if i not in self.states]
-        every += [f"K_{s}_{i}" for s in ["R", *self.states] for i in self.inputs]
         if self.own:
             every += [*self.parameters, *(f"G_{p}" for p in self.parameters)]
         return every
@@ -164,10 +162,6 @@ class LaneSource:
         )  # fmt: skip
         text = head + self._gather() + self._rates() + self._pull()
         return text + self._own() + SIMULATE.format(**self._pieces())
-
-    def response(self) -> str:
-        """Source of the linear response, to be added to :meth:`text`."""
-        return self._slopes() + RESPONSE.format(**self._pieces())
 
     def _pieces(self) -> dict[str, str]:
         return {
@@ -287,17 +281,6 @@ class LaneSource:
         for i, p in enumerate(self.parameters if self.own else []):
             text += f"    collect(room[_G_{p}:], grad[:, {i}], low, width, w, agents)\n"
         return text + "    return\n"
-
-    def _slopes(self) -> str:
-        """Derivatives of the increments by what they depend on, in rows K."""
-        rows: dict[str, Expr] = {}
-        for row, node in self.follower.items():
-            label = "R" if row == "R" else row[2:]
-            found = pull({node: const(1)}, lambda part: False)
-            bars = {part.value: bar for part, bar in found.items()}
-            for i in self.inputs:
-                rows[f"K_{label}_{i}"] = bars.get(i, const(0))
-        return self.loop.function("slopes", rows)
 
 
 def _lines(depth: int, *lines: str) -> str:

@@ -218,5 +218,3 @@ def backward(
             place(row(room, A, c), grad_out[c, 0], low, width, w)
             take(row(room, A, c), grad_y0[c], low, width, w)
 '''
-
-RESPONSE = ""
