@@ -104,6 +104,14 @@ class Lane:
         return frozenset(symbols([*self.rates.values(), self.leader]))
 
     @cached_property
+    def ahead(self) -> list[tuple[str, int]]:
+        """States of the first and second vehicle ahead that the formulas name, the first ones
+        first: the second is found by way of them."""
+        second = [s for s in self.rates if f"{s}_2" in self.symbols]
+        first = [s for s in self.rates if f"{s}_1" in self.symbols or s in second]
+        return [*((s, 1) for s in first), *((s, 2) for s in second)]
+
+    @cached_property
     def is_formula(self) -> bool:
         """Whether there is no code in it that is no formula."""
         return all(node.op != "call" for node in below(self.rates.values()))

@@ -74,14 +74,15 @@ class LaneRates:
         self.lane, self.states = lane, list(lane.rates)
         self.outputs = list(lane.rates.values())
         parts = below(self.outputs)
-        names = {part.value for part in parts if part.op == "symbol"}
-        self.ahead = [(s, j) for j in (1, 2) for s in self.states if f"{s}_{j}" in names]
         #: nodes that depend on the speed of the vehicle ahead, each after what it is made of
         chain: dict[Expr, None] = {}
         for part in parts:
             if part.value == "dx_1" or any(a in chain for a in part.args):
                 chain[part] = None
-        self.chain = [part for part in chain if part.op != "symbol"]
+        outside = {a for part in chain for a in part.args if a not in chain}
+        #: and those that they need, which are computed for all vehicles at once
+        self.ready = [*below(outside), *(o for o in self.outputs if o not in chain)]
+        self.chain = bool(chain)
 
     def __call__(
         self,
@@ -105,7 +106,7 @@ class LaneRates:
         own = {s: y[..., i] for i, s in enumerate(self.states)}
         second = follower & torch.cat([follower[:, 1:], torch.zeros_like(follower[:, :1])], 1)
         given = {**values, **own, "second": second.to(y.dtype)}
-        for s, j in self.ahead:
+        for s, j in self.lane.ahead:
             before, here = own[s] if j == 1 else given[f"{s}_1"], follower if j == 1 else second
             away = own[s] + (SAFE if s == "x" else 0.0) if j == 1 else before
             if j == 2 and s == "x":
@@ -133,14 +134,9 @@ class LaneRates:
         code: Mapping[str, Code] | None,
     ) -> list[Tensor]:
         """Rates where each one's depends on that of the vehicle ahead."""
-        outside = {
-            a for part in self.chain for a in part.args if a.op != "symbol" or a.value != "dx_1"
-        }
-        ready = [a for a in below(outside) if a not in set(self.chain) and a.value != "dx_1"]
-        every = [*ready, *(o for o in self.outputs if o not in set(self.chain))]
         known: dict[Expr, Tensor] = {}
-        computed(every, given, known, code)
-        wide = {part: known[part].expand_as(follower) for part in every}
+        computed(self.ready, given, known, code)
+        wide = {part: known[part].expand_as(follower) for part in self.ready}
         ahead = speed[:, -1]
         rows: list[list[Tensor]] = []
         for i in range(follower.shape[1] - 1, -1, -1):

@@ -43,8 +43,7 @@ def dimension(unit: str) -> Dimension | None:
         raise ConfigError(f"{unit} is no unit; expected one such as m/s² or kg/(m s)") from error
     if set(found) - set(_BASE):
         raise ConfigError(f"the unit {unit} is not made of metre, second and kilogram")
-    length, time, mass = (Fraction(found.get(b, 0)).limit_denominator(8) for b in _BASE)
-    return length, time, mass
+    return _powers(found)
 
 
 @cache
@@ -56,13 +55,13 @@ def in_si(value: str) -> tuple[float, str]:
     """
     try:
         found = _registry().Quantity(value)
-        return float(found.to_base_units().magnitude), shown(_of_quantity(found))
+        return float(found.to_base_units().magnitude), shown(_powers(found.dimensionality))
     except Exception as error:
         raise ConfigError(f"{value!r} is no quantity; expected one such as 30 m/s") from error
 
 
-def _of_quantity(quantity: Any) -> Dimension:
-    found = quantity.dimensionality
+def _powers(found: Mapping[str, Any]) -> Dimension:
+    """Of metre, second and kilogram."""
     length, time, mass = (Fraction(found.get(b, 0)).limit_denominator(8) for b in _BASE)
     return length, time, mass
 
@@ -102,12 +101,8 @@ def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
         ConfigError: it has not, or its parts do not go together.
     """
     found, expected = unit_of(node, units), dimension(wanted)
-    if found is not None and expected is not None and found != expected and not _zero(node):
+    if found is not None and expected is not None and found != expected and not node.is_number(0):
         raise ConfigError(f"{name} = {plain(node)} has the unit {shown(found)}, expected {wanted}")
-
-
-def _zero(node: Expr) -> bool:
-    return node.is_number(0)
 
 
 def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Dimension | None:
@@ -144,7 +139,7 @@ def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Di
 
 
 def _same(part: Expr, pairs: list[tuple[Expr, Dimension | None]]) -> Dimension | None:
-    known = [(a, own) for a, own in pairs if own is not None and not _zero(a)]
+    known = [(a, own) for a, own in pairs if own is not None and not a.is_number(0)]
     for a, own in known[1:]:
         if own != known[0][1]:
             raise ConfigError(

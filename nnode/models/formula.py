@@ -113,9 +113,7 @@ def inputs_of(terms: Sequence[Any], lane: Lane, scene: Scene) -> dict[str, Tenso
 
 def _length_ahead(scene: Scene) -> Tensor:
     """``(B, N)`` m; the mean of those that are known where it is not, 0 where none is."""
-    known = torch.isfinite(scene.length)
-    mean = torch.where(known, scene.length, 0.0).sum() / known.sum().clamp(min=1)
-    length = torch.where(known, scene.length, mean)
+    length = torch.where(torch.isfinite(scene.length), scene.length, scene.mean_length)
     return torch.cat([length[:, 1:], torch.zeros_like(length[:, :1])], 1)
 
 

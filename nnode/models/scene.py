@@ -106,6 +106,12 @@ class Scene:
         return torch.lerp(before, after, (position - k).clamp(0, 1).to(before.dtype))
 
     @cached_property
+    def mean_length(self) -> Tensor:
+        """Of the agents whose length is known, m; 0 where none is."""
+        known = torch.isfinite(self.length)
+        return torch.where(known, self.length, 0.0).sum() / known.sum().clamp(min=1)
+
+    @cached_property
     def kinds(self) -> dict[str, Tensor]:
         """Class name to ``(B, N)`` True for its agents; empty where no class is known."""
         return self._masks(self.kind)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
@@ -221,3 +222,21 @@ class Crowd(System):
             seen = scene.measured_at(t), scene.measured_rate_at(t)
         rate, own = self._rates(State(t, x, v, scene, seen=seen), memory)
         return torch.cat([v, rate, *own], -1)
+
+
+class _Initial(nn.Module):
+    """The start of a model as a module, so that its parameters can be replaced."""
+
+    def __init__(self, system: System) -> None:
+        super().__init__()
+        self.system = system
+
+    def forward(self, batch: Batch) -> Tensor:
+        return self.system.initial(batch)
+
+
+def initial_with(system: System, parameters: Mapping[str, Tensor], batch: Batch) -> Tensor:
+    """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
+    own = {f"system.{name}": value for name, value in parameters.items()}
+    found: Tensor = functional_call(_Initial(system), own, (batch,))
+    return found

@@ -1,11 +1,11 @@
-"""The compiled simulation of a lane, its exact gradient and its linear response, as source text.
+"""The compiled simulation of a lane and its exact gradient, as source text.
 
 Numba cannot promise the compiler that two arrays do not overlap: all rows of a block therefore lie
 in one array, at distances that are numbers when it is compiled. An increment of a state is
 
     I = move * (the formula where somebody is ahead, the leader's speed elsewhere),
 
-and every step of every method adds increments; gradient and response are made from this formula.
+and every step of every method adds increments; the gradient is made from this formula.
 Where a formula names the speed of the vehicle ahead, vehicles are computed one behind the other.
 """
 
@@ -54,13 +54,6 @@ class LaneSource:
         return list(self.lane.owned)
 
     @cached_property
-    def ahead(self) -> list[tuple[str, int]]:
-        """States of vehicles ahead that the formulas name."""
-        found = [(s, j) for s in self.states for j in (1, 2) if f"{s}_{j}" in self.lane.symbols]
-        # the second one ahead is found by way of the first
-        return found + [(s, 1) for s, j in found if j == 2 and (s, 1) not in found]
-
-    @cached_property
     def recursive(self) -> bool:
         return "dx_1" in self.lane.symbols
 
@@ -88,7 +81,7 @@ class LaneSource:
     @cached_property
     def inputs(self) -> list[str]:
         """Rows that carry derivatives."""
-        ahead = [f"{s}_{j}" for s, j in self.ahead]
+        ahead = [f"{s}_{j}" for s, j in self.lane.ahead]
         return [*self.states, *ahead, *(["dx_1"] if self.recursive else [])]
 
     @cached_property
@@ -139,9 +132,9 @@ class LaneSource:
     def rows(self) -> list[str]:
         """All rows, states first, then what is one after the other for every state."""
         every = list(self.states)
-        for group in ("I", "E", "B", "S", "A", "T", "J", *(f"Y{i}" for i in range(4))):
+        for group in ("I", "E", "B", "S", "A", *(f"Y{i}" for i in range(4))):
             every += [f"{group}_{s}" for s in self.states]
-        every += [f"{s}_{j}" for s, j in self.ahead]
+        every += [f"{s}_{j}" for s, j in self.lane.ahead]
         every += ["behind", "second", "move", "first_move", "measured", "dx_1", "R", "RBAR"]
         every += self.fields + [f"D_{i}" for i in self.inputs if i not in self.states]
         if self.own:
@@ -168,7 +161,6 @@ class LaneSource:
             "measured": str(self.measured),
             "speeds": str(self.lane.order > 1),
             "own": str(self.own),
-            "parameters": str(len(self.parameters)),
             "fields": _lines(
                 2,
                 *(
@@ -183,7 +175,7 @@ class LaneSource:
         """What stands ahead of everybody; something harmless where there is nobody."""
         text = "\n\n@njit(**INLINE)\ndef gather(room, lo, n, w):\n"
         text += f"    zero, safe = real(0, room[0]), real({SAFE!r}, room[0])\n"
-        for s, j in sorted(self.ahead, key=lambda one: one[1]):
+        for s, j in self.lane.ahead:
             own, mask = (s, "behind") if j == 1 else (f"{s}_1", "second")
             text += f"    there = room[_{s} + np.uint64(lo + {j} * w):]\n"
             text += (
@@ -255,7 +247,7 @@ class LaneSource:
     def _ahead_back(self) -> str:
         """Adjoints of states ahead to those whose states they are."""
         text = ""
-        for s, j in sorted(self.ahead, key=lambda one: -one[1]):
+        for s, j in reversed(self.lane.ahead):
             if j == 2:
                 text += (
                     f"    share, other, mask = room[_D_{s}_2:], room[_D_{s}_1:], room[_second:]\n"

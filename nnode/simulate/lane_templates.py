@@ -21,8 +21,7 @@ STATES, ROWS = {states}, {rows}
 WEIGHTS, TIMES = np.array({weights}), np.array({times})
 STAGES = len(WEIGHTS)
 {places}
-X, I, E, B, Z, A, T, J = (np.uint64(i * STATES) * S for i in range(8))
-Y = np.uint64(8 * STATES) * S
+X, I, E, B, Z, A, Y = (np.uint64(i * STATES) * S for i in range(7))
 
 
 @njit(**INLINE)

@@ -10,14 +10,13 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.laws.lane import Lane
 from nnode.models.formula import inputs_of
-from nnode.models.system import System, Traffic
+from nnode.models.system import System, Traffic, initial_with
 from nnode.models.term import Term
 from nnode.simulate import _math, _polynomials, lane_rows
 from nnode.simulate._cache import digest, keep
@@ -160,7 +159,7 @@ def simulate(
     simulations, agents = y0.shape[2:4]
     own = runs > 1 and (agents - 1) * simulations < _ENOUGH
     lanes = runs * simulations
-    y0 = y0.permute(0, 1, 2, 3).reshape(len(lane.rates), lanes, agents)
+    y0 = y0.reshape(len(lane.rates), lanes, agents)
     if own:
         q = q.repeat_interleave(simulations, 0)
     plan = planned(system, lane, batch, substeps, threads, runs, own=own, method=method)
@@ -189,7 +188,7 @@ def starts(system: System, lane: Lane, batch: Batch, parameters: Mapping[str, Te
         y = system.initial(batch)[None].expand(runs, -1, -1, -1)
     else:
         every = [{name: value[r] for name, value in parameters.items()} for r in range(runs)]
-        y = torch.stack([_start(system, batch, own) for own in every])
+        y = torch.stack([initial_with(system, own, batch) for own in every])
     y = y.to(batch.x.dtype).permute(3, 0, 1, 2)
     if isinstance(system, Traffic) and system.leader == "measured":
         last = torch.arange(y.shape[-1]) == (batch.agent.sum(1) - 1)[:, None]
@@ -288,21 +287,3 @@ def _stride(size: int) -> int:
         if size + _BEHIND <= stride:
             return stride
     return size + _BEHIND + 80 - size % 64
-
-
-class _Start(nn.Module):
-    """The start of a model as a module, so that its parameters can be replaced."""
-
-    def __init__(self, system: System) -> None:
-        super().__init__()
-        self.system = system
-
-    def forward(self, batch: Batch) -> Tensor:
-        return self.system.initial(batch)
-
-
-def _start(system: System, batch: Batch, parameters: Mapping[str, Tensor]) -> Tensor:
-    """``(B, N, M)`` states at the start, with other parameters."""
-    own = {f"system.{name}": value for name, value in parameters.items()}
-    found: Tensor = functional_call(_Start(system), own, (batch,))
-    return found

@@ -10,7 +10,7 @@ from torch.func import functional_call, jvp, vmap
 
 from nnode.data.sequence import Batch
 from nnode.discover.residuals.engine import trained
-from nnode.models.system import System
+from nnode.models.system import System, initial_with
 
 
 class Response:
@@ -102,20 +102,4 @@ class Response:
         return found
 
     def _start(self, parameters: dict[str, Tensor]) -> Tensor:
-        found: Tensor = functional_call(_Initial(self.system), _inside(parameters), (self.batch,))
-        return found
-
-
-class _Initial(torch.nn.Module):
-    """The start of a model as a module, so that its parameters can be replaced."""
-
-    def __init__(self, system: System) -> None:
-        super().__init__()
-        self.system = system
-
-    def forward(self, batch: Batch) -> Tensor:
-        return self.system.initial(batch)
-
-
-def _inside(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {f"system.{name}": value for name, value in parameters.items()}
+        return initial_with(self.system, parameters, self.batch)

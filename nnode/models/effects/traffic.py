@@ -202,9 +202,7 @@ class LeaderLength(Effect):
 
     def inputs(self, scene: Scene) -> dict[str, Tensor]:
         length = scene.length
-        known = torch.isfinite(length)
-        mean = torch.where(known, length, 0.0).sum() / known.sum().clamp(min=1)
-        longer = torch.where(known, length - mean, 0.0)
+        longer = torch.where(torch.isfinite(length), length - scene.mean_length, 0.0)
         return {"longer": torch.cat([longer[:, 1:], torch.zeros_like(longer[:, :1])], 1)}
 
     @classmethod
