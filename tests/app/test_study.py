@@ -11,7 +11,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from nnode.app import study
@@ -71,7 +70,6 @@ def test_every_study_composes_in_a_folder_without_time(name: str, kind: type) ->
     check_overrides([f"study={name}", "study.quick=true", "study.workers=3"], CONF, "study")
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("study", [f"study={name}"], return_hydra_config=True)
-        HydraConfig.instance().set_config(config)
         assert config.hydra.run.dir == f"runs/study/{name}"
     assert isinstance(OmegaConf.to_object(config.study), kind)
     assert name in study.STUDIES

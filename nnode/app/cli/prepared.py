@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.choices import own_groups
-from nnode.app.cli.saved import path_given
+from nnode.app.cli.saved import in_hydra, path_given
 from nnode.config import SCHEMAS
 from nnode.data.prepare import NOT_PREPARATION, made_by, refuse_others
 from nnode.data.store import Store
@@ -42,7 +42,7 @@ def with_prepared(config: DictConfig) -> DictConfig:
         DataError: no store in that folder.
     """
     folder = OmegaConf.select(config, "data.prepared")
-    if folder is None or not HydraConfig.initialized():
+    if folder is None or not in_hydra():
         return config
     store = _store(folder)
     made = store.manifest["options"]

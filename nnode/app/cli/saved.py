@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -18,6 +19,11 @@ GROUPS = ("model", "data", "optimizer", "solver")
 _chosen: set[str] = set()
 
 
+def in_hydra() -> bool:
+    """Whether Hydra runs now; a job that has ended leaves its configuration behind."""
+    return HydraConfig.initialized() and GlobalHydra.instance().is_initialized()
+
+
 def plain_config(config: DictConfig) -> dict[str, Any]:
     """The composed configuration in plain types, with the groups it was composed from.
 
@@ -26,7 +32,7 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
     assert isinstance(plain, dict)
     make_absolute(plain.get("data", {}))
-    if not HydraConfig.initialized():
+    if not in_hydra():
         return {str(k): v for k, v in plain.items() if k != "resume"}
     choices = HydraConfig.get().runtime.choices
     groups = {group: str(choices[group]) for group in GROUPS if group in choices}

@@ -11,7 +11,7 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from nnode.app.cli.saved import make_absolute
+from nnode.app.cli.saved import in_hydra, make_absolute
 
 #: Texts of these characters need no quotes, unless they would be read as something else.
 _PLAIN = re.compile(r"[\w./:+-]*", re.ASCII)
@@ -60,7 +60,7 @@ def group_defaults(section: str, group: str) -> dict[str, Any]:
     """
     from nnode.config import SCHEMAS
 
-    if HydraConfig.initialized():
+    if in_hydra():
         name = HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:

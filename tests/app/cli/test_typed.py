@@ -54,6 +54,17 @@ def plain(value: Any) -> Any:
     return getattr(value, "text", value)
 
 
+def test_what_a_job_has_left_behind_is_not_taken() -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        composed = compose("train", ["model=n4", "data=table"], return_hydra_config=True)
+    HydraConfig.instance().set_config(composed)
+    try:
+        assert group_defaults("data", "table")["name"] == "table"
+        assert "groups" not in plain_config(OmegaConf.create({"data": {}}))
+    finally:
+        HydraConfig.instance().cfg = None
+
+
 def test_texts_need_no_quotes_where_they_mean_themselves() -> None:
     assert literal("runs/a_1/x.pt") == "runs/a_1/x.pt"
     assert shell_override("data.path", "runs/x.pt") == "data.path=runs/x.pt"
