@@ -5,6 +5,8 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterator
 
+from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
+from nnode.laws.lane import Rule
 from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.base import Effect
@@ -40,24 +42,35 @@ def lines() -> Iterator[str]:
 
 def _of(term: Term, left: str) -> Iterator[str]:
     rule = rule_of(term)
-    written = rule is not None and not isinstance(term, NetworkSpeed)
+    networks = isinstance(term, NetworkSpeed | NetworkForce)
     about = "" if isinstance(term, FormulaLaw) else (inspect.getdoc(term) or "").splitlines()[0]
     yield f"  {term.name}: {about}".rstrip()
-    if rule is None or not written:
+    if rule is None or networks:
         yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
+    else:
+        yield from _ruled(rule, left)
+    for name, unit in term.units.items():
+        yield f"    {name}: {'a number' if unit == '1' else unit}{_bounds(term.bounds.get(name))}"
+    yield f"    source: {term.source}"
+
+
+def _ruled(rule: Rule | CrowdRule, left: str) -> Iterator[str]:
+    if isinstance(rule, CrowdRule):
+        for axis, text in zip("xy", rule.rate, strict=True):
+            yield f"    dv{axis}/dt: + {text}"
+        for over, what in ((OTHERS, "others"), (POINTS, "wall points"), (WALLS, "walls")):
+            for name, (_, text) in getattr(rule, over).items():
+                yield f"    {name} = sum over {what} of {text}"
     else:
         yield f"    {left}{rule.rate}" if rule.rate else f"    a leader's W becomes {rule.leader}"
         for name, (_, rate) in rule.states.items():
             yield f"    d{name}/dt = {rate}"
-        for name, text in rule.where.items():
-            yield f"    {name} = {text}"
-        for name, (value, unit) in rule.constants.items():
-            yield f"    {name} = {value:g} {unit}"
-        for name, unit in rule.inputs.items():
-            yield f"    {name}: of each vehicle, from the data{'' if unit == '1' else f' ({unit})'}"
-    for name, unit in term.units.items():
-        yield f"    {name}: {'a number' if unit == '1' else unit}{_bounds(term.bounds.get(name))}"
-    yield f"    source: {term.source}"
+    for name, text in rule.where.items():
+        yield f"    {name} = {text}"
+    for name, (value, unit) in rule.constants.items():
+        yield f"    {name} = {value:g} {'' if unit == '1' else unit}".rstrip()
+    for name, unit in rule.inputs.items():
+        yield f"    {name}: of each agent, from the data{'' if unit == '1' else f' ({unit})'}"
 
 
 def _bounds(interval: Interval | None) -> str:

@@ -111,7 +111,7 @@ def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
     )
     if force.walls and not walls:
         found.notes.append("obstacle_scale: 0, the data have no walls")
-    if force.friction_sign < 0 and walls:
+    if force.sign < 0 and walls:
         found.missing.append(
             "opposing_wall_friction: JuPedSim's friction at walls has the opposite sign"
         )

@@ -219,13 +219,13 @@ def changed(
     for part, (unit, _) in rule.states.items():
         names[part] = symbol(f"{name}__{part}")
         every[f"{name}__{part}"] = unit
-    rates = dict(lane.rates)
+    rates, laws = dict(lane.rates), {} if lane.law is None else {"law": lane.law}
     before = {**names, "W": rates[lane.top]}
     for part, formula in rule.where.items():
-        before[part] = names[part] = parse(formula, before, lane.law)
+        before[part] = names[part] = parse(formula, before, laws)
 
     def finished(part: str, text: str, given: Mapping[str, Expr], unit: str) -> Expr:
-        found = parse(text, given, lane.law)
+        found = parse(text, given, laws)
         check(part, found, every, unit)
         return found
 

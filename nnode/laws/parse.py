@@ -2,7 +2,7 @@
 
 The text is data: it is read by Python's own grammar, but only what is listed here is taken, and
 nothing of it is ever run. ``law(gap=...)`` stands for the law itself with other quantities in
-place of its own.
+place of its own; there may be several such names.
 """
 
 from __future__ import annotations
@@ -50,13 +50,15 @@ def _around(text: str, column: int) -> tuple[str, int]:
     return text[first : column + 30].replace("\n", " "), column - first
 
 
-def parse(text: str, names: Mapping[str, Expr] | None = None, law: Expr | None = None) -> Expr:
+def parse(
+    text: str, names: Mapping[str, Expr] | None = None, laws: Mapping[str, Expr] | None = None
+) -> Expr:
     """A formula.
 
     Args:
         text: such as ``v0*(1 - L/gap)``.
         names: what names stand for; None takes every name as a quantity of its own.
-        law: what ``law(...)`` stands for; None: there is none.
+        laws: name to the formula that ``name(...)`` stands for, with other quantities in it.
 
     Raises:
         FormulaError: anything that is no formula, with its place.
@@ -70,12 +72,14 @@ def parse(text: str, names: Mapping[str, Expr] | None = None, law: Expr | None =
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         at = max(int(getattr(error, "offset", 1) or 1) - 1, 0)
         raise FormulaError(text.strip(), at, f"this cannot be read; {_LISTED}") from error
-    return _Reader(text.strip(), names, law).read(tree.body, 0)
+    return _Reader(text.strip(), names, laws or {}).read(tree.body, 0)
 
 
 class _Reader:
-    def __init__(self, text: str, names: Mapping[str, Expr] | None, law: Expr | None) -> None:
-        self.text, self.names, self.law = text, names, law
+    def __init__(
+        self, text: str, names: Mapping[str, Expr] | None, laws: Mapping[str, Expr]
+    ) -> None:
+        self.text, self.names, self.laws = text, names, laws
 
     def fail(self, node: ast.AST, problem: str) -> FormulaError:
         return FormulaError(self.text, getattr(node, "col_offset", 0), problem)
@@ -124,8 +128,8 @@ class _Reader:
         return self.names[node.id]
 
     def call(self, node: ast.Call, name: str, depth: int) -> Expr:
-        if name == "law" and self.law is not None:
-            return self.of_law(node, depth)
+        if name in self.laws:
+            return self.of_law(node, name, depth)
         if name not in FUNCTIONS:
             raise self.fail(node, f"there is no function {name}; {_LISTED}")
         if node.keywords or len(node.args) != FUNCTIONS[name]:
@@ -137,11 +141,10 @@ class _Reader:
             return apply("min", apply("max", args[0], args[1]), args[2])
         return apply(name, *args)
 
-    def of_law(self, node: ast.Call, depth: int) -> Expr:
-        assert self.law is not None
+    def of_law(self, node: ast.Call, name: str, depth: int) -> Expr:
         values: dict[str, Expr] = {}
         if node.args or any(keyword.arg is None for keyword in node.keywords):
-            raise self.fail(node, "law takes what it replaces by name, as law(gap=gap_1)")
+            raise self.fail(node, f"{name} takes what it replaces by name, as {name}(gap=gap_1)")
         for keyword in node.keywords:
             assert keyword.arg is not None
             target = self.names.get(keyword.arg) if self.names is not None else None
@@ -149,4 +152,4 @@ class _Reader:
                 raise self.fail(node, f"{keyword.arg} is made of others and cannot be replaced")
             place = keyword.arg if target is None else target.value
             values[place] = self.read(keyword.value, depth + 1)
-        return substitute(self.law, values)
+        return substitute(self.laws[name], values)

@@ -54,7 +54,8 @@ def _plain(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
             return part.value.replace("__", "."), _ATOM  # a parameter by its address
         case "add" | "sub":
             sign = "+" if part.op == "add" else "-"
-            return f"{_in(of[0], _SUM)} {sign} {_in(of[1], _SUM + (part.op == 'sub'))}", _SUM
+            # what is added as a whole stays in brackets, so that it is read as it was written
+            return f"{_in(of[0], _SUM)} {sign} {_in(of[1], _SUM + 1)}", _SUM
         case "mul":
             if part.args[0] is part.args[1]:
                 return f"{_in(of[0], _ATOM)}**2", _POWER

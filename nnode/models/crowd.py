@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from nnode.laws.crowd import OTHERS, POINTS, SMOOTHING, CrowdLaw, CrowdRule, with_rule
+from nnode.laws.expression import call, symbol
+from nnode.laws.tensors import Code, computed
+from nnode.models.crowd_formula import CrowdBase, formula_of, ruled, settings_of
+from nnode.models.formula import own_values, values_of
 from nnode.models.network import FeedForward
-from nnode.models.term import Interval, State, Term
-
-#: Distances (m) and speeds (m/s) are smoothed at this scale, so that their gradient exists at 0.
-SMOOTHING = 1e-6
+from nnode.models.term import Interval, State
 
 
 def norm(vector: Tensor) -> Tensor:
@@ -39,7 +45,7 @@ def velocity(state: State) -> Tensor:
     return state.v
 
 
-class Relaxation(Term):
+class Relaxation(CrowdBase):
     """Relaxation towards the destination at the present speed.
 
     (v_des - v) / tau with v_des = |v| (x_D - x) / |x_D - x|; tau (s) is fixed.
@@ -48,20 +54,23 @@ class Relaxation(Term):
     name = "relaxation"
     formula = "(|v| (x_D - x) / |x_D - x| - v) / tau"
     source = "Göttlich & Totzeck, equation (relaxation)"
+    rule = CrowdRule(
+        rate=(
+            "((goal_x - x)*(speed/far) - vx)/tau",
+            "((goal_y - y)*(speed/far) - vy)/tau",
+        ),
+        where={"far": "sqrt((goal_x - x)**2 + (goal_y - y)**2 + small_m**2)"},
+        settings={"tau": "s"},
+        drive=True,
+    )
 
     def __init__(self, tau: float = 0.5) -> None:
         super().__init__()
         _positive(tau=tau)
         self.tau = tau
 
-    def forward(self, state: State) -> Tensor:
-        v = velocity(state)
-        way = state.scene.destination - state.x
-        desired = way * (norm(v) / norm(way))[..., None]
-        return (desired - v) / self.tau
 
-
-class InteractionForce(Term):
+class InteractionForce(CrowdBase):
     """Forces between people and from walls, averaged as in the paper.
 
     (1/m) mean over the N people of the pair force + (1/m) mean over the P wall points of the
@@ -118,6 +127,34 @@ class InteractionForce(Term):
     def forward(self, state: State) -> Tensor:
         return sum(self.components(state).values(), torch.zeros_like(state.x))
 
+    def told(self, law: CrowdLaw, owner: str, place: int) -> CrowdLaw:
+        """Its force is code that formulas can call."""
+        seen = [symbol(name) for name in ("dx", "dy", "dvx", "dvy")]
+        known = {f"force_{axis}": call(f"force_{axis}", *seen) for axis in "xy"}
+        mass = f"{owner}__mass"
+        return replace(
+            law,
+            known=law.known | known | {"mass": symbol(mass)},
+            settings=law.settings | {mass: (place, "mass")},
+            units=law.units | {mass: "kg"},
+        )
+
+    def code(self) -> dict[str, Code]:
+        def component(c: int) -> Code:
+            def force(dx: Tensor, dy: Tensor, dvx: Tensor, dvy: Tensor) -> Tensor:
+                return self.pair_force(torch.stack([dx, dy], -1), torch.stack([dvx, dvy], -1))[
+                    ..., c
+                ]
+
+            return force
+
+        return {"force_x": component(0), "force_y": component(1)}
+
+
+def without_walls(rule: CrowdRule) -> CrowdRule:
+    """The forces between people alone."""
+    return replace(rule, rate=("pair_x/(mass*people)", "pair_y/(mass*people)"), points={})
+
 
 class SocialForce(InteractionForce):
     """Helbing and Molnár's social force with contact and sliding friction.
@@ -137,6 +174,26 @@ class SocialForce(InteractionForce):
     Source: Göttlich & Totzeck, equation (InteractionForceHelbing).
     """
 
+    rule = CrowdRule(
+        rate=(
+            "pair_x/(mass*people) + wall_x/(mass*points)",
+            "pair_y/(mass*people) + wall_y/(mass*points)",
+        ),
+        others={"pair_x": ("N", "f_x"), "pair_y": ("N", "f_y")},
+        points={
+            "wall_x": ("N", "f_x(r=r/2, dvx=-sign*vx, dvy=-sign*vy)"),
+            "wall_y": ("N", "f_y(r=r/2, dvx=-sign*vx, dvy=-sign*vy)"),
+        },
+        where={
+            "contact": "max(2*r - d, 0)",
+            "push": "A*exp((2*r - d)/B) + k*contact",
+            "slide": "kappa*contact*(dvx*n_y - dvy*n_x)",
+            "f_x": "push*n_x - slide*n_y",
+            "f_y": "push*n_y + slide*n_x",
+        },
+        settings={"r": "m", "B": "m", "mass": "kg", "sign": "1"},
+        force=("pair_x", "pair_y"),
+    )
     name = "social_force"
     formula = "(A exp((2r - d)/B) + k h(2r - d)) n + kappa h(2r - d) (dv·t) t"
     source = "Göttlich & Totzeck, equation (InteractionForceHelbing); Helbing & Molnár 1995"
@@ -163,24 +220,35 @@ class SocialForce(InteractionForce):
         self.k: Tensor
         self.kappa: Tensor
         self.r, self.B = r, B
-        self.friction_sign = -1.0 if opposing_wall_friction else 1.0
+        self.sign = -1.0 if opposing_wall_friction else 1.0
+        if not walls:
+            self.rule = without_walls(self.rule)
 
-    def _force(self, dx: Tensor, reach: float, slip: Tensor) -> Tensor:
-        """Force at distance |dx| of a body of radius sum ``reach``, sliding at ``slip``."""
-        d = norm(dx)
-        n = dx / d[..., None]
-        t = torch.stack([-n[..., 1], n[..., 0]], -1)
-        overlap = reach - d
-        contact = overlap.clamp(min=0)
-        push = self.A * torch.exp(overlap / self.B) + self.k * contact
-        slide = self.kappa * contact * dot(slip, t)
-        return push[..., None] * n + slide[..., None] * t
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, self.walls)
+
+    def written(self, law: CrowdLaw, owner: str, place: int) -> CrowdLaw:
+        return ruled(law, self, owner, place)
+
+    told = written
+
+    def _of(self, over: str, seen: Mapping[str, Tensor]) -> Tensor:
+        """``(..., 2)`` N: its summands over the others or over wall points."""
+        law = formula_of(self)
+        values = dict(zip(law.owned, values_of(law, own_values([self], law)), strict=True))
+        like = seen["dx"]
+        fixed = {k: like.new_tensor(value) for k, value in settings_of([self], law).items()}
+        found = computed(list(law.sums[over].values()), {**seen, **values, **fixed})
+        return torch.stack(found, -1)
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
-        return self._force(dx, 2 * self.r, -dv)
+        seen = {"dx": dx[..., 0], "dy": dx[..., 1], "dvx": dv[..., 0], "dvy": dv[..., 1]}
+        return self._of(OTHERS, seen)
 
     def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
-        return self._force(dx, self.r, self.friction_sign * v)
+        seen = {"dx": dx[..., 0], "dy": dx[..., 1], "vx": v[..., 0], "vy": v[..., 1]}
+        return self._of(POINTS, seen)
 
 
 class NetworkForce(InteractionForce):
@@ -198,6 +266,17 @@ class NetworkForce(InteractionForce):
     Source: Göttlich & Totzeck, equation (NNseparate) and section 6.4.
     """
 
+    rule = CrowdRule(
+        rate=(
+            "pair_x/(mass*people) + wall_x/(mass*points)",
+            "pair_y/(mass*people) + wall_y/(mass*points)",
+        ),
+        # the networks are written out by written()
+        others={"pair_x": ("N", "0"), "pair_y": ("N", "0")},
+        points={"wall_x": ("N", "0"), "wall_y": ("N", "0")},
+        settings={"mass": "kg"},
+        force=("pair_x", "pair_y"),
+    )
     name = "network_force"
     formula = "NN_pair(x_i - x_j, v_i - v_j), NN_wall(x_i - x_w, v_i - v_w)"
     source = "Göttlich & Totzeck, equation (NNseparate)"
@@ -214,10 +293,31 @@ class NetworkForce(InteractionForce):
     ) -> None:
         super().__init__(mass, walls)
         self.self_interaction = self_interaction
+        if not walls:
+            self.rule = without_walls(self.rule)
         self.pair = FeedForward((4, hidden, 2), generator)
         self.wall = FeedForward((4, hidden, 2), generator)
         if box is not None:
             self.bound_all("", Interval(-box, box))
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, self.walls, self.self_interaction, self.pair.sizes)
+
+    def written(self, law: CrowdLaw, owner: str, place: int) -> CrowdLaw:
+        """Both networks, neuron by neuron."""
+        seen = [symbol(name) for name in ("dx", "dy", "dvx", "dvy")]
+        pair, owned = self.pair.written(seen, f"{owner}__p", f"terms.{place}.pair.")
+        wind = [symbol("vx") - symbol("normal_x"), symbol("vy") - symbol("normal_y")]
+        wall, more = self.wall.written(seen[:2] + wind, f"{owner}__w", f"terms.{place}.wall.")
+        owned |= more if self.walls else {}
+        found = with_rule(law, owner, self.rule, {}, owned, dict.fromkeys(owned, "*"), place)
+        for over, kind, outputs in ((OTHERS, "pair", pair), (POINTS, "wall", wall)):
+            for axis, output in zip("xy", outputs, strict=True):
+                found.sums[over][f"{owner}__{kind}_{axis}"] = output
+                if over == OTHERS:
+                    found.known[f"force_{axis}"] = output
+        return found
 
     def components(self, state: State) -> dict[str, Tensor]:
         parts = super().components(state)

@@ -11,8 +11,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from nnode.laws.crowd import CrowdLaw
 from nnode.laws.expression import Expr, substitute, symbol
-from nnode.laws.lane import UNITS, Lane, Rule, changed
+from nnode.laws.lane import UNITS, Lane, changed
 from nnode.laws.tensors import Code, LaneRates, computed
 from nnode.models.scene import Scene
 from nnode.models.term import State, Term
@@ -53,17 +54,23 @@ class Law(Term):
         return computed([substitute(lane.law, lane.fixed)], {**own, **values})[0]
 
 
-def rule_of(term: Term) -> Rule | None:
-    """What a term says of itself; None where its class, or one between it and the one that says
-    so, is code of its own."""
+def rule_of(term: Term) -> Any:
+    """What a term says of itself, a rule of its domain; None where its class, or one between it
+    and the one that says so, is code of its own."""
     if "rule" in vars(term):
         return term.rule
     for kind in type(term).__mro__:
         if "rule" in vars(kind):
-            return kind.rule  # type: ignore[attr-defined]
-        if {"forward", "speed", "memory_rate"} & set(vars(kind)):
+            return vars(kind)["rule"]
+        if _CODE & set(vars(kind)):
             return None
     return None
+
+
+#: What computes a term.
+_CODE = {
+    "forward", "speed", "memory_rate", "pair_force", "wall_force", "pairs", "components",
+}  # fmt: skip
 
 
 def lane_of(terms: Sequence[Term]) -> Lane | None:
@@ -83,7 +90,7 @@ _KNOWN: dict[tuple[Any, ...], Lane] = {}
 
 
 def _made(terms: Sequence[Term]) -> Lane:
-    names = _owners(terms)
+    names = owners(terms)
     assert isinstance(terms[0], Law)
     lane = terms[0].lane(names[0])
     for i, (term, owner) in enumerate(zip(terms[1:], names[1:], strict=True), start=1):
@@ -117,7 +124,7 @@ def _length_ahead(scene: Scene) -> Tensor:
     return torch.cat([length[:, 1:], torch.zeros_like(length[:, :1])], 1)
 
 
-def values_of(lane: Lane, parameters: Mapping[str, Tensor]) -> list[Tensor]:
+def values_of(lane: Lane | CrowdLaw, parameters: Mapping[str, Tensor]) -> list[Tensor]:
     """Of the parameters' symbols, in their order, from the model's parameters by name; what stands
     before the parameters' own axes stays."""
     found = []
@@ -127,7 +134,7 @@ def values_of(lane: Lane, parameters: Mapping[str, Tensor]) -> list[Tensor]:
     return found
 
 
-def own_values(terms: Sequence[Term], lane: Lane) -> dict[str, Tensor]:
+def own_values(terms: Sequence[Term], lane: Lane | CrowdLaw) -> dict[str, Tensor]:
     """The terms' parameters that a lane's formula needs, by their names in the model."""
     found = {}
     for name, _, _ in lane.owned.values():
@@ -139,7 +146,7 @@ def own_values(terms: Sequence[Term], lane: Lane) -> dict[str, Tensor]:
     return found
 
 
-def _owners(terms: Sequence[Term]) -> list[str]:
+def owners(terms: Sequence[Term]) -> list[str]:
     """The name of each term; of several of one name the second is numbered."""
     seen: Counter[str] = Counter()
     found = []

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from nnode.laws.expression import Expr, apply, symbol
 
 
 class FeedForward(nn.Module):
@@ -49,3 +53,30 @@ class FeedForward(nn.Module):
             x = nn.functional.softplus(layer(x))
         out: Tensor = self.layers[-1](x)
         return out
+
+    def written(
+        self, inputs: Sequence[Expr], label: str, path: str
+    ) -> tuple[list[Expr], dict[str, Any]]:
+        """Its outputs as formulas, neuron by neuron.
+
+        Args:
+            label: what the symbols of its weights begin with.
+            path: of the network in the model's named parameters.
+
+        Returns:
+            the outputs; the weights' symbols to name, place in it, and number of its axes.
+        """
+        owned: dict[str, Any] = {}
+        values = list(inputs)
+        for i, (n_in, n_out) in enumerate(pairwise(self.sizes)):
+            last, found = i == len(self.layers) - 1, []
+            for u in range(n_out):
+                total = symbol(f"{label}_b{i}_{u}")
+                owned[f"{label}_b{i}_{u}"] = (f"{path}layers.{i}.bias", u, 1)
+                for k in range(n_in):
+                    weight = f"{label}_w{i}_{u}_{k}"
+                    owned[weight] = (f"{path}layers.{i}.weight", u * n_in + k, 2)
+                    total = total + symbol(weight) * values[k]
+                found.append(total if last else apply("softplus", total))
+            values = found
+        return values, owned

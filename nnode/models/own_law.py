@@ -62,7 +62,7 @@ class FormulaLaw(Law):
         self.order = 1 if state == "x" else 2
         self.formula = str(text)  # type: ignore[misc]
         parts = {str(k): str(v) for k, v in (where or {}).items()}
-        self.rule = Rule(rate=str(text), where=parts)  # type: ignore[misc]
+        self.rule = Rule(rate=str(text), where=parts)
         for own, value in parameters.items():
             self._declare(str(own), value)
         self.lane(self.name)  # says what is wrong with the formula
@@ -98,7 +98,7 @@ class FormulaLaw(Law):
         leader = symbol("v")
         if self.order == 1:
             leader = parameters.get("v0", symbol("measured"))
-        assert self.rule is not None
+        assert isinstance(self.rule, Rule)
         return of_rule(owner, self.rule, self.order, parameters, leader, owned, units)
 
     def speed(self, gap: Tensor) -> Tensor:

@@ -117,13 +117,13 @@ class Scene:
         return self._masks(self.kind)
 
     @cached_property
-    def companions(self) -> Tensor:
-        """``(B, N, N)`` True for two different agents of one social group."""
-        found = torch.zeros(*self.agent.shape, self.agent.shape[1], dtype=torch.bool)
+    def companies(self) -> Tensor:
+        """``(B, N)`` number of an agent's social group in its sequence, from 1; 0: none."""
+        found = torch.zeros(self.agent.shape, dtype=torch.float64)
         for b, names in enumerate(self.group):
+            known = sorted({name for name in names or () if name})
             for i, name in enumerate(names or ()):
-                for j, other in enumerate(names or ()):
-                    found[b, i, j] = bool(name) and i != j and name == other
+                found[b, i] = known.index(name) + 1 if name else 0
         return found.to(self.agent.device)
 
     def _masks(self, labels: tuple[tuple[str, ...] | None, ...]) -> dict[str, Tensor]:

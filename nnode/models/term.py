@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Rule
 from nnode.models.scene import Scene
 
@@ -87,7 +88,7 @@ class Term(nn.Module):
     source: ClassVar[str]
     memory: ClassVar[int] = 0
     fast: ClassVar[dict[str, float]] = {}
-    rule: ClassVar[Rule | None] = None
+    rule: Rule | CrowdRule | None = None
 
     def __init__(self) -> None:
         super().__init__()

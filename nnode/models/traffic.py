@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nnode.laws.expression import Expr, apply, call, symbol
+from nnode.laws.expression import call, symbol
 from nnode.laws.lane import Lane, Rule, begun, of_rule
 from nnode.laws.tensors import Code
 from nnode.models.formula import Law, parameters_of, rule_of
@@ -124,18 +124,7 @@ class NetworkSpeed(FollowTheLeader):
 
     def lane(self, owner: str) -> Lane:
         """A sum of softplus neurons of the gap."""
-        first, second = (f"terms.0.network.layers.{i}." for i in (0, 1))
-        owned: dict[str, Any] = {}
-
-        def weight(label: str, name: str, place: int, axes: int) -> Expr:
-            owned[f"{owner}__{label}"] = (name, place, axes)
-            return symbol(f"{owner}__{label}")
-
-        total = weight("b", second + "bias", 0, 1)
-        for u in range(self.network.sizes[1]):
-            inside = weight(f"w{u}", first + "weight", u, 2) * symbol("gap")
-            inside = inside + weight(f"c{u}", first + "bias", u, 1)
-            total = total + weight(f"o{u}", second + "weight", u, 2) * apply("softplus", inside)
+        (total,), owned = self.network.written([symbol("gap")], f"{owner}__n", "terms.0.network.")
         units = {**dict.fromkeys(owned, "*"), f"{owner}__v0": "m/s"}
         owned[f"{owner}__v0"] = ("terms.0.v0", 0, None)
         return begun(owner, total, 1, symbol(f"{owner}__v0"), owned, units)

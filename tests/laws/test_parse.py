@@ -84,11 +84,11 @@ def test_what_needs_no_computing_is_not_computed(text: str, same: str) -> None:
 def test_a_law_inside_an_effect() -> None:
     names = {name: symbol(name) for name in ("gap", "beta", "W", "v0")}
     law = parse("v0*gap", names)
-    assert parse("W + law(gap=gap - beta) - law()", names, law) is parse(
+    assert parse("W + law(gap=gap - beta) - law()", names, {"law": law}) is parse(
         "W + v0*(gap - beta) - v0*gap", names
     )
     with pytest.raises(FormulaError, match="by name"):
-        parse("law(gap)", names, law)
+        parse("law(gap)", names, {"law": law})
 
 
 leaves = st.sampled_from(["a", "b", "gap", "2", "0.5", "3.25"])

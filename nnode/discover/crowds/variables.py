@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
-from nnode.models.crowd import dot, velocity
+from nnode.models.crowd import dot, norm, velocity
+from nnode.models.crowd_formula import walls_of
 from nnode.models.effects.crowd_pairs import (
     Neighbours,
     heading,
     local_density,
     right_of,
 )
-from nnode.models.effects.crowd_places import wall_distance
 from nnode.models.term import State
 
 Of = Callable[[State], Tensor]
@@ -28,6 +28,8 @@ WAY, CLOCK = (1.5, 10.0), (1.5, 10.0)
 KERNEL = 1.0
 #: Distance of the nearest person where there is none, m.
 NOBODY = 100.0
+#: Distance at which an absent wall stands, m.
+FAR = 1e4
 
 
 def _ahead(state: State) -> Tensor:
@@ -93,7 +95,7 @@ def _speed(state: State) -> Tensor:
 
 
 def _nearest_wall(state: State) -> tuple[Tensor, Tensor]:
-    d, n = wall_distance(state.x, state.scene.segment)
+    d, n = wall_distance(state)
     least, w = d.min(2)
     index = w[..., None, None].expand(*w.shape, 1, 2)
     return least, n.gather(2, index)[:, :, 0]
@@ -146,3 +148,15 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
             found.append(Variable(name, unit, value, knots, direction, level))
     found += waves_of("position x", "m", _position(0), state.x[..., 0][agent], WAY, axes)
     return found + waves_of("clock time", "s", clock, clock(state)[agent], CLOCK, axes)
+
+
+def wall_distance(state: State) -> tuple[Tensor, Tensor]:
+    """Distance and direction to the nearest point of each wall: ``(B, N, W)`` m, ``FAR`` for
+    absent walls; unit vectors from the wall ``(B, N, W, 2)``."""
+    ends, real = walls_of(state.scene)
+    start, along = ends[:, None, :, :2], ends[:, None, :, 2:]
+    offset = state.x[:, :, None] - start
+    share = (dot(offset, along) / dot(along, along).clamp(min=1e-12)).clamp(0, 1)
+    away = offset - share[..., None] * along
+    d = norm(away)
+    return torch.where(real[:, None], d, FAR), away / d[..., None]

@@ -109,7 +109,7 @@ class Walk:
         if self.compiled:
             relaxation, force = cast(tuple[Relaxation, SocialForce], law)
             self.tables = tables or Tables.of(windows, scene, force)
-            self.law = np.array([1 / relaxation.tau, force.r, 1 / force.B, force.friction_sign])
+            self.law = np.array([1 / relaxation.tau, force.r, 1 / force.B, force.sign])
             self.own = [f"terms.1.{name}" for name in ("A", "k", "kappa")]
             self.usual = [float(p.detach()) for p in (force.A, force.k, force.kappa)]
 

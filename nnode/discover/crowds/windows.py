@@ -80,7 +80,7 @@ class WindowScene(Scene):
         scene = WindowScene(**chosen)
         if self.group:
             # found once for all moments
-            scene.__dict__["companions"] = self.companions.repeat_interleave(number, 0)
+            scene.__dict__["companies"] = self.companies.repeat_interleave(number, 0)
         return scene
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch, Domain
+from nnode.models.crowd_formula import contribution
 from nnode.models.formula import beyond
 from nnode.models.scene import Scene
 from nnode.models.system import System
@@ -129,6 +130,8 @@ class Effect(Term):
 
     def forward(self, state: State) -> Tensor:
         """By its rule; an effect without one defines its own."""
+        if self.domain == "crowd":
+            return contribution(self, state)
         return beyond(self, state)[..., :1]
 
     def memory_rate(self, state: State) -> Tensor:

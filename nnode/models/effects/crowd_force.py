@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import InteractionForce, dot, velocity
+from nnode.laws.crowd import CrowdRule
+from nnode.models.crowd import InteractionForce
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
-from nnode.models.effects.crowd_pairs import Neighbours, company, heading
+from nnode.models.effects.crowd_pairs import company
 from nnode.models.system import System
 from nnode.models.term import Interval, State
 
@@ -25,19 +25,22 @@ class ForceEffect(Effect):
             return []
         return super().probes(batch, system)
 
-    def base(self, state: State) -> InteractionForce:
-        """The term whose force is changed.
+    def forward(self, state: State) -> Tensor:
+        """By its rule.
 
         Raises:
-            ValueError: the model has none.
+            ValueError: the model has no force between people.
         """
-        force = None if state.system is None else state.system.find(InteractionForce)
-        if force is None:
+        if state.system is None or state.system.find(InteractionForce) is None:
             raise ValueError(
                 f"effect {self.name} changes the force between people, but the model has none; "
                 "add social_force or network_force to its terms"
             )
-        return force
+        return super().forward(state)
+
+
+#: What is added to the acceleration: a mean over people, as that of the force.
+_MEAN = ("more_x/(mass*people)", "more_y/(mass*people)")
 
 
 @CATALOGUE.add
@@ -49,17 +52,17 @@ class FieldOfView(ForceEffect):
 
     name = "field_of_view"
     formula = "sum over j of (w_ij - 1) f_ij, w = lambda_ + (1 - lambda_) (1 + cos phi_ij)/2"
+    rule = CrowdRule(
+        rate=_MEAN,
+        others={"more_x": ("N", "less*force_x"), "more_y": ("N", "less*force_y")},
+        # the other is in the direction (-n_x, -n_y)
+        where={"less": "(1 - lambda_)*((1 - (e_x*n_x + e_y*n_y))/2 - 1)"},
+    )
     source = "Helbing, Farkas, Molnár & Vicsek 2002"
     strengths = {"lambda_": Strength(1.0, -0.1, Interval(-0.5, 1.5), "1", usual=0.25)}
     separated_by = "people who follow others closely, so that some are behind and some ahead"
 
     lambda_: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        towards = -Neighbours.of(state).n
-        cosine = dot(heading(velocity(state))[:, :, None], towards)
-        weight = (1 - self.lambda_) * ((1 + cosine) / 2 - 1)
-        return (weight[..., None] * self.base(state).pairs(state)).sum(2)
 
 
 @CATALOGUE.add
@@ -68,6 +71,13 @@ class Anticipation(ForceEffect):
 
     name = "anticipation"
     formula = "sum over j of f(x_ij + T_a v_ij, v_ij) - f(x_ij, v_ij)"
+    rule = CrowdRule(
+        rate=_MEAN,
+        others={
+            "more_x": ("N", "force_x(dx=dx + T_a*dvx, dy=dy + T_a*dvy) - force_x"),
+            "more_y": ("N", "force_y(dx=dx + T_a*dvx, dy=dy + T_a*dvy) - force_y"),
+        },
+    )
     source = "Zanlungo, Ikeda & Kanda 2011 (positions at a later time)"
     strengths = {"T_a": Strength(0.0, 0.1, Interval(-0.5, 2.0), "s", usual=0.2)}
     separated_by = "approaches at different speeds that come equally near"
@@ -81,10 +91,6 @@ class Anticipation(ForceEffect):
         # the force is far from linear in the time
         return [Probe({}, {"T_a": step}) for step in (0.1, 0.4, 0.8)]
 
-    def forward(self, state: State) -> Tensor:
-        base = self.base(state)
-        return (base.pairs(state, self.T_a) - base.pairs(state)).sum(2)
-
 
 @CATALOGUE.add
 class EvasiveRotation(ForceEffect):
@@ -97,17 +103,17 @@ class EvasiveRotation(ForceEffect):
 
     name = "evasive_rotation"
     formula = "sum over j of (R(theta (1 - e_i·e_j)/2) - 1) f_ij"
+    rule = CrowdRule(
+        rate=_MEAN,
+        others={
+            "more_x": ("N", "(cos(angle) - 1)*force_x - sin(angle)*force_y"),
+            "more_y": ("N", "sin(angle)*force_x + (cos(angle) - 1)*force_y"),
+        },
+        where={"angle": "theta*(1 - (e_x*other_x + e_y*other_y))/2"},
+    )
     source = "Totzeck 2020 (an angle proportional to gamma there)"
     strengths = {"theta": Strength(0.0, 0.1, Interval(-1.6, 1.6), "rad", usual=0.3)}
     kin = "avoidance_side"
     separated_by = "encounters passed on the left as well as on the right, head on and crossing"
 
     theta: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        force = self.base(state).pairs(state)
-        own, other = heading(velocity(state)), heading(state.others[1])
-        angle = self.theta * (1 - dot(own[:, :, None], other[:, None])) / 2
-        turn, less = torch.sin(angle), torch.cos(angle) - 1
-        fx, fy = force[..., 0], force[..., 1]
-        return torch.stack([less * fx - turn * fy, turn * fx + less * fy], -1).sum(2)

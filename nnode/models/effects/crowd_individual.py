@@ -6,13 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import Relaxation, velocity
+from nnode.laws.crowd import CrowdRule
+from nnode.models.crowd import Relaxation
 from nnode.models.effects.base import CATALOGUE, IndividualEffect, Probe, Setting, Strength
-from nnode.models.effects.crowd_pairs import heading, right_of
+from nnode.models.scene import Scene
 from nnode.models.system import System
 from nnode.models.term import Interval, State
 
@@ -27,6 +27,7 @@ class WalkerHeterogeneity(IndividualEffect):
     name = "walker_heterogeneity"
     domain = "crowd"
     formula = "eta_i (v_des - v) / tau, eta_i ~ N(0, sigma²)"
+    rule = CrowdRule(rate=("eta*drive_x", "eta*drive_y"), inputs={"eta": "1"})
     source = "Campanella, Hoogendoorn & Daamen 2009 (heterogeneous walkers)"
     strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 2.0), "1", usual=0.2)}
     separated_by = "people who are recorded for longer and turn more often"
@@ -47,15 +48,15 @@ class WalkerHeterogeneity(IndividualEffect):
         return max(float(numbers[0]), -1.0)
 
     def forward(self, state: State) -> Tensor:
-        relaxation = None if state.system is None else state.system.find(Relaxation)
-        if relaxation is None:
+        if state.system is None or state.system.find(Relaxation) is None:
             raise ValueError(
                 f"effect {self.name} changes the relaxation, but the model has none; add "
                 "Relaxation to its terms"
             )
-        eta, _ = self.known(state.scene, state.x)
-        out: Tensor = eta[..., None] * relaxation(state)
-        return out
+        return super().forward(state)
+
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        return {"eta": self.known(scene, self.sigma)[0]}
 
 
 @CATALOGUE.add
@@ -68,6 +69,11 @@ class GaitSway(IndividualEffect):
     name = "gait_sway"
     domain = "crowd"
     formula = "a sin(2 pi f t + phase_i) right_i"
+    rule = CrowdRule(
+        rate=("sway*e_y", "-sway*e_x"),
+        where={"sway": f"a*sin({2 * math.pi!r}*f*clock + phase)*there"},
+        inputs={"phase": "1", "there": "1"},
+    )
     source = "Hoogendoorn & Daamen 2005; Liu, Song & Zhang 2009 (lateral sway)"
     strengths = {"a": Strength(0.0, 0.05, Interval(0.0, 5.0), "m/s²", usual=0.3)}
     settings = {"f": Setting(0.95, Interval(0.5, 1.6), "Hz")}
@@ -98,8 +104,6 @@ class GaitSway(IndividualEffect):
         """The amplitude: sine and cosine share its square."""
         return math.sqrt(2) * sigma
 
-    def forward(self, state: State) -> Tensor:
-        phase, there = self.known(state.scene, state.x)
-        clock = (state.scene.start.to(state.x.dtype) + state.t)[:, None]
-        sway = self.a * torch.sin(2 * torch.pi * self.f * clock + phase) * there
-        return sway[..., None] * right_of(heading(velocity(state)))
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        phase, there = self.known(scene, self.a)
+        return {"phase": phase, "there": there}

@@ -6,16 +6,12 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import dot, norm, velocity
+from nnode.laws.crowd import CrowdRule
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
-from nnode.models.effects.crowd_pairs import (
-    Neighbours,
-    PairEffect,
-    heading,
-    right_of,
-)
+from nnode.models.effects.crowd_pairs import PairEffect
+from nnode.models.scene import Scene
 from nnode.models.system import System
-from nnode.models.term import Interval, State
+from nnode.models.term import Interval
 
 
 @CATALOGUE.add
@@ -30,24 +26,21 @@ class SidePreference(PairEffect):
         "c (1 - exp(-sum_j w_ij)) right_i, w_ij = h(e_i·e_ij) h(-e_i·e_j) / (1 + exp((d - D)/S)),"
         " D = 3 m, S = 0.3 m"
     )
+    rule = CrowdRule(
+        rate=("c*(1 - exp(-met))*e_y", "-c*(1 - exp(-met))*e_x"),
+        others={"met": ("1", "max(ahead, 0)*max(facing, 0)*logistic((reach - d)/edge)")},
+        where={
+            "ahead": "-(e_x*n_x + e_y*n_y)",
+            "facing": "-(e_x*other_x + e_y*other_y)",
+        },
+        constants={"reach": (3.0, "m"), "edge": (0.3, "m")},
+    )
     source = "Moussaïd et al. 2009 (side preference in avoidance)"
     strengths = {"c": Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²", usual=0.1)}
     kin = "avoidance_side"
     separated_by = "encounters at different distances and angles, so that the force's shape shows"
 
-    #: D and S, m
-    REACH, EDGE = 3.0, 0.3
     c: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        pair = Neighbours.of(state)
-        own, other = heading(velocity(state)), heading(state.others[1])
-        ahead = -dot(own[:, :, None], pair.n)
-        facing = -dot(own[:, :, None], other[:, None])
-        near = torch.sigmoid((self.REACH - pair.d) / self.EDGE)
-        weight = pair.acts * ahead.clamp(min=0) * facing.clamp(min=0) * near
-        met = 1 - torch.exp(-weight.sum(2))
-        return self.c * met[..., None] * right_of(own)
 
 
 @CATALOGUE.add
@@ -57,6 +50,17 @@ class GroupCohesion(Effect):
     name = "group_cohesion"
     covariate = "group"
     formula = "c (mean of x_j over the others of the group - x_i)"
+    rule = CrowdRule(
+        rate=("-c*way_x/max(mates, 1)", "-c*way_y/max(mates, 1)"),
+        others={
+            "mates": ("1", "mate"),
+            "way_x": ("m", "mate*dx"),
+            "way_y": ("m", "mate*dy"),
+        },
+        # groups are numbered from 1; 0 is nobody's
+        where={"mate": "choose(group - 0.5, choose(0.5 - abs(group - group_j), 1, 0), 0)"},
+        inputs={"group": "1"},
+    )
     source = "Moussaïd et al. 2010"
     domain = "crowd"
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s²", usual=0.1)}
@@ -70,11 +74,8 @@ class GroupCohesion(Effect):
         together = any(len(set(group)) < len(group) for group in names)
         return super().probes(batch, system) if together else []
 
-    def forward(self, state: State) -> Tensor:
-        mates = state.scene.companions.to(state.x.dtype)
-        share = mates / mates.sum(2, keepdim=True).clamp(min=1)
-        way = state.others[0][:, None] - state.x[:, :, None]
-        return self.c * (share[..., None] * way).sum(2)
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        return {"group": scene.companies}
 
 
 @CATALOGUE.add
@@ -83,6 +84,7 @@ class PreferredSpeed(Effect):
 
     name = "preferred_speed"
     formula = "c (v_pref - |v|) v/|v|"
+    rule = CrowdRule(rate=("c*(v_pref - speed)*e_x", "c*(v_pref - speed)*e_y"))
     source = "Helbing & Molnár 1995 (relaxation to the desired speed)"
     domain = "crowd"
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.02, 5.0), "1/s", usual=0.2)}
@@ -100,10 +102,6 @@ class PreferredSpeed(Effect):
         levels = torch.quantile(step[real][:100_000], torch.tensor([0.15, 0.5, 0.85]).to(step))
         return [Probe({"v_pref": min(float(level), 3.0)}, {"c": 0.02}) for level in levels]
 
-    def forward(self, state: State) -> Tensor:
-        v = velocity(state)
-        return self.c * ((self.v_pref - norm(v))[..., None] * heading(v))
-
 
 @CATALOGUE.add
 class Drift(Effect):
@@ -111,6 +109,7 @@ class Drift(Effect):
 
     name = "drift"
     formula = "(a_x, a_y)"
+    rule = CrowdRule(rate=("a_x", "a_y"))
     source = "a slope, a wind or a current; no specific source"
     domain = "crowd"
     strengths = {
@@ -121,7 +120,3 @@ class Drift(Effect):
 
     a_x: Tensor
     a_y: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        one = torch.ones_like(state.x[..., 0])
-        return torch.stack([self.a_x * one, self.a_y * one], -1)

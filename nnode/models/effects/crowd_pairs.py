@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import SocialForce, dot, norm, velocity
+from nnode.laws.crowd import CrowdRule
+from nnode.models.crowd import norm, velocity
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.system import System
 from nnode.models.term import Interval, State
-
-#: Radius of a person where the base law has none, m.
-RADIUS = 0.25
-
-
-def radius(system: System | None) -> float:
-    """m: of a person, that of the base law where it has one."""
-    force = None if system is None else system.find(SocialForce)
-    return RADIUS if force is None else force.r
 
 
 def heading(v: Tensor) -> Tensor:
@@ -82,6 +75,11 @@ class PairRepulsion(PairEffect):
 
     name = "pair_repulsion"
     formula = "sum over j of A_2 exp((2r - d_ij)/B_2) n_ij"
+    rule = CrowdRule(
+        rate=("more_x", "more_y"),
+        others={"more_x": ("m/s²", "push*n_x"), "more_y": ("m/s²", "push*n_y")},
+        where={"push": "A_2*exp((2*r - d)/B_2)"},
+    )
     source = "Helbing, Buzna, Johansson & Werner 2005 (two ranges)"
     strengths = {"A_2": Strength(0.0, 0.05, Interval(-0.2, 20.0), "m/s²", usual=0.2)}
     settings = {"B_2": Setting(0.8, Interval(0.1, 3.0), "m")}
@@ -100,36 +98,28 @@ class PairRepulsion(PairEffect):
             return []
         return [Probe({"B_2": reach}, {"A_2": 0.05}) for reach in (0.4, 0.8, 1.4)]
 
-    def forward(self, state: State) -> Tensor:
-        pair = Neighbours.of(state)
-        push = self.A_2 * torch.exp((2 * radius(state.system) - pair.d) / self.B_2)
-        return ((push * pair.acts)[..., None] * pair.n).sum(2)
-
 
 @CATALOGUE.add
 class SlidingFriction(PairEffect):
     """Friction between people who pass each other, also without contact.
 
-    It slows the sliding along the tangent t = (-n_y, n_x) over a range of ``REACH``.
+    It slows the sliding along the tangent t = (-n_y, n_x) over a range of B.
     """
 
     name = "sliding_friction"
     formula = "sum over j of c exp((2r - d_ij)/B) ((v_j - v_i)·t_ij) t_ij, B = 0.5 m"
+    rule = CrowdRule(
+        rate=("drag_x", "drag_y"),
+        others={"drag_x": ("m/s²", "-slide*n_y"), "drag_y": ("m/s²", "slide*n_x")},
+        where={"slide": "c*exp((2*r - d)/reach)*(dvx*n_y - dvy*n_x)"},
+        constants={"reach": (0.5, "m")},
+    )
     source = "Helbing, Farkas & Vicsek 2000, with a range beyond contact"
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 10.0), "1/s", usual=0.2)}
     kin = "velocity_of_others"
     separated_by = "people who pass at different distances, overtaking as well as head on"
 
-    #: B, m
-    REACH = 0.5
     c: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        pair = Neighbours.of(state)
-        tangent = torch.stack([-pair.n[..., 1], pair.n[..., 0]], -1)
-        drag = self.c * torch.exp((2 * radius(state.system) - pair.d) / self.REACH)
-        slip = dot(pair.dv, tangent)
-        return ((drag * slip * pair.acts)[..., None] * tangent).sum(2)
 
 
 @CATALOGUE.add
@@ -138,21 +128,23 @@ class Alignment(PairEffect):
 
     name = "alignment"
     formula = "c sum_j w_ij (v_j - v_i) / sum_j w_ij, w_ij = exp(-d_ij/R), R = 2 m"
+    rule = CrowdRule(
+        rate=("c*pull_x/(near + few)", "c*pull_y/(near + few)"),
+        others={
+            "near": ("1", "weight"),
+            "pull_x": ("m/s", "-weight*dvx"),
+            "pull_y": ("m/s", "-weight*dvy"),
+        },
+        where={"weight": "exp(-d/reach)"},
+        # the small number keeps someone without neighbours finite
+        constants={"reach": (2.0, "m"), "few": (1e-12, "1")},
+    )
     source = "Vicsek et al. 1995; Cucker & Smale 2007"
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "1/s", usual=0.2)}
     kin = "velocity_of_others"
     separated_by = "people who walk side by side at different speeds, far apart as well as near"
 
-    #: R, m
-    REACH = 2.0
     c: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        pair = Neighbours.of(state)
-        weight = pair.acts * torch.exp(-pair.d / self.REACH)
-        # the small number keeps someone without neighbours finite
-        share = weight / (weight.sum(2, keepdim=True) + 1e-12)
-        return self.c * (share[..., None] * pair.dv).sum(2)
 
 
 @CATALOGUE.add
@@ -161,18 +153,17 @@ class DensitySlowdown(PairEffect):
 
     name = "density_slowdown"
     formula = "-c rho_i v_i, rho_i = sum_j exp(-d_ij²/(2 h²)) / (2 pi h²), h = 1 m"
+    rule = CrowdRule(
+        rate=("-c*density*vx", "-c*density*vy"),
+        others={"density": ("1/m²", f"exp(-d**2/(2*h**2))/({2 * math.pi!r}*h**2)")},
+        constants={"h": (1.0, "m")},
+    )
     source = "Weidmann 1993; density: Helbing, Johansson & Al-Abideen 2007"
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "m²/s", usual=0.1)}
     kin = "speed"
     separated_by = "the same people at different densities"
 
-    #: h, m
-    KERNEL = 1.0
     c: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        density = local_density(Neighbours.of(state), self.KERNEL)
-        return -self.c * density[..., None] * velocity(state)
 
 
 def local_density(pair: Neighbours, kernel: float) -> Tensor:

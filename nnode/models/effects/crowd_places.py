@@ -2,43 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import dot, norm
+from nnode.laws.crowd import CrowdRule
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
-from nnode.models.effects.crowd_pairs import radius
 from nnode.models.system import System
-from nnode.models.term import Interval, State
+from nnode.models.term import Interval
 
 #: Places are looked for this far apart, m, but in no more than this many cells.
 SPACING, CELLS = 0.8, 170
-#: Distance at which an absent wall stands, m.
-FAR = 1e4
-
-
-def wall_distance(x: Tensor, segment: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance and direction to the nearest point of each wall.
-
-    Args:
-        x: ``(B, N, 2)`` m.
-        segment: ``(B, W, 4)`` m, NaN where a sequence has fewer walls.
-
-    Returns:
-        ``(B, N, W)`` m, ``FAR`` for absent walls; unit vectors from the wall ``(B, N, W, 2)``.
-    """
-    real = ~segment.isnan().any(-1)
-    ends = torch.where(real[..., None], segment, 0.0)[:, None]
-    start, along = ends[..., :2], ends[..., 2:] - ends[..., :2]
-    offset = x[:, :, None] - start
-    length2 = dot(along, along).clamp(min=1e-12)
-    share = (dot(offset, along) / length2).clamp(0, 1)
-    away = offset - share[..., None] * along
-    d = norm(away)
-    absent = ~real[:, None]
-    return torch.where(absent, FAR, d), away / d[..., None]
 
 
 @CATALOGUE.add
@@ -50,6 +26,19 @@ class WallRepulsion(Effect):
 
     name = "wall_repulsion"
     formula = "sum over walls w of A_w exp((r - d_w)/B_w) n_w"
+    rule = CrowdRule(
+        rate=("away_x", "away_y"),
+        walls={"away_x": ("m/s²", "push*off_x"), "away_y": ("m/s²", "push*off_y")},
+        where={
+            "long": "max(along_x**2 + along_y**2, least**2)",
+            "share": "clip((dx*along_x + dy*along_y)/long, 0, 1)",
+            "off_x": "dx - share*along_x",
+            "off_y": "dy - share*along_y",
+            "far": "sqrt(off_x**2 + off_y**2 + small_m**2)",
+            "push": "A_w*exp((r - far)/B_w)/far",
+        },
+        constants={"least": (1e-6, "m")},
+    )
     source = "Helbing & Molnár 1995"
     domain = "crowd"
     strengths = {"A_w": Strength(0.0, 0.05, Interval(-0.5, 20.0), "m/s²", usual=0.2)}
@@ -65,13 +54,6 @@ class WallRepulsion(Effect):
             return []
         return [Probe({"B_w": reach}, {"A_w": 0.05}) for reach in (0.2, 0.4, 0.8)]
 
-    def forward(self, state: State) -> Tensor:
-        if not state.scene.segment.shape[1]:
-            return torch.zeros_like(state.x)
-        d, n = wall_distance(state.x, state.scene.segment)
-        push = self.A_w * torch.exp((radius(state.system) - d) / self.B_w)
-        return (push[..., None] * n).sum(2)
-
 
 def places(batch: Batch) -> list[tuple[float, float]]:
     """Middles of the cells of a coarse grid in which somebody walks, or that touch one."""
@@ -84,6 +66,17 @@ def places(batch: Batch) -> list[tuple[float, float]]:
         if len(around) <= CELLS:
             return [((i + 0.5) * spacing, (j + 0.5) * spacing) for i, j in sorted(around)]
         spacing *= 1.25
+
+
+_PLACE = CrowdRule(
+    rate=("push*to_x", "push*to_y"),
+    where={
+        "to_x": "x - x_o",
+        "to_y": "y - y_o",
+        "far": "sqrt(to_x**2 + to_y**2 + small_m**2)",
+        "push": "A_o*exp(-far/B_o)/far",
+    },
+)
 
 
 class PlaceEffect(Effect):
@@ -99,8 +92,6 @@ class PlaceEffect(Effect):
     kin = "place"
     separated_by = "people who pass the place on all sides"
 
-    #: +1 away from the place, -1 towards it
-    sign = 1.0
     A_o: Tensor
     B_o: Tensor
     x_o: Tensor
@@ -114,18 +105,13 @@ class PlaceEffect(Effect):
             for x, y in places(batch)
         ]
 
-    def forward(self, state: State) -> Tensor:
-        offset = state.x - torch.stack([self.x_o, self.y_o])
-        d = norm(offset)
-        push = self.sign * self.A_o * torch.exp(-d / self.B_o) / d
-        return push[..., None] * offset
-
 
 @CATALOGUE.add
 class Obstacle(PlaceEffect):
     """People keep away from an unknown place."""
 
     name = "obstacle"
+    rule = _PLACE
     formula = "A_o exp(-d/B_o) n, d and n: distance and direction from (x_o, y_o)"
     source = "Helbing & Molnár 1995 (repulsion from obstacles)"
 
@@ -135,6 +121,6 @@ class Attraction(PlaceEffect):
     """People are drawn to an unknown place."""
 
     name = "attraction"
+    rule = replace(_PLACE, rate=("-push*to_x", "-push*to_y"))
     formula = "-A_o exp(-d/B_o) n, d and n: distance and direction from (x_o, y_o)"
     source = "Helbing & Molnár 1995 (attractive places)"
-    sign = -1.0

@@ -246,7 +246,7 @@ def simulate(
         ].numpy(),
         end=substeps * (batch.valid.any(-1).sum(0).numpy() - 1),
         rate=_scalar(number(1 / tau)),
-        slip=_scalar(number(-social.friction_sign if social else 1.0)),
+        slip=_scalar(number(-social.sign if social else 1.0)),
         mutual=social is not None,
         first=0 if isinstance(force, NetworkForce) and force.self_interaction else 1,
         cutoff=tuple(_scalar(number(distance)) for distance in distances),
