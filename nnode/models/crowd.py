@@ -139,6 +139,13 @@ class InteractionForce(CrowdBase):
             units=law.units | {mass: "kg"},
         )
 
+    @property
+    def own_rule(self) -> CrowdRule:
+        """Its rule, without walls where it has none."""
+        assert isinstance(self.rule, CrowdRule)
+        rate = ("pair_x/(mass*people)", "pair_y/(mass*people)")
+        return self.rule if self.walls else replace(self.rule, rate=rate, points={})
+
     def code(self) -> dict[str, Code]:
         def component(c: int) -> Code:
             def force(dx: Tensor, dy: Tensor, dvx: Tensor, dvy: Tensor) -> Tensor:
@@ -149,11 +156,6 @@ class InteractionForce(CrowdBase):
             return force
 
         return {"force_x": component(0), "force_y": component(1)}
-
-
-def without_walls(rule: CrowdRule) -> CrowdRule:
-    """The forces between people alone."""
-    return replace(rule, rate=("pair_x/(mass*people)", "pair_y/(mass*people)"), points={})
 
 
 class SocialForce(InteractionForce):
@@ -221,15 +223,13 @@ class SocialForce(InteractionForce):
         self.kappa: Tensor
         self.r, self.B = r, B
         self.sign = -1.0 if opposing_wall_friction else 1.0
-        if not walls:
-            self.rule = without_walls(self.rule)
 
     @property
     def shape(self) -> tuple[Any, ...]:
         return (*super().shape, self.walls)
 
     def written(self, law: CrowdLaw, owner: str, place: int) -> CrowdLaw:
-        return ruled(law, self, owner, place)
+        return ruled(law, self, owner, place, self.own_rule)
 
     told = written
 
@@ -293,8 +293,6 @@ class NetworkForce(InteractionForce):
     ) -> None:
         super().__init__(mass, walls)
         self.self_interaction = self_interaction
-        if not walls:
-            self.rule = without_walls(self.rule)
         self.pair = FeedForward((4, hidden, 2), generator)
         self.wall = FeedForward((4, hidden, 2), generator)
         if box is not None:
@@ -311,7 +309,7 @@ class NetworkForce(InteractionForce):
         wind = [symbol("vx") - symbol("normal_x"), symbol("vy") - symbol("normal_y")]
         wall, more = self.wall.written(seen[:2] + wind, f"{owner}__w", f"terms.{place}.wall.")
         owned |= more if self.walls else {}
-        found = with_rule(law, owner, self.rule, {}, owned, dict.fromkeys(owned, "*"), place)
+        found = with_rule(law, owner, self.own_rule, {}, owned, dict.fromkeys(owned, "*"), place)
         for over, kind, outputs in ((OTHERS, "pair", pair), (POINTS, "wall", wall)):
             for axis, output in zip("xy", outputs, strict=True):
                 found.sums[over][f"{owner}__{kind}_{axis}"] = output

@@ -38,12 +38,15 @@ class CrowdBase(Term):
         return contribution(self, state)
 
 
-def ruled(law: CrowdLaw, term: Term, owner: str, place: int) -> CrowdLaw:
-    """A law with a term that has a rule."""
-    if not isinstance(term.rule, CrowdRule):
+def ruled(
+    law: CrowdLaw, term: Term, owner: str, place: int, own: CrowdRule | None = None
+) -> CrowdLaw:
+    """A law with a term that has a rule, or ``own`` in its place."""
+    rule = own or term.rule
+    if not isinstance(rule, CrowdRule):
         raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
     parameters, owned, units = parameters_of(term, owner, place)
-    return with_rule(law, owner, term.rule, parameters, owned, units, whose=place)
+    return with_rule(law, owner, rule, parameters, owned, units, whose=place)
 
 
 def formula_of(base: CrowdBase) -> CrowdLaw:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from nnode.models.system import Traffic
+from typing import cast
+
+from nnode.models.crowd_formula import crowd_of
+from nnode.models.system import System, Traffic
+from nnode.models.term import Term
 
 
-def source(model: Traffic) -> str:
-    """The code that simulates a model of a lane, to be read.
+def source(model: System) -> str:
+    """The code that simulates a model, to be read.
 
     Raises:
         ValueError: the model has a term that is no formula.
     """
+    from nnode.simulate.crowd_source import CrowdSource
     from nnode.simulate.lane_source import LaneSource
 
-    lane = model.lane
-    if lane is None or not lane.is_formula:
-        raise ValueError("the model has a term that is code of its own: it runs in PyTorch")
-    return LaneSource(lane).text()
+    if isinstance(model, Traffic):
+        lane = model.lane
+        if lane is not None and lane.is_formula:
+            return LaneSource(lane).text()
+    else:
+        law = crowd_of(cast(list[Term], list(model.terms)))
+        if law is not None:
+            return CrowdSource(law).text()
+    raise ValueError("the model has a term that is code of its own: it runs in PyTorch")

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from nnode.laws.differentiate import pull
-from nnode.laws.expression import Expr, below, const, symbol
+from nnode.laws.expression import Expr, below, const, symbol, symbols
 
 #: Text of every operation, of the texts of its arguments.
 OPERATIONS = {
@@ -43,10 +43,14 @@ class Loop:
     Attributes:
         uniform: symbols that are the same along a row, in the order of the array ``q``.
         scalars: others of them, which the function's arguments are called.
+        options: of the compiler, by their name in the module.
+        fixed: uniform symbols by which nobody wants a gradient.
     """
 
     uniform: Sequence[str]
     scalars: Sequence[str] = ("t", "dt", "drives")
+    options: str = "INLINE"
+    fixed: Sequence[str] = ()
 
     def varies(self, nodes: Sequence[Expr]) -> dict[Expr, bool]:
         """Node to whether it varies along a row."""
@@ -74,10 +78,10 @@ class Loop:
         sums = sums or {}
         outputs = [*rows.values(), *sums.values()]
         varies = self.varies(outputs)
-        names = self._names(outputs)
-        before, inside = self._lines(below(outputs), varies, names)
+        names = self.names(outputs)
+        before, inside = self.lines(below(outputs), varies, names)
         read = [n.value for n in below(outputs) if n.op == "symbol" and varies[n]]
-        text = f"\n\n@njit(**INLINE)\ndef {name}(room, lo, n, q, t, dt, drives, total):\n"
+        text = f"\n\n@njit(**{self.options})\ndef {name}(room, lo, n, q, t, dt, drives, total):\n"
         text += "    zero, one, two = real(0, dt), real(1, dt), real(2, dt)\n"
         text += self.given(outputs)
         text += _indented(before, 1)
@@ -106,34 +110,45 @@ class Loop:
             rows: row to the symbol whose adjoint is stored there.
             onto: rows whose adjoints are added to what they hold.
         """
-        varies = self.varies([*seeds, *seeds.values()])
-        bar = pull(seeds, lambda node: not varies[node])
-        stored = {row: bar.get(symbol(own), const(0)) for row, own in rows.items()}
+        stored, ends = self.adjoints(seeds, rows)
         stored.update({row: symbol(row) + stored[row] for row in onto})
-        ends = [node for node in bar if not varies[node] and node.op != "const"]
-        sums = {str(i): bar[node] for i, node in enumerate(ends)}
+        sums = {str(i): total for i, total in enumerate(ends.values())}
         rest = pull({node: symbol(f"sum_{i}") for i, node in enumerate(ends)}, lambda node: False)
         found = {
-            n.value: b for n, b in rest.items() if n.op == "symbol" and n.value in self.uniform
+            n.value: b
+            for n, b in rest.items()
+            if n.op == "symbol" and n.value in self.uniform and n.value not in self.fixed
         }
         # what the chain behind the loop needs is computed there
         outputs = list(found.values())
         names = {
-            **self._names(outputs, "u"),
+            **self.names(outputs, "u"),
             **{symbol(f"sum_{i}"): f"sum_{i}" for i in range(len(ends))},
         }
-        lines, _ = self._lines(below(outputs), dict.fromkeys(below(outputs), False), names)
+        lines, _ = self.lines(below(outputs), dict.fromkeys(below(outputs), False), names)
         after = self.given(outputs).replace("    ", "").splitlines() + lines
         after += [f"total[{self.uniform.index(p)}] += {names[b]}" for p, b in found.items()]
         return self.function(name, stored, sums, after)
 
-    def _names(self, outputs: Sequence[Expr], prefix: str = "n") -> dict[Expr, str]:
+    def adjoints(
+        self, seeds: Mapping[Expr, Expr], rows: Mapping[str, str]
+    ) -> tuple[dict[str, Expr], dict[Expr, Expr]]:
+        """What is stored in rows, and what is summed over the loop of every node that does not
+        vary in it."""
+        varies = self.varies([*seeds, *seeds.values()])
+        bar = pull(seeds, lambda node: not varies[node])
+        stored = {row: bar.get(symbol(own), const(0)) for row, own in rows.items()}
+        still = {*self.fixed, *self.scalars}
+        ends = {n: b for n, b in bar.items() if not varies[n] and not set(symbols([n])) <= still}
+        return stored, ends
+
+    def names(self, outputs: Sequence[Expr], prefix: str = "n") -> dict[Expr, str]:
         found = {}
         for i, node in enumerate(below(outputs)):
             found[node] = node.value if node.op == "symbol" else f"{prefix}{i}"
         return found
 
-    def _lines(
+    def lines(
         self, nodes: Sequence[Expr], varies: Mapping[Expr, bool], names: Mapping[Expr, str]
     ) -> tuple[list[str], list[str]]:
         """Lines before the loop, and inside."""

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from nnode.discover.crowds import kernel
 from nnode.discover.crowds.walk import Walk
 from nnode.discover.residuals.engine import trained
 from nnode.models.effects.base import Effect
@@ -57,7 +56,7 @@ class Frames:
 
     def acceleration(self, x: Tensor, v: Tensor) -> Tensor:
         """``(W * F, N, 2)`` m/s² of the model at the frames' moments, where people are at x."""
-        base = self._compiled(x, v, self.walk.forces(self.row[None]) if self._fast else None)
+        base = self._compiled(x, v, self.walk.of_law(self.row[None]) if self._fast else None)
         return base + self._beyond(self._own(), self._bare(x, v, base))
 
     def parameter_tangents(self) -> Tensor:
@@ -132,9 +131,9 @@ class Frames:
             return found
         q = None
         if self._fast:
-            q = self.walk.forces(self.row[None])
-            if key in self.walk.own:
-                q[0, self.walk.own.index(key)] = float(value)
+            row = self.row.clone()
+            row[self.walk.place(key)] = value.reshape(-1)
+            q = self.walk.of_law(row[None])
         base = self._compiled(self.x, self.v, q)
         return base + self._beyond(whole, self._bare(self.x, self.v, base))
 
@@ -149,13 +148,12 @@ class Frames:
             return out
         state = torch.cat([self.of_people(x), self.of_people(v)], -1)
         p, f = state.shape[:2]
-        found = kernel.accelerations(
+        found = self.walk.kernel.accelerations(
             state.reshape(p * f, 4).numpy(),
             np.repeat(np.arange(p), f),
             np.tile(2 * np.arange(f), p),
             np.zeros(p * f, dtype=np.int64),
             *self.walk.tables.arguments(),
-            self.walk.law,
             q,
         )
         shaped = out.view(*self.shape, 2)

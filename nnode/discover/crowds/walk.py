@@ -1,8 +1,9 @@
-"""Simulation of people who walk alone: compiled for the social force, in PyTorch for the rest."""
+"""Simulation of people who walk alone: the law compiled, its effects in PyTorch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import cast
 
 import numpy as np
@@ -10,12 +11,14 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
-from nnode.discover.crowds import kernel
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
 from nnode.discover.residuals.engine import trained
-from nnode.models.crowd import Relaxation, SocialForce
+from nnode.models.crowd import NetworkForce
+from nnode.models.crowd_formula import CrowdBase, crowd_of, settings_of
+from nnode.models.formula import own_values, values_of
 from nnode.models.system import Crowd, System
 from nnode.models.term import State, Term
+from nnode.simulate.walk_source import WalkSource, compiled
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -39,52 +42,51 @@ class Beyond(nn.Module):
 
 @dataclass
 class Tables:
-    """What the compiled code knows of the surroundings, see its description."""
+    """What the compiled code knows of the surroundings, see :mod:`nnode.simulate.walk_source`."""
 
     others: np.ndarray
     window: np.ndarray
     meets: np.ndarray
     wall: np.ndarray
     points: np.ndarray
-    fixed: np.ndarray
+    have: np.ndarray
 
     @classmethod
-    def of(cls, windows: Windows, scene: WindowScene, force: SocialForce) -> Tables:
+    def of(cls, windows: Windows, scene: WindowScene, source: WalkSource) -> Tables:
         """The tables of all people of all windows."""
         which, who = windows.person.T
         x, v = windows.batch.x.numpy(), windows.batch.v.numpy()
         others = np.ascontiguousarray(np.concatenate([x, v], -1).transpose(0, 1, 3, 2))
         agent = scene.agent.numpy()
-        count = agent.sum(1)
-        meets = agent[which] / (force.mass * count[which])[:, None]
+        meets = agent[which].astype(float)
         meets[np.arange(len(who)), who] = 0.0
-        place, _, real = (part.numpy() for part in scene.walls_of_each())
+        place, normal, real = (part.numpy() for part in scene.walls_of_each())
         shape = (*agent.shape, place.shape[2])
-        wall = np.broadcast_to(place, (*shape, 2))[which, who].transpose(0, 2, 1)
+        wall = np.broadcast_to(np.concatenate([place, normal], -1), (*shape, 4))[which, who]
         there = np.broadcast_to(real, shape)[which, who]
-        if not force.walls:
-            there = np.zeros_like(there)
-        share = 1 / (force.mass * scene.wall_count.numpy()[which, 0])
-        goal = scene.destination.numpy()[which, who]
         # real points come first
         order = np.argsort(~there, axis=1, kind="stable")
-        wall = np.take_along_axis(wall, order[:, None], 2)
-        return cls(
-            others=others,
-            window=which,
-            meets=meets,
-            wall=np.ascontiguousarray(wall),
-            points=there.sum(1),
-            fixed=np.concatenate([goal, share], 1),
-        )
+        wall = np.take_along_axis(wall, order[..., None], 1).transpose(0, 2, 1)
+        goal = scene.destination.numpy()[which, who]
+        has = {
+            "goal_x": goal[:, 0],
+            "goal_y": goal[:, 1],
+            "people": scene.count.numpy()[which, 0, 0],
+            "points": scene.wall_count.numpy()[which, 0, 0],
+        }
+        have = np.stack([has[name] for name in source.fields] or [np.zeros(len(who))], 1)
+        return cls(others, which, meets, np.ascontiguousarray(wall), there.sum(1), have)
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """In the order of the compiled functions."""
-        return (self.others, self.window, self.meets, self.wall, self.points, self.fixed)
+        return (self.others, self.window, self.meets, self.wall, self.points, self.have)
 
 
 class Walk:
     """One model among the measured others.
+
+    Its law, the terms before its effects, is compiled where it is a formula; what effects add is
+    computed by PyTorch, so that nothing has to be compiled for each of many of them.
 
     Args:
         windows: the windows.
@@ -98,29 +100,44 @@ class Walk:
     ) -> None:
         self.windows, self.scene, self.system = windows, scene, alone(system)
         terms = cast(list[Term], list(system.terms))
-        law = [term for term in terms if type(term) in (Relaxation, SocialForce)]
-        self.compiled = [type(term) for term in law] == [Relaxation, SocialForce] and (
-            law == terms[:2]
-        )
-        self.beyond = Beyond(self.system, terms[2:] if self.compiled else terms)
+        self.law = list(takewhile(lambda term: isinstance(term, CrowdBase), terms))
+        law = crowd_of(self.law)
+        force = system.find(NetworkForce)
+        oneself = force is not None and force.self_interaction
+        self.formula = None if oneself else law
+        self.beyond = Beyond(self.system, terms[len(self.law) :] if self.compiled else terms)
         self.names = list(trained(system))
         self._people = tuple(torch.as_tensor(index) for index in windows.person.T)
         self.sizes = [p.numel() for p in trained(system).values()]
-        if self.compiled:
-            relaxation, force = cast(tuple[Relaxation, SocialForce], law)
-            self.tables = tables or Tables.of(windows, scene, force)
-            self.law = np.array([1 / relaxation.tau, force.r, 1 / force.B, force.sign])
-            self.own = [f"terms.1.{name}" for name in ("A", "k", "kappa")]
-            self.usual = [float(p.detach()) for p in (force.A, force.k, force.kappa)]
+        if self.formula is not None:
+            source = WalkSource(self.formula)
+            self.kernel = compiled(source)
+            self.tables = tables or Tables.of(windows, scene, source)
 
-    def forces(self, rows: Tensor) -> np.ndarray:
-        """``(R, 3)``: A, k, kappa of rows ``(R, K)``."""
-        out = np.tile(self.usual, (len(rows), 1))
-        for column, name in enumerate(self.own):
+    @property
+    def compiled(self) -> bool:
+        """Whether its law is."""
+        return self.formula is not None
+
+    def place(self, name: str) -> slice:
+        """Of a parameter in rows."""
+        i = self.names.index(name)
+        first = sum(self.sizes[:i])
+        return slice(first, first + self.sizes[i])
+
+    def of_law(self, rows: Tensor) -> np.ndarray:
+        """``(R, U)``: parameters of the compiled law of rows ``(R, K)``."""
+        assert self.formula is not None
+        fixed = list(settings_of(self.law, self.formula).values())
+        values = {}
+        for name, own in own_values(self.law, self.formula).items():
+            value = own.detach().double().expand(len(rows), *own.shape)
             if name in self.names:
-                place = sum(self.sizes[: self.names.index(name)])
-                out[:, column] = rows[:, place].numpy()
-        return out
+                value = rows[:, self.place(name)].reshape(value.shape)
+            values[name] = value
+        found = values_of(self.formula, values)
+        every = [part.numpy() for part in found] + [np.full(len(rows), v) for v in fixed]
+        return np.stack(every, 1) if every else np.zeros((len(rows), 1))
 
     def parameters(self, rows: Tensor) -> dict[str, Tensor]:
         """Rows ``(R, K)`` as parameters of :class:`Beyond`."""
@@ -164,14 +181,14 @@ class Walk:
         when they are known there: a parabola through the last three steps, for a sway of one
         second changes too fast for lines.
         """
-        windows, h, q = self.windows, self.windows.step, self.forces(rows)
+        windows, h, q = self.windows, self.windows.step, self.of_law(rows)
         out = np.empty((windows.steps + 1, len(rows), *start.shape))
         out[0] = start.numpy()
-        fixed = (*self.tables.arguments(), self.law, q)
+        fixed = (*self.tables.arguments(), q)
         before = self._extra(parameters, q, 0, out[0])
         after = before
         for n in range(windows.steps):
-            kernel.advance(out[n], before, after, out[n + 1], n, h, *fixed)
+            self.kernel.advance(out[n], before, after, out[n + 1], n, h, *fixed)
             if self.beyond.added:
                 found = self._extra(parameters, q, 2 * n + 2, out[n + 1])
                 bend = found - after if n else 0.0
@@ -192,13 +209,12 @@ class Walk:
         state = torch.from_numpy(states)
         x[:, which, who], v[:, which, who] = state[..., :2], state[..., 2:]
         rate, p = torch.zeros_like(x), len(which)
-        found = kernel.accelerations(
+        found = self.kernel.accelerations(
             states.reshape(r * p, 4),
             np.tile(np.arange(p), r),
             np.full(r * p, moment),
             np.repeat(np.arange(r), p),
             *self.tables.arguments(),
-            self.law,
             q,
         )
         rate[:, which, who] = torch.from_numpy(found).reshape(r, p, 2)

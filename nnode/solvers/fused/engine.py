@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
-from nnode.simulate import lanes
+from nnode.simulate import crowds, lanes, neighbours
 from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.fused import crowd, fallback, neighbours
+from nnode.solvers.fused import fallback
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +27,8 @@ class FusedSolver:
     that of ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint,
     from which it differs by O(dt).
 
-    Lanes whose law and effects are formulas (see :mod:`nnode.laws.lane`) and the crowd models
-    run compiled. Any other model, such as a crowd's with an effect, goes through
+    Models whose law and effects are formulas (see :mod:`nnode.laws`) run compiled. Any other
+    model, with a term that is code of its own, goes through
     :mod:`nnode.solvers.fused.fallback`: the same gradient, at the speed of PyTorch. The solver
     warns of it once.
 
@@ -46,7 +46,7 @@ class FusedSolver:
         cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
             left out, in units of A. The acceleration of one person is then off by less than
             ``cutoff_error`` A / m through people, and as much through walls; see
-            :func:`nnode.solvers.fused.neighbours.cutoff_distance`. 0 lets everybody meet
+            :func:`nnode.simulate.neighbours.cutoff_distance`. 0 lets everybody meet
             everybody.
 
     Attributes:
@@ -126,28 +126,23 @@ class FusedSolver:
     def _substeps(self, system: System, batch: Batch) -> int:
         if batch.x.shape[-1] != system.dim:
             system.scene(batch)  # says so
-        compiled = crowd.supports(system, batch)
-        if self.cutoff is not None and not compiled and not crowd.without_partners(system):
+        law = crowds.supports(system, batch)
+        if self.cutoff is not None and law is None and not crowds.without_partners(system):
             raise ConfigError(
-                f"solver.cutoff={self.cutoff:g} m works for crowds with one compiled force "
-                "(model=sf or model=nn) only; set it to null"
+                f"solver.cutoff={self.cutoff:g} m works for crowds whose terms are formulas, as "
+                "model=sf or model=nn, only; set it to null"
             )
         return substeps(batch.dt, self.dt, system.domain)
 
     def _other(self, system: System, batch: Batch, n: int, parameters: list[Tensor]) -> Trajectory:
-        if crowd.supports(system, batch):
-            return Trajectory(
-                *crowd.simulate(
-                    system,
-                    batch,
-                    n,
-                    self.threads,
-                    cutoff=self.cutoff,
-                    cutoff_error=self.cutoff_error,
-                )
+        law = crowds.supports(system, batch)
+        if law is not None:
+            found = crowds.simulate(
+                system, law, batch, n, self.threads, self.cutoff, self.cutoff_error
             )
+            return Trajectory(*found)
         # the relaxation alone is a baseline, and cheap
-        if not self.uncompiled and not crowd.without_partners(system):
+        if not self.uncompiled and not crowds.without_partners(system):
             self.uncompiled = fallback.reason(system)
             log.warning(
                 "solver=fused works in batched PyTorch and not in compiled code: %s; the gradient "

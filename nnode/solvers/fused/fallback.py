@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
-from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.formula import rule_of
 from nnode.models.system import System, Traffic
 from nnode.models.term import Term
@@ -152,15 +151,10 @@ def _pull(
 def reason(system: System) -> str:
     """Why compiled code is not used, in words: terms that it does not cover, by their names."""
     terms = cast(list[Term], list(system.terms))
-    if system.domain == "crowd":
-        without = [t for t in terms if type(t) not in (Relaxation, SocialForce, NetworkForce)]
-        alone = "a relaxation with one force, a network of one hidden layer at most,"
-    else:
-        without = [term for term in terms if rule_of(term) is None]
-        alone = "models that begin with a law of the gap"
-    names = ", ".join(term.name for term in without)
+    names = ", ".join(t.name for t in terms if rule_of(t) is None or (t.memory and t.rule is None))
     if names:
         return f"it does not cover {names}"
+    alone = "models that begin with a law of the gap, without people who meet themselves and others"
     return f"it covers {alone} on the CPU, without a gradient by what was measured"
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
@@ -27,7 +28,10 @@ ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
 
 
 class Same(SocialForce):
-    """A force that is the same, but for which there is no compiled code."""
+    """A force that is the same, but code of its own."""
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        return super().pair_force(dx, dv)
 
 
 def model(force: type[SocialForce] = SocialForce, **options: float | bool) -> Crowd:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError, SimulationError
 from nnode.models import Crowd, Linear, NetworkForce, Relaxation, SocialForce, System, Traffic
+from nnode.models.effects import CATALOGUE
 from nnode.models.network import FeedForward
+from nnode.simulate import crowds as compiled
+from nnode.simulate.crowd_rows import SIZE
+from nnode.simulate.crowd_source import CrowdSource
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
-from nnode.solvers.fused import crowd as compiled
-from nnode.solvers.fused import crowd_laws, crowd_network, fallback
-from nnode.solvers.fused.crowd_cache import load
+from nnode.solvers.fused import fallback
 from tests.solvers.fused.compare import difference, single
 from tests.solvers.fused.test_fallback import Sway
 
@@ -38,7 +41,6 @@ MODELS = {
     "nn": lambda: [Relaxation(), network()],
     "nn_open": lambda: [network(3, mass=2.0, walls=False), Relaxation()],
     "nn_self": lambda: [Relaxation(), network(self_interaction=True)],
-    "nn_one": lambda: [Relaxation(), network(1)],
 }
 
 
@@ -96,6 +98,8 @@ def test_states_and_gradient(name: str, people: list[Sequence]) -> None:
     batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
     for threads in (1, 2):
         check(model, batch, FusedSolver(DT, threads))
+    if name not in ("sf", "nn"):
+        return  # each precision is compiled for
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
     found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
     assert found.x.dtype == own.dtype == torch.float32
@@ -120,7 +124,7 @@ def test_many_blocks_and_threads(name: str, crowd) -> None:  # type: ignore[no-u
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_rows_longer_than_a_piece(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
     draw = np.random.default_rng(5)
-    x = np.tile(draw.uniform(0, 25, (crowd_laws.SIZE + 21, 2)), (2, 1, 1))
+    x = np.tile(draw.uniform(0, 25, (SIZE + 21, 2)), (2, 1, 1))
     x[1] += 0.1
     wall = np.array([[-1.0, 0.0, 0.0, 0.0]])
     item = Sequence(name="l", recording="r", time=np.array([0, 0.1]), x=x, walls=wall)
@@ -181,7 +185,10 @@ def test_padding_stands_still(options: dict[str, float], people: list[Sequence])
     batch = single(people)
     x0, v0 = batch.x.clone().requires_grad_(), batch.v.clone().requires_grad_()
     moving = Batch(**{**vars(batch), "x": x0, "v": v0})
-    x, _ = compiled.simulate(Crowd(MODELS["nn"]()), moving, 2, **options)
+    model = Crowd(MODELS["nn"]())
+    law = compiled.supports(model, moving)
+    assert law is not None
+    x, _ = compiled.simulate(model, law, moving, 2, **options)
     padding = ~batch.agent
     assert padding.any()
     assert (x[:, padding] == batch.x[0, padding]).all()
@@ -221,17 +228,18 @@ def test_a_blow_up_is_reported(crowd) -> None:  # type: ignore[no-untyped-def]
 def test_one_compilation_for_all_shapes(people: list[Sequence], crowd) -> None:  # type: ignore[no-untyped-def]
     # arrays of another layout would be compiled for again, unnoticed but for the seconds
     for items in (people, people[3:4], [crowd(2, samples=2)], [crowd(3)] * 70):
-        for name in ("sf", "sf_open", "nn"):
-            gradient(Crowd(MODELS[name]()), FusedSolver(DT), collate(items))
-    module = load("crowd_dense")
+        gradient(Crowd(MODELS["sf"]()), FusedSolver(DT), collate(items))
+    law = compiled.supports(Crowd(MODELS["sf"]()))
+    assert law is not None
+    module = compiled.compiled(CrowdSource(law))
     for function in (module.forward, module.backward):
-        # two laws in two precisions
-        assert len(function.signatures) <= 4
+        assert 1 <= len(function.signatures) <= 2  # of two precisions
 
 
 def test_what_is_covered(people: list[Sequence]) -> None:
     class Weaker(SocialForce):
-        pass
+        def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+            return 0.5 * super().pair_force(dx, dv)
 
     batch = collate(people)
     assert compiled.supports(Crowd(MODELS["sf"]()), batch)
@@ -242,7 +250,13 @@ def test_what_is_covered(people: list[Sequence]) -> None:
     assert not compiled.supports(Crowd([*MODELS["sf"](), Sway()]))
     deep = Crowd(MODELS["nn"]())
     next(t for t in deep.terms if isinstance(t, NetworkForce)).pair = FeedForward((4, 3, 3, 2))
-    assert not compiled.supports(deep)
+    assert compiled.supports(deep)
+    alone = Crowd(MODELS["sf"]())
+    alone.neighbours = "measured"
+    assert not compiled.supports(alone)
+    # what sums run over is one for all of them, and only networks' may be over oneself
+    both = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
+    assert not compiled.supports(Crowd(both))
     batch.destination.requires_grad_()
     assert not compiled.supports(Crowd(MODELS["sf"]()), batch)
 
@@ -253,22 +267,51 @@ def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
         FusedSolver(DT, cutoff=0.4)(Crowd(MODELS["sf"]()), collate(people))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_loops_are_vector_code(dtype: type) -> None:
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_loops_are_vector_code(name: str) -> None:
     # losing this makes everything ten times slower and nothing else would tell
     from tests.simulate.test_lane_code import PACKED, platform
 
     if platform.machine() not in PACKED:
         pytest.skip("unknown instruction set")
-    room = np.ones(crowd_laws.ROWS * crowd_laws.SIZE, dtype)
-    row, social, neurons = room[:32], np.ones(5, dtype), np.ones((3, 7), dtype)
-    for function, arguments in (
-        (crowd_laws._social, (room, 32, social)),
-        (crowd_laws._social_pull, (room, 32, social, np.zeros(5))),
-        (crowd_laws._network_pull, (room, 32, neurons, np.zeros((3, 7)))),
-        (crowd_network._both, (room, row, row, 32)),
-        (crowd_network._slopes, (room, row, row, 32)),
-    ):
-        function(*arguments)
-        text = function.inspect_asm(function.signatures[-1])
-        assert re.findall(PACKED[platform.machine()], text), function.__name__
+    law = compiled.supports(Crowd(MODELS[name]()))
+    assert law is not None
+    source = CrowdSource(law)
+    module = compiled.compiled(source)
+    for kind in (np.float64, np.float32):
+        room, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
+        for function in (module.law_others_pull, module.law_points_pull):  # they divide
+            function(room, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
+            text = function.inspect_asm(function.signatures[-1])
+            assert re.findall(PACKED[platform.machine()], text), function.__name__
+
+
+#: What changes each part of a formula: sums over others, wall points and walls, inputs, clocks.
+EFFECTS = {
+    "sums": {
+        "alignment": {"c": 0.4},
+        "side_preference": {"c": 0.9},
+        "density_slowdown": {"c": 0.3},
+    },
+    "force": {"anticipation": {"T_a": 0.4}, "field_of_view": {"lambda_": 0.3}, "drift": {}},
+    "walls": {
+        "wall_repulsion": {"A_w": 0.8, "B_w": 0.3},
+        "group_cohesion": {"c": 0.5},
+        "gait_sway": {"a": 0.3, "f": 1.0, "people": {"a": [0.1, 0.4, 0.2, 0.9]}},
+        "walker_heterogeneity": {"people": {"c": [0.1, -0.3, 0.2, 0.4, 0.0, 0.1, 0.3]}},
+    },
+}
+
+
+@pytest.mark.parametrize(("base", "chosen"), [("sf", "walls"), ("nn", "force"), ("sf", "sums")])
+def test_effects(base: str, chosen: str, people: list[Sequence]) -> None:
+    names = ("g", "", "h", "g", "h", "g", "i", "h")
+    people = [replace(item, group=names[: item.x.shape[1]]) for item in people]
+    effects = [CATALOGUE.effects[name](**values) for name, values in EFFECTS[chosen].items()]
+    model = Crowd([*MODELS[base](), *effects])
+    check(model, single(people), FusedSolver(DT, 2))
+
+
+def test_effects_among_neighbours(people: list[Sequence]) -> None:
+    effects = [CATALOGUE.effects[name](**v) for name, v in EFFECTS["walls"].items()]
+    check(Crowd([*MODELS["sf"](), *effects]), single(people), FusedSolver(DT, cutoff=50.0))

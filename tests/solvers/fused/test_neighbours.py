@@ -9,12 +9,13 @@ import sys
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Linear, NetworkForce, Relaxation, SocialForce, Traffic
+from nnode.simulate import crowds, neighbours
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
-from nnode.solvers.fused import crowd, neighbours
 from tests.solvers.fused.compare import difference
 from tests.solvers.fused.test_crowd import gradient
 
@@ -151,7 +152,7 @@ def test_the_bound_of_a_given_distance(cutoff: float) -> None:
 
 
 def test_no_error_is_everybody() -> None:
-    batch = hall(crowd.LISTS_FROM + 20)
+    batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0)])
     with torch.no_grad():
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).x
@@ -184,6 +185,9 @@ def test_models_that_cannot_have_a_cutoff() -> None:
     class Weaker(SocialForce):
         """Not compiled."""
 
+        def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+            return 0.5 * super().pair_force(dx, dv)
+
     with pytest.raises(ConfigError, match=r"solver\.cutoff=1 m works for crowds.*set it to null"):
         solver(Crowd([Relaxation(), Weaker(1.0, 1.0, 1.0)]), batch)
     x = np.array([0.0, 12.0]) + np.arange(3.0)[:, None]
@@ -202,8 +206,10 @@ def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
     batch = hall(n)
     model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, walls=False)])
     with torch.no_grad():
-        _, v = crowd.simulate(model, batch, 1)
-        _, exact = crowd.simulate(model, batch, 1, cutoff_error=0)
+        law = crowds.supports(model, batch)
+        assert law is not None
+        _, v = crowds.simulate(model, law, batch, 1)
+        _, exact = crowds.simulate(model, law, batch, 1, cutoff_error=0)
     away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
     assert away * n < 1e-6 * A
 
@@ -220,7 +226,7 @@ def test_the_formula_of_the_bound() -> None:
 
 @pytest.mark.parametrize("walls", [False, True])
 def test_lists_give_the_gradient(walls: bool) -> None:
-    batch = hall(crowd.LISTS_FROM + 20)
+    batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0, walls=walls)])
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     for threads in (1, 2):
@@ -251,10 +257,11 @@ import resource
 import torch
 from tests.solvers.fused.test_neighbours import hall
 from nnode.models import Crowd, Relaxation, SocialForce
-from nnode.solvers.fused import crowd
+from nnode.simulate import crowds
 torch.set_num_threads(1)
 model = Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0)])
-crowd.simulate(model, hall(10_000, samples=26), 1)[0].square().sum().backward()
+law = crowds.supports(model)
+crowds.simulate(model, law, hall(10_000, samples=26), 1)[0].square().sum().backward()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 """
 

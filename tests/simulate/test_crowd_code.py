@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 
 from nnode.errors import ConfigError
-from nnode.solvers.fused import crowd_cache
+from nnode.models import Crowd, Relaxation, SocialForce
+from nnode.models.crowd_formula import crowd_of
+from nnode.simulate import crowd_templates, crowds, source
+from nnode.simulate.crowd_source import CrowdSource
 
 SCRIPT = """
 import json
@@ -23,8 +26,9 @@ batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x
 model = Crowd([Relaxation(), SocialForce(1.0, 1.0, 1.0)])
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-from nnode.solvers.fused.crowd_cache import load
-module = load("crowd_dense")
+from nnode.simulate.crowds import compiled, supports
+from nnode.simulate.crowd_source import CrowdSource
+module = compiled(CrowdSource(supports(model)))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
 print(json.dumps({"hits": hits}))
 """
@@ -46,31 +50,39 @@ def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
     assert len(list((tmp_path / "fused").glob("*.py"))) == 1
 
 
-def test_an_edit_changes_the_name(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    before = crowd_cache.digest(b"text")
-    assert before == crowd_cache.digest(b"text") != crowd_cache.digest(b"other")
-    for module in crowd_cache._COMPILED_IN:
-        assert module.__file__ is not None
-        file = tmp_path / Path(module.__file__).name
-        file.write_bytes(Path(module.__file__).read_bytes() + b"\n# edited\n")
-        with monkeypatch.context() as patch:
-            patch.setattr(module, "__file__", str(file))
-            assert crowd_cache.digest(b"text") != before
-
-
 def test_everything_that_is_compiled_in_counts() -> None:
-    # whatever a compiled file imports from the package must be part of the digest
-    counted = {module.__name__ for module in crowd_cache._COMPILED_IN}
-    names = [n.removeprefix("nnode.solvers.fused.") for n in counted if "fused" in n]
-    folder = Path(crowd_cache.__file__).parent
-    for name in ("crowd_dense", "crowd_sparse", *names):
-        for line in (folder / f"{name}.py").read_text(encoding="utf-8").splitlines():
+    # whatever compiled text imports from the package must be part of the digest
+    counted = {module.__name__ for module in crowds._COMPILED_IN}
+    texts = [
+        crowd_templates.HEAD,
+        *(Path(str(m.__file__)).read_text() for m in crowds._COMPILED_IN),
+    ]
+    for text in texts:
+        for line in text.splitlines():
             if line.startswith("from nnode.") and "nnode.errors" not in line:
-                assert line.split()[1] in counted, f"{name}: {line}"
+                assert line.split()[1] in counted, line
+
+
+def test_one_law_of_other_bodies_is_one_module() -> None:
+    one, other = SocialForce(1.0, 2.0, 3.0), SocialForce(4.0, 5.0, 6.0, r=0.3, B=0.2, mass=70.0)
+    texts = set()
+    for force in (one, other):
+        law = crowd_of([Relaxation(0.1 * len(texts) + 0.4), force])
+        assert law is not None
+        texts.add(CrowdSource(law).text())
+    assert len(texts) == 1
+
+
+def test_its_source_is_shown() -> None:
+    text = source(Crowd([Relaxation(), SocialForce(1.0, 2.0, 3.0)]))
+    assert "social_force.pair_x = sum over others of" in text
+    assert "def backward(" in text
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
+    law = crowd_of([SocialForce(1.0, 2.0, 3.0)])
+    assert law is not None
     with pytest.raises(ConfigError, match="NNODE_CACHE"):
-        crowd_cache.load.__wrapped__("crowd_dense")
+        crowds.compiled.__wrapped__(CrowdSource(law))

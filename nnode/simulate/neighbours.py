@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from nnode.errors import ConfigError
-from nnode.solvers.fused.crowd_laws import LOOP
+from nnode.simulate.crowd_rows import LOOP
 
 #: Cells are a hair wider than the cutoff, so that no rounding puts partners two cells apart.
 _WIDER = 1.0001

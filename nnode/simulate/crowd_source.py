@@ -1,0 +1,240 @@
+"""The compiled simulation of a crowd and its exact gradient, as source text.
+
+A step of Euler's method has two parts: sums over the others, over wall points and over walls, in
+which everybody meets everybody, or his neighbours; and accelerations of these sums. The gradients
+of both are made from the formulas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from nnode.laws.crowd import OTHERS, POINTS, SEEN, WALLS, CrowdLaw
+from nnode.laws.expression import Expr, below, symbol, symbols
+from nnode.laws.tensors import computed
+from nnode.laws.text import plain
+from nnode.simulate.crowd_rows import SIZE
+from nnode.simulate.crowd_templates import DENSE, HEAD, MEET, OWN, SPARSE, SPARSE_MEET
+from nnode.simulate.loops import Loop
+
+_STATE = ("x", "y", "vx", "vy")
+_FIELDS = ("goal_x", "goal_y", "people", "points", "start")
+#: Places of what is seen of others in the rows of states, and in the tables of walls.
+_RELATIVE = {OTHERS: ("dx", "dy", "dvx", "dvy"), POINTS: ("dx", "dy"), WALLS: ("dx", "dy")}
+_COUNT = {POINTS: "points", WALLS: "walls"}
+
+
+@dataclass(frozen=True)
+class CrowdSource:
+    """Source of a model.
+
+    Attributes:
+        law: flat.
+        near: whether people meet their neighbours only.
+    """
+
+    law: CrowdLaw
+    near: bool = False
+
+    @cached_property
+    def uniform(self) -> list[str]:
+        """Symbols of the array ``q``."""
+        return [*self.law.owned, *self.law.settings]
+
+    @cached_property
+    def fields(self) -> list[str]:
+        """What people have besides their states, in the rows behind those."""
+        names = [*_FIELDS, *self.law.inputs]
+        return [n for n in names if {n, f"{n}_j"} & self.law.symbols]
+
+    @cached_property
+    def own(self) -> list[str]:
+        """All rows of a person."""
+        return [*_STATE, *self.fields]
+
+    @cached_property
+    def over(self) -> dict[str, dict[str, Expr]]:
+        """What sums run over, and these."""
+        return {over: found for over, found in self.law.sums.items() if found}
+
+    @cached_property
+    def sums(self) -> list[str]:
+        return [name for found in self.over.values() for name in found]
+
+    @cached_property
+    def mutual(self) -> bool:
+        """Whether partners do the opposite to each other, so that one of both tells it all."""
+        found = list(self.over.get(OTHERS, {}).values())
+        return bool(found) and _opposite(found, [self.law.swapped(s) for s in found])
+
+    @cached_property
+    def kept(self) -> list[str]:
+        """Sums on which the gradient depends by itself."""
+        stored, ends = self.loop.adjoints(_seeds(self._rate), self._slopes_own)
+        inner = set(symbols([*stored.values(), *ends.values()]))
+        return [name for name in self.sums if name in inner]
+
+    # -- functions of rows -----------------------------------------------------------------------
+
+    @cached_property
+    def loop(self) -> Loop:
+        return Loop(self.uniform, options="LOOP", fixed=tuple(self.law.settings))
+
+    @cached_property
+    def _rate(self) -> dict[str, Expr]:
+        return {"O_x": self.law.rate[0], "O_y": self.law.rate[1]}
+
+    @cached_property
+    def _slopes_own(self) -> dict[str, str]:
+        return {f"D_{name}": name for name in (*_STATE, *self.sums)}
+
+    @cached_property
+    def rows(self) -> list[str]:
+        """All rows of the room."""
+        seen = [name for over in self.over for name in SEEN[over]]
+        state = [*self.own, *dict.fromkeys(seen), *(f"{n}_j" for n in self.law.inputs)]
+        weights = [f"W_{name}" for name in (*self.sums, "O_x", "O_y")]
+        slopes = [f"D_{name}" for name in (*_STATE, *dict.fromkeys(seen), *self.sums)]
+        return [*state, *self.sums, "O_x", "O_y", *weights, *slopes]
+
+    def at(self, row: str) -> int:
+        """Where a row begins."""
+        return self.rows.index(row) * SIZE
+
+    def text(self) -> str:
+        """The module's source."""
+        law = self.law
+        lines = [f"dvx/dt = {plain(law.rate[0])}", f"dvy/dt = {plain(law.rate[1])}"]
+        for over, found in self.over.items():
+            lines += [
+                f"{plain(symbol(n))} = sum over {over} of {plain(s)}" for n, s in found.items()
+            ]
+        places = "".join(f"_{row} = np.uint64({self.at(row)})\n" for row in self.rows)
+        places += self._table("KEPT", {name: self.sums.index(name) for name in self.kept})
+        text = HEAD.format(formula="\n".join(lines), rows=len(self.rows), places=places)
+        for over, found in self.over.items():
+            text += self._tables(over)
+            text += self.loop.function(f"law_{over}", found)
+            text += self.loop.pulled(f"law_{over}_pull", _seeds(found), self._slopes(over), [])
+            opposite = self.mutual and over == OTHERS
+            template = SPARSE_MEET if self.near else MEET
+            text += template.format(over=over, mutual=opposite, moving=over == OTHERS)
+        text += self._own_tables() + self.loop.function("law_own", self._rate)
+        text += self.loop.pulled("law_own_pull", _seeds(self._rate), self._slopes_own, [])
+        turned = [("own, sums, rate",), ("own, sums, weight", "to_own, to_sums")]
+        text += OWN.format(
+            **{
+                # rows are columns where everybody meets his neighbours
+                name: "".join(f"    {a} = {a.replace(',', '.T,')}.T\n" for a in arrays)
+                if self.near
+                else ""
+                for name, arrays in zip(("turned", "turned_back"), turned, strict=True)
+            }
+        )
+        return text + (SPARSE if self.near else DENSE).format(**self._pieces())
+
+    def _slopes(self, over: str) -> dict[str, str]:
+        used = set(symbols(self.over[over].values()))
+        names = [n for n in (*_RELATIVE[over], *_STATE) if n in used]
+        return {f"D_{name}": name for name in names}
+
+    def _table(self, name: str, places: dict[str, int]) -> str:
+        """Where rows begin in the room, and which rows they are outside it."""
+        rows = [[self.at(row), place] for row, place in places.items()]
+        return f"{name} = np.array({rows}, np.int64).reshape(-1, 2)\n"
+
+    def _tables(self, over: str) -> str:
+        """What a sum takes from receivers and sources, and what it gives back."""
+        used, relative, seen = symbols(self.over[over].values()), _RELATIVE[over], [*SEEN[over]]
+        apart = {n: relative.index(n) for n in used if n in relative}
+        own = {n: self.own.index(n) for n in used if n in self.own}
+        other = {n: seen.index(n) for n in used if n in seen and n not in relative}
+        other |= {n: self.own.index(n[:-2]) for n in used if n.endswith("_j")}
+        sums = {n: self.sums.index(n) for n in self.over[over]}
+        found = {
+            "APART": apart, "OWN": own, "OTHER": other, "SUMS": sums,
+            "WEIGHTS": {f"W_{n}": place for n, place in sums.items()},
+            "TO_BOTH": {f"D_{n}": place for n, place in apart.items()},
+            "TO_OWN": {f"D_{n}": c for c, n in enumerate(_STATE) if n in used},
+        }  # fmt: skip
+        return "\n\n" + "".join(self._table(f"{k}_{over}", v) for k, v in found.items())
+
+    def _own_tables(self) -> str:
+        """What accelerations take, and what their gradient gives back."""
+        used = set(symbols(self._rate.values()))
+        found = {
+            "HAVE": {n: i for i, n in enumerate(self.own) if n in used},
+            "MET": {n: i for i, n in enumerate(self.sums) if n in used},
+            "RATE": {"O_x": 0, "O_y": 1},
+            "WEIGHTS": {"W_O_x": 0, "W_O_y": 1},
+            "TO_STATE": {f"D_{n}": i for i, n in enumerate(_STATE)},
+            "TO_SUMS": {f"D_{n}": i for i, n in enumerate(self.sums)},
+        }
+        return "\n\n" + "".join(self._table(name, places) for name, places in found.items())
+
+    # -- drivers ---------------------------------------------------------------------------------
+
+    def _pieces(self) -> dict[str, object]:
+        meets: list[str] = []
+        pulls: list[str] = []
+        barriers: list[str] = []
+        for over in self.over:
+            calls, pull = f"meet_{over}(room, ", f"meet_{over}_pull(room, "
+            rest, back = "q, time, dt, total, sums", "q, time, dt, total, weighed, to_own"
+            if self.near:
+                source = {OTHERS: "own, pairs, meetings", POINTS: "barrier, touched, touches",
+                          WALLS: "solid, every, every.shape[1]"}[over]  # fmt: skip
+                near = (
+                    "touched, touches = points_near(own[:, 0], own[:, 1], barrier[:, 0], "
+                    "barrier[:, 1], cells, start, cutoff_wall, touched)"
+                )
+                for found, call, end in ((meets, calls, rest), (pulls, pull, back)):
+                    found += [near] if over == POINTS else []
+                    found.append(f"{call}own, {source}, {end})")
+                continue
+            count = _COUNT.get(over, "")
+            source = f"y, length, exists, rows_{over}, real_{over}, width, 0, {count}"
+            if over == OTHERS:
+                source = "y, length, exists, y, exists, width, first, shifts"
+            else:
+                table = f"barrier(members, people, {count}, table_{over})"
+                barriers.append(f"rows_{over}, real_{over} = {table}")
+            meets.append(f"{calls}{source}, {rest}, reaction)")
+            pulls.append(f"{pull}{source}, {back}, to_other)")
+        return {
+            "width": len(self.own), "sums": len(self.sums), "mutual": self.mutual,
+            "kept_width": 4 + len(self.kept), "meets": _lines(3, meets),
+            "pulls": _lines(3, pulls), "barriers": _lines(2, barriers),
+        }  # fmt: skip
+
+
+def _seeds(formulas: dict[str, Expr]) -> dict[Expr, Expr]:
+    found: dict[Expr, Expr] = {}
+    for row, node in formulas.items():
+        weight = symbol(f"W_{row}")
+        if not node.is_number():
+            found[node] = found[node] + weight if node in found else weight
+    return found
+
+
+def _opposite(found: list[Expr], swapped: list[Expr]) -> bool:
+    """Whether formulas are each other's opposite, tried at eight places."""
+    generator = torch.Generator().manual_seed(0)
+    values = {
+        node.value: 0.5 * torch.randn(8, generator=generator, dtype=torch.float64)
+        if node.value.startswith(("d", "v"))
+        else 0.3 + torch.rand(8, generator=generator, dtype=torch.float64)
+        for node in below([*found, *swapped])
+        if node.op == "symbol"
+    }
+    here, there = computed(found, values), computed(swapped, values)
+    return all(
+        torch.allclose(a, -b, rtol=1e-9, atol=1e-12) for a, b in zip(here, there, strict=True)
+    )
+
+
+def _lines(depth: int, lines: list[str]) -> str:
+    return "".join(f"{'    ' * depth}{line}\n" for line in lines)
