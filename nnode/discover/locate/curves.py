@@ -12,12 +12,12 @@ from torch import Tensor
 
 from nnode.discover.residuals.engine import Engine, fill, square_of
 from nnode.discover.residuals.fit import ROUGH, Fit, grams, limits, refine, sums
-from nnode.discover.residuals.variables import Curves, Variable
+from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
 from nnode.models.system import System
-from nnode.models.term import Interval, State, Term
+from nnode.models.term import State
 
 #: A curve may bend about so many times; several are tried.
 BENDS = (2, 5, 12)
@@ -31,25 +31,6 @@ MOST = 6
 UNKNOWN = 1e-9
 #: Columns that are computed at once.
 CHUNK = 128
-
-
-class Curve(Term):
-    """A curve as a term of a model: the flexible fit of what is left."""
-
-    name = "curve"
-    formula = "f(variable)"
-    source = "a curve without a formula, fitted to what a model leaves"
-
-    def __init__(self, variable: Variable, amounts: np.ndarray) -> None:
-        super().__init__()
-        self.variable = variable
-        self.amounts = torch.from_numpy(amounts)
-        self.declare("scale", 1.0, unit="1", bounds=Interval(0.0, 2.0))
-        self.scale: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        amount = self.scale * (self.variable.weights(state) @ self.amounts)
-        return amount[..., None] * self.variable.direction(state)
 
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
