@@ -108,6 +108,7 @@ class Bend:
         x, rate = x.clone().requires_grad_(), rate.clone().requires_grad_()
         with torch.enable_grad():
             value, now = motion._value(x, rate, t)
+            sums = value.sum(0).unbind()
         height, slope = motion.curve.variable.curve(now, motion.curve.amounts.numpy())
         n = len(height)
         follows = np.concatenate([motion.follows, np.zeros_like(motion.follows[:1])])
@@ -116,9 +117,9 @@ class Bend:
         #: of each vehicle's curve by everybody's places and speeds
         self._by = np.zeros((2, n, n, *shape))
         for i in range(n) if value.requires_grad else ():
-            seed = torch.zeros_like(value)
-            seed[:, i] = 1.0
-            both = torch.autograd.grad(value, (x, rate), seed, retain_graph=True, allow_unused=True)
+            both = torch.autograd.grad(
+                sums[i], (x, rate), retain_graph=True, allow_unused=True
+            )
             for part, found in zip(self._by, both, strict=True):
                 if found is not None:
                     part[i] = steep[i] * found[..., 0].numpy().T.reshape(n, *shape)

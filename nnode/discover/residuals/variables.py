@@ -44,8 +44,11 @@ class Variable:
         value = self.value(state)
         if self.lengths:
             turn = 2 * torch.pi / torch.tensor(self.lengths, dtype=value.dtype)
-            angle = value[..., None] * turn
-            return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+            # a clock is the same for all agents
+            own = value[..., :1] if value.stride(-1) == 0 else value
+            angle = own[..., None] * turn
+            found = torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+            return found.expand(*value.shape, -1)
         return hats(value, self.knots)
 
     def wave(self, number: int) -> Variable:
