@@ -18,7 +18,7 @@ from nnode.models.term import State
 
 
 class Bent(Motion):
-    """A motion whose last term is a curve.
+    """A motion whose last term is a curve, which acts on all followers.
 
     Args:
         base: the model without it.
@@ -43,21 +43,17 @@ class Bent(Motion):
 
     def rates(self, y: np.ndarray, given: Values) -> np.ndarray:
         found = super().rates(y, given)
-        _, x, rate = self._state(y, found, given["t"])
-        value = self._value(x, rate, given["t"])[1]
+        value = self.seen(*self.simulations(y, found), given["t"])[1]
         bend = self.curve.variable.curve(value, self.curve.amounts.numpy())[0]
         found[0, :-1] += np.where(self.follows, self.scale * bend[:-1], 0.0)
         return found
 
-    def _state(
-        self, y: np.ndarray, rates: np.ndarray, t: Any
-    ) -> tuple[tuple[int, ...], Tensor, Tensor]:
-        """The shape, and places and speeds ``(S, N, 1)`` of all simulations."""
-        n, shape = y.shape[1], y.shape[2:]
-        x, rate = (torch.from_numpy(one.reshape(n, -1)).T[..., None] for one in (y[0], rates[0]))
-        return shape, x, rate
+    def simulations(self, y: np.ndarray, rates: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Places and speeds ``(S, N, 1)`` of all simulations."""
+        x, rate = (torch.from_numpy(one.reshape(len(one), -1)) for one in (y[0], rates[0]))
+        return x.T[..., None], rate.T[..., None]
 
-    def _value(self, x: Tensor, rate: Tensor, t: Any) -> tuple[Tensor, np.ndarray]:
+    def seen(self, x: Tensor, rate: Tensor, t: Any) -> tuple[Tensor, np.ndarray]:
         """What the curve depends on: ``(S, N)``, and the same as ``(N, L, B)``."""
         sequences = self.follows.shape[2]
         # one time for all runs, or one for each simulation
@@ -104,10 +100,9 @@ class Bend:
     """
 
     def __init__(self, motion: Bent, y: np.ndarray, rates: np.ndarray, t: Any, slopes: Slopes):
-        shape, x, rate = motion._state(y, rates, t)
-        x, rate = x.clone().requires_grad_(), rate.clone().requires_grad_()
+        x, rate = (one.clone().requires_grad_() for one in motion.simulations(y, rates))
         with torch.enable_grad():
-            value, now = motion._value(x, rate, t)
+            value, now = motion.seen(x, rate, t)
             sums = value.sum(0).unbind()
         height, slope = motion.curve.variable.curve(now, motion.curve.amounts.numpy())
         n = len(height)
@@ -115,14 +110,12 @@ class Bend:
         self.height = np.where(follows, height, 0.0)
         steep = np.where(follows, motion.scale * slope, 0.0)
         #: of each vehicle's curve by everybody's places and speeds
-        self._by = np.zeros((2, n, n, *shape))
+        self._by = np.zeros((2, n, n, *y.shape[2:]))
         for i in range(n) if value.requires_grad else ():
-            both = torch.autograd.grad(
-                sums[i], (x, rate), retain_graph=True, allow_unused=True
-            )
+            both = torch.autograd.grad(sums[i], (x, rate), retain_graph=True, allow_unused=True)
             for part, found in zip(self._by, both, strict=True):
                 if found is not None:
-                    part[i] = steep[i] * found[..., 0].numpy().T.reshape(n, *shape)
+                    part[i] = steep[i] * found[..., 0].numpy().T.reshape(y.shape[1:])
         self.matrix = whole(slopes, y.shape)
         self.matrix[0] += np.einsum("ijkb,jqmkb->iqmkb", self._by[1], self.matrix[0])
         self.matrix[0, :, 0] += self._by[0]

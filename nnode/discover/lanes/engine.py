@@ -47,7 +47,7 @@ LARGE = 6.0
 #: Change of an agent's number by which derivatives are taken.
 SMALL = 1e-4
 #: Numbers of sequences times changes whose response is computed at once: so many fit the cache.
-BLOCK = 8192
+BLOCK = 4096
 #: Most past samples that a filter looks at.
 ORDER = 6
 
@@ -190,15 +190,16 @@ class TrafficEngine:
             rates: of a state M speeds ``(B, N, 1)``, m/s.
         """
         linear = self.linear(system, row)
-        found = rates(linear.along.state(linear.system))
-        size = max(1, BLOCK // len(self.batch))
         k, b, n = linear.states.shape[:3]
-        columns = [
-            self._columns(linear, linear.moved(torch.stack(part).reshape(-1, k, b, n, 1)))
-            for first in range(0, len(found), size)
-            if (part := found[first : first + size])
+        found = [
+            one.reshape(k, b, n).transpose(1, 2) for one in rates(linear.along.state(linear.system))
         ]
-        return torch.cat(columns)
+        size = max(1, BLOCK // b)
+        columns = []
+        for first in range(0, len(found), size):
+            source = torch.stack(found[first : first + size], 2).permute(2, 0, 3, 1)[..., None]
+            columns.append(self._columns(linear, linear.moved(source)))
+        return torch.cat([one.T for one in columns], 1).T
 
     def linear(self, system: System, row: Tensor) -> Response:
         """The linear response of a run, kept until another one is asked for."""
@@ -220,13 +221,15 @@ class TrafficEngine:
         away = self.batch.x[..., 0] - response.states[..., 0]
         residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
         weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
-        found = self.filter(torch.where(self.follows, -moved, 0.0))[:, self.seen]
-        return torch.nan_to_num(found * weight)
+        found = self.filter(torch.where(self.follows, -moved, 0.0)).permute(1, 2, 3, 0)[self.seen]
+        return torch.nan_to_num(found.mul_(weight[:, None])).T
 
     def near(self, system: System) -> System:
         """A copy whose law is fitted to the smoothed speeds: simulations started from there do
         not end in a far minimum. The regression itself is biased by noise, as a start it may."""
         found, batch = copy.deepcopy(system), self.smoothed
+        if any(getattr(term, "memory", 0) for term in found.terms):
+            return found  # speeds alone do not tell of states that nobody measures
         low, high = limits(found)
         along = Along(found.scene(batch), batch.x)
 

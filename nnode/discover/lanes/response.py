@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -68,7 +69,7 @@ class Response:
 
     With A the derivative of the rates with respect to the states, a change s of the rates moves
     the states by d' = A d + s, d = 0 at the start. The trapezoidal rule solves this at the
-    sampling times; rates at all times come from one call.
+    sampling times: vehicle by vehicle where the model is a formula, otherwise for all at once.
 
     Args:
         system: the model, with the run's parameters.
@@ -99,6 +100,7 @@ class Response:
             matrix = self._bend.matrix.reshape(size, size, *y.shape[2:]).transpose(2, 3, 0, 1)
             self._linear = Dense(torch.from_numpy(matrix.copy()), width, batch.dt)
 
+    @np.errstate(all="ignore")
     def moved(self, source: Tensor, start: Tensor | None = None) -> Tensor:
         """``(C, K, B, N)`` m: positions moved by changes of the rates.
 
@@ -113,34 +115,36 @@ class Response:
 
     def parameters(self) -> Tensor:
         """``(C, K, B, N)`` m per unit of each parameter that is calibrated."""
-        if self._motion is None:
-            return self._parameters_by_code()
-        own, found = trained(self.system), self._slopes
-        names = {(name, place): i for i, (name, place) in enumerate(_entries(own))}
-        shape = (len(names), self.states.shape[-1], self.states.shape[2])
-        source = np.zeros((*shape, len(self.states), len(self.batch)))
-        leads = self._motion.leads
-        for symbol, (name, place, _) in self._motion.lane.owned.items():
-            c = names.get((name, place))
-            if c is None:
-                continue
-            for (p, who), slope in found.parameters.items():
-                if who == symbol:
-                    source[c, p, :-1] += slope
-            if symbol in found.lead:
-                source[c, 0] += np.where(leads, found.lead[symbol], 0.0)
-        for i in range(shape[2] - 2, -1, -1):
-            for p, slope in found.chain.items():
-                source[:, p, i] += slope[i] * source[:, 0, i + 1]
-        if self._bend is not None:
-            assert isinstance(self._motion, Bent)
-            for c in range(len(source)):
-                source[c, 0] = self._bend.passed_on(source[c, 0])
-            source[names[self._motion.name, 0], 0] = self._bend.height
-        # (C, W, N, K, B) to (C, K, B, N, W)
-        return self.moved(torch.from_numpy(source).permute(0, 3, 4, 2, 1), self._starts(own))
+        own = trained(self.system)
+        source = self._sources_by_code() if self._motion is None else self._sources(self._motion)
+        return self.moved(source, self._starts(own))
 
-    def _starts(self, own: dict[str, torch.nn.Parameter]) -> Tensor | None:
+    def _sources(self, motion: Motion) -> Tensor:
+        """``(C, K, B, N, W)`` derivatives of the rates by the parameters."""
+        slopes, width = self._slopes, self.states.shape[-1]
+        entries = {entry: c for c, entry in enumerate(_entries(trained(self.system)))}
+        n, times, sequences = len(motion.leads), len(self.states), len(self.batch)
+        found = np.zeros((len(entries), width, n, times, sequences))
+        for symbol, (name, place, _) in motion.lane.owned.items():
+            c = entries.get((name, place))
+            if c is None:
+                continue  # it is not calibrated
+            for p in range(width):
+                if (p, symbol) in slopes.parameters:
+                    found[c, p, :-1] += slopes.parameters[p, symbol]
+            if symbol in slopes.lead:
+                found[c, 0] += np.where(motion.leads, slopes.lead[symbol], 0.0)
+        for i in range(n - 2, -1, -1):
+            for p, slope in slopes.chain.items():
+                found[:, p, i] += slope[i] * found[:, 0, i + 1]
+        if self._bend is not None:
+            assert isinstance(motion, Bent)
+            for own in found:
+                own[0] = self._bend.passed_on(own[0])
+            found[entries[motion.name, 0], 0] = self._bend.height
+        return torch.from_numpy(found).permute(0, 3, 4, 2, 1)
+
+    def _starts(self, own: Mapping[str, Tensor]) -> Tensor | None:
         """``(C, B, N, W)`` derivatives of the states at the start; None: they are measured."""
         if self.states.shape[-1] == self.system.order:
             return None
@@ -175,7 +179,8 @@ class Response:
         matrix: Tensor = vmap(moving)(ways).transpose(-1, -2).reshape(n * w, k, b, n * w)
         return matrix.permute(1, 2, 3, 0)
 
-    def _parameters_by_code(self) -> Tensor:
+    def _sources_by_code(self) -> Tensor:
+        """As :meth:`_sources`."""
         own = {name: p.detach() for name, p in trained(self.system).items()}
 
         def rates(parameters: dict[str, Tensor]) -> Tensor:
@@ -186,9 +191,9 @@ class Response:
             change = {n: torch.zeros_like(v) for n, v in own.items()}
             change[name].view(-1)[place] = 1.0
             sources.append(jvp(rates, (own,), (change,))[1])
-        return self.moved(torch.stack(sources), self._starts(trained(self.system)))
+        return torch.stack(sources)
 
 
-def _entries(own: Any) -> list[tuple[str, int]]:
+def _entries(own: Mapping[str, Tensor]) -> list[tuple[str, int]]:
     """The parameters' names and the places in them, as in a row."""
     return [(name, place) for name, value in own.items() for place in range(value.numel())]

@@ -98,7 +98,8 @@ class Engine(Protocol):
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
     ) -> Tensor:
         """``(M, n)`` derivatives of the residuals with respect to factors of M further rates
-        ``(B, N, D)``, m/s or m/s², that are functions of the state."""
+        ``(B, N, D)``, m/s or m/s², that are functions of the state; it may be of many times, each
+        as a simulation."""
         ...
 
     def individual(

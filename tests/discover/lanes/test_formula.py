@@ -16,13 +16,17 @@ from nnode.data.sequence import Sequence
 from nnode.discover.lanes import along, response, runs
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.lanes.straight import straight
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.variables import Curve
+from nnode.laws.parse import parse
+from nnode.laws.tensors import computed
 from nnode.models import System
 from nnode.models.build import add_effects, build_model
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.traffic import DriverHeterogeneity
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
+from tests.laws.test_tensors import FORMULAS
 
 LIN = {"term": "lin", "name": "lin", "v0": V0, "L": LENGTH, "L_min": 1.0}
 LOG = {"term": "log", "name": "log", "v0": 18.0, "L": LENGTH, "L_min": 1.0}
@@ -103,6 +107,15 @@ def rows_of(system: System) -> Tensor:
     return torch.stack([row, 1.01 * row, row + 0.01])
 
 
+@pytest.mark.parametrize("text", FORMULAS)
+def test_a_straight_line_function(text: str) -> None:
+    rng, node = np.random.default_rng(3), parse(text)
+    values = {name: rng.uniform(0.3, 2.0, 50) for name in "abc"}
+    (found,) = straight((node,))(values, ())
+    tensors = {name: torch.from_numpy(value) for name, value in values.items()}
+    same(torch.from_numpy(found), computed([node], tensors)[0], close=1e-14)
+
+
 @pytest.mark.parametrize(("law", "leader", "effects"), CASES)
 def test_runs_and_tangents(
     sequences: list[Sequence], law: dict[str, Any], leader: str, effects: tuple[str, ...]
@@ -136,6 +149,12 @@ def test_individual_effects(sequences: list[Sequence]) -> None:
     system = model(LIN, "measured", ("relative_speed",))
     row = row_of(system)
     same(*both(sequences, lambda e: e.individual(system, row, DriverHeterogeneity, {})), close=1e-8)
+
+
+def test_a_model_with_a_memory_starts_where_it_is(sequences: list[Sequence]) -> None:
+    system = model(LIN, "measured", ("inertia",))
+    found = TrafficEngine(sequences).near(system)
+    assert row_of(found).tolist() == row_of(system).tolist()
 
 
 @pytest.mark.parametrize("leader", ["measured", "constant"])
