@@ -6,6 +6,7 @@ whole; then L runs of a model, or L times of one run; then sequences.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -51,7 +52,8 @@ class Leaders:
     def at(self, t: float) -> list[np.ndarray]:
         """``(B,)`` both at one time."""
         position = t / self.dt
-        k = int(np.clip(np.floor(position + 1e-4), 0, len(self.samples[0]) - 2))
+        # as in the scene: a hair of tolerance keeps whole sample numbers whole
+        k = max(0, min(math.floor(position + 1e-4), len(self.samples[0]) - 2))
         share = min(max(position - k, 0.0), 1.0)
         return [one[k] + share * (one[k + 1] - one[k]) for one in self.samples]
 
@@ -94,7 +96,7 @@ class Motion:
     Attributes:
         values: of the parameters' symbols, numbers or ``(R, 1)``.
         follows: ``(N - 1, 1, B)`` True for those behind another vehicle.
-        leads: ``(N, 1, B)``
+        leads: ``(N, 1, B)`` True for those in front.
     """
 
     def __init__(
@@ -162,7 +164,6 @@ class Motion:
         rows = found.shape[1] - 1
         wide = [isinstance(part, np.ndarray) and part.ndim == 3 for part in known]
         for i in range(rows - 1, -1, -1):
-            # with the inputs' rows there may be one row only
             here = tuple(p[i] if w else p for p, w in zip(known, wide, strict=True))
             out = self.code.rates({"dx_1": found[0, i + 1]}, here)
             self._put(found[:, i], out, self.follows[i])
