@@ -15,12 +15,13 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
+from nnode.discover.lanes.along import Along
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
 from nnode.discover.lanes.response import Response
+from nnode.discover.lanes.runs import side_by_side
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
 from nnode.discover.residuals.engine import (
-    Ensemble,
     Squares,
     fill,
     names_of,
@@ -45,6 +46,8 @@ WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
 LARGE = 6.0
 #: Change of an agent's number by which derivatives are taken.
 SMALL = 1e-4
+#: Numbers of sequences times changes whose response is computed at once: so many fit the cache.
+BLOCK = 4096
 #: Most past samples that a filter looks at.
 ORDER = 6
 
@@ -107,28 +110,28 @@ class TrafficEngine:
         weight = [s.n_samples * (s.n_agents - 1) for s in self.sequences if s.n_samples > 4]
         return float(np.average(found, weights=weight)) if found else float("nan")
 
+    @np.errstate(all="ignore")
     def simulate(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N, W)`` states; their first component are positions, m."""
         batch = self.smoothed
-        runs = Ensemble(system, rows, system.scene(batch))
+        runs = side_by_side(system, rows, system.scene(batch))
         longest = min(STEP, fastest(system, rows))
         # several samples in a step, or several steps in a sample
         stride = max(1, math.floor(longest / batch.dt + 1e-9))
         steps = max(1, math.ceil(batch.dt / longest - 1e-9))
         h = batch.dt * stride / steps
         y = runs.start(batch)
-        rate = runs.recorded_rate(_time(0.0), y)
-        slope, found = rate(_time(0.0), y), [y]
+        slope, found = runs.rate(0.0, y), [y]
         number = math.ceil((batch.n_samples - 1) / stride) * steps
         for step in range(number):
             t = step * h
-            after = runge_kutta(rate, _time(t), y, h, slope)
-            then = rate(_time(t + h), after)
+            after = runge_kutta(runs.rate, t, y, h, slope)
+            then = runs.rate(t + h, after)
             found += _between(y, slope, after, then, h, stride)
             if (step + 1) % steps == 0:
                 found.append(after)
             y, slope = after, then
-        return torch.stack(found[: batch.n_samples], 1)
+        return runs.states(found[: batch.n_samples])
 
     def deviations(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N)`` measured minus simulated positions, m; 0 for leaders and outside of
@@ -157,15 +160,15 @@ class TrafficEngine:
         response = self.linear(system, row)
         if effect.memory:
             return self._whole(response, effect, probe)
-        base = response.rates(response.system)
+        base = response.along.rates(response.system)
         sources = []
         if not probe.steps:
             changed, _ = extended(response.system, effect(**probe.options))
-            sources.append(response.rates(changed) - base)
+            sources.append(response.along.rates(changed) - base)
         for name, step in probe.steps.items():
             value = effect.strengths[name].neutral + step
             changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
-            sources.append((response.rates(changed) - base) / step)
+            sources.append((response.along.rates(changed) - base) / step)
         return self._columns(response, response.moved(torch.stack(sources)))
 
     def _whole(self, response: Response, effect: type[Effect], probe: Probe) -> Tensor:
@@ -187,18 +190,16 @@ class TrafficEngine:
             rates: of a state M speeds ``(B, N, 1)``, m/s.
         """
         linear = self.linear(system, row)
-        scene, lead = linear.scene, linear.scene.leader[..., None]
-
-        def one(t: Tensor, y: Tensor, rate: Tensor) -> Tensor:
-            x = torch.where(lead, scene.measured_at(t), y[..., :1])
-            speed = torch.where(lead, scene.measured_rate_at(t), rate[..., :1])
-            return torch.stack(rates(State(t, x, None, scene, linear.system, speed)))
-
-        base = linear.rates(linear.system)
-        with torch.no_grad():
-            found = torch.func.vmap(one)(linear.time, linear.states, base).transpose(0, 1)
-        rest = found.new_zeros(*found.shape[:-1], base.shape[-1] - 1)
-        return self._columns(linear, linear.moved(torch.cat([found, rest], -1)))
+        k, b, n = linear.states.shape[:3]
+        found = [
+            one.reshape(k, b, n).transpose(1, 2) for one in rates(linear.along.state(linear.system))
+        ]
+        size = max(1, BLOCK // b)
+        columns = []
+        for first in range(0, len(found), size):
+            source = torch.stack(found[first : first + size], 2).permute(2, 0, 3, 1)[..., None]
+            columns.append(self._columns(linear, linear.moved(source)))
+        return torch.cat([one.T for one in columns], 1).T
 
     def linear(self, system: System, row: Tensor) -> Response:
         """The linear response of a run, kept until another one is asked for."""
@@ -220,22 +221,20 @@ class TrafficEngine:
         away = self.batch.x[..., 0] - response.states[..., 0]
         residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
         weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
-        found = self.filter(torch.where(self.follows, -moved, 0.0))[:, self.seen]
-        return torch.nan_to_num(found * weight)
+        found = self.filter(torch.where(self.follows, -moved, 0.0)).permute(1, 2, 3, 0)[self.seen]
+        return torch.nan_to_num(found.mul_(weight[:, None])).T
 
     def near(self, system: System) -> System:
         """A copy whose law is fitted to the smoothed speeds: simulations started from there do
         not end in a far minimum. The regression itself is biased by noise, as a start it may."""
-        found = copy.deepcopy(system)
-        batch, scene = self.smoothed, found.scene(self.smoothed)
+        found, batch = copy.deepcopy(system), self.smoothed
+        if any(getattr(term, "memory", 0) for term in found.terms):
+            return found  # speeds alone do not tell of states that nobody measures
         low, high = limits(found)
-        time = batch.dt * torch.arange(batch.n_samples, dtype=torch.float64)
-        every = torch.func.vmap(lambda t, x: found(t, x, scene))
+        along = Along(found.scene(batch), batch.x)
 
         def missed(row: np.ndarray) -> np.ndarray:
-            fill(found, torch.from_numpy(row))
-            with torch.no_grad():
-                speed = every(time, batch.x)[..., 0]
+            speed = along.rates(fill(found, torch.from_numpy(row)))[..., 0]
             away: np.ndarray = (batch.v[..., 0] - speed)[self.follows].numpy()
             return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
 
@@ -269,7 +268,7 @@ class TrafficEngine:
             for own in people.values():
                 if place is not None:
                     own[place] += number * SMALL
-            return linear.rates(extended(plain, effect(people=people, **values))[0])
+            return linear.along.rates(extended(plain, effect(people=people, **values))[0])
 
         base = rates(None)
         sources = [(rates(place) - base) / SMALL for place in range(size)]
@@ -314,13 +313,7 @@ def _fast(term: nn.Module) -> dict[str, float]:
     return term.fast
 
 
-def _time(t: float) -> Tensor:
-    return torch.tensor(t, dtype=torch.float64)
-
-
-def _between(
-    before: Tensor, start: Tensor, after: Tensor, end: Tensor, h: float, stride: int
-) -> list[Tensor]:
+def _between(before: Any, start: Any, after: Any, end: Any, h: float, stride: int) -> list[Any]:
     """States at the samples within a step of ``h`` s, by Hermite's cubic interpolation."""
     x0, v0, x1, v1 = before, start, after, end
     found = []

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from nnode.discover.residuals.engine import Engine, fill, square_of
 from nnode.discover.residuals.fit import ROUGH, Fit, grams, limits, refine, sums
-from nnode.discover.residuals.variables import Curves, Variable
+from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
 from nnode.models.system import System
-from nnode.models.term import Interval, State, Term
+from nnode.models.term import State
 
 #: A curve may bend about so many times; several are tried.
 BENDS = (2, 5, 12)
@@ -29,42 +29,19 @@ FLIPS = 7999
 MOST = 6
 #: A share of the knowledge of a height that is none, but for rounding.
 UNKNOWN = 1e-9
-#: Columns that are computed at once.
-CHUNK = 128
-
-
-class Curve(Term):
-    """A curve as a term of a model: the flexible fit of what is left."""
-
-    name = "curve"
-    formula = "f(variable)"
-    source = "a curve without a formula, fitted to what a model leaves"
-
-    def __init__(self, variable: Variable, amounts: np.ndarray) -> None:
-        super().__init__()
-        self.variable = variable
-        self.amounts = torch.from_numpy(amounts)
-        self.declare("scale", 1.0, unit="1", bounds=Interval(0.0, 2.0))
-        self.scale: Tensor
-
-    def forward(self, state: State) -> Tensor:
-        amount = self.scale * (self.variable.weights(state) @ self.amounts)
-        return amount[..., None] * self.variable.direction(state)
+#: Waves that are looked at together.
+WAVES = 64
 
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
     """``(n, M)`` changes of the residuals per unit of the curve's weights."""
-    total = 2 * len(variable.lengths) or len(variable.knots)
-    row, found = torch.from_numpy(fit.row), []
-    for first in range(0, total, CHUNK):
-        part = slice(first, first + CHUNK)
 
-        def rates(state: State, part: slice = part) -> list[Tensor]:
-            weights, way = variable.weights(state)[..., part], variable.direction(state)
-            return [weight[..., None] * way for weight in weights.unbind(-1)]
+    def rates(state: State) -> list[Tensor]:
+        weights, way = variable.weights(state), variable.direction(state)
+        return list((weights.movedim(-1, 0)[..., None] * way).unbind())
 
-        found.append(engine.response(fit.system, row, rates).numpy().T)
-    return np.concatenate(found, 1)
+    found: np.ndarray = engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
+    return found
 
 
 def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -> list[Curves]:
@@ -107,18 +84,27 @@ class _Look:
 
     def __init__(self, engine: Engine, fit: Fit, screen: Screen, variable: Variable) -> None:
         self.engine, self.fit, self.variable = engine, fit, variable
-        columns = columns_of(engine, fit, variable)
-        self.z = screen.beyond(columns)
-        self.parts = sums(self.z * fit.residual[:, None], engine.cluster)
-        self.total = screen.flipped(screen.parts(self.z, engine.cluster))
-        self.absorbed = np.linalg.lstsq(fit.jacobian, columns, rcond=1e-9)[0]
-        self.squares: list[np.ndarray] = []
+        self.screen, self.squares = screen, list[np.ndarray]()
         if variable.lengths:
             self._look_for_waves()
         else:
             self._look_for_curves()
 
+    def _looked(self, variable: Variable) -> tuple[np.ndarray, np.ndarray]:
+        """Columns of a variable's weights, and their sums ``(F, M)`` under sign flips."""
+        columns = columns_of(self.engine, self.fit, variable)
+        self.z = self.screen.beyond(columns)
+        parts = self.screen.parts(self.z, self.engine.cluster)
+        return columns, self.screen.flipped(parts)
+
+    def _settle(self, columns: np.ndarray) -> None:
+        """Keep what is said of the weights with these columns."""
+        self.parts = sums(self.z * self.fit.residual[:, None], self.engine.cluster)
+        self.absorbed = np.linalg.lstsq(self.fit.jacobian, columns, rcond=1e-9)[0]
+
     def _look_for_curves(self) -> None:
+        columns, total = self._looked(self.variable)
+        self._settle(columns)
         whole = self.z.T @ self.z
         number = len(whole)
         bend = np.diff(np.eye(number), 2, axis=0)
@@ -127,23 +113,34 @@ class _Look:
         for bends in BENDS:
             smooth = (number / (np.pi * bends)) ** 4 * bend.T @ bend
             self.penalties.append(size * (smooth + RIDGE * np.eye(number)))
-            solved = np.linalg.solve(whole + self.penalties[-1], self.total.T)
-            self.squares.append((self.total.T * solved).sum(0))
+            solved = np.linalg.solve(whole + self.penalties[-1], total.T)
+            self.squares.append((total.T * solved).sum(0))
 
     def _look_for_waves(self) -> None:
-        z, total = self.z, self.total
-        sine, cosine = z[:, ::2], z[:, 1::2]
+        """Some at a time: there may be many, and only the best one is kept."""
+        every, best = self.variable.lengths, 0
+        largest, most = np.full(0, -np.inf), -np.inf
+        for first in range(0, len(every), WAVES):
+            some = replace(self.variable, lengths=every[first : first + WAVES])
+            squares = self._squares(self._looked(some)[1])
+            if squares[0].max() > most:
+                best, most = first + int(np.argmax(squares[0])), squares[0].max()
+            own = squares.max(1)
+            largest = np.maximum(largest, own) if len(largest) else own
+        self.squares.append(largest)
+        self.variable = self.variable.wave(best)
+        self._settle(self._looked(self.variable)[0])
+        self.penalties = [np.zeros((2, 2))]
+
+    def _squares(self, total: np.ndarray) -> np.ndarray:
+        """``(F, waves)`` what waves explain under sign flips, of their sums ``(F, 2 waves)``."""
+        sine, cosine = self.z[:, ::2], self.z[:, 1::2]
         a, b = (sine**2).sum(0), (sine * cosine).sum(0)
         c = (cosine**2).sum(0)
         determinant = np.maximum(a * c - b**2, 1e-12 * (a * c + 1e-300))
         s, t = total[:, ::2], total[:, 1::2]
-        squares = (c * s**2 - 2 * b * s * t + a * t**2) / determinant
-        self.squares.append(squares.max(1))
-        best = int(np.argmax(squares[0]))
-        own = slice(2 * best, 2 * best + 2)
-        self.variable = self.variable.wave(best)
-        self.z, self.parts, self.absorbed = z[:, own], self.parts[:, own], self.absorbed[:, own]
-        self.penalties = [np.zeros((2, 2))]
+        found: np.ndarray = (c * s**2 - 2 * b * s * t + a * t**2) / determinant
+        return found
 
     def best(self, before: np.ndarray, p_value: float) -> Curves:
         """With the smoothing that predicts best.

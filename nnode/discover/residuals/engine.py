@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from nnode.data.sequence import Batch, Sequence
-from nnode.discover.residuals.traced import recorded
 from nnode.models.effects import Effect, IndividualEffect, Probe
-from nnode.models.scene import Scene
 from nnode.models.system import System
 from nnode.models.term import State
 
@@ -23,6 +20,8 @@ if TYPE_CHECKING:
 
 
 Rate = Callable[[Tensor, Tensor], Tensor]
+_Time = TypeVar("_Time", float, Tensor)
+_States = TypeVar("_States", np.ndarray, Tensor)
 
 
 @dataclass
@@ -99,7 +98,8 @@ class Engine(Protocol):
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
     ) -> Tensor:
         """``(M, n)`` derivatives of the residuals with respect to factors of M further rates
-        ``(B, N, D)``, m/s or m/s², that are functions of the state."""
+        ``(B, N, D)``, m/s or m/s², that are functions of the state; it may be of many times, each
+        as a simulation."""
         ...
 
     def individual(
@@ -168,55 +168,18 @@ def fill(system: System, row: Tensor) -> System:
     return system
 
 
-@dataclass
-class Ensemble:
-    """The right-hand side of R runs of one model at once.
-
-    Attributes:
-        system: the model.
-        rows: ``(R, K)`` the runs' parameters.
-        scene: the surroundings, the same in all runs.
-    """
-
-    system: System
-    rows: Tensor
-    scene: Scene
-
-    def __post_init__(self) -> None:
-        own = trained(self.system)
-        parts = self.rows.split([p.numel() for p in own.values()], 1)
-        self._parameters = {
-            name: part.reshape(-1, *p.shape)
-            for (name, p), part in zip(own.items(), parts, strict=True)
-        }
-        self._rate = torch.func.vmap(self._one, in_dims=(0, None, 0))
-
-    def _one(self, parameters: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
-        found: Tensor = functional_call(self.system, parameters, (t, y, self.scene))
-        return found
-
-    def start(self, batch: Batch) -> Tensor:
-        """``(R, B, N, ...)`` states at the first sample."""
-        y = self.system.initial(batch)
-        return y.expand(len(self.rows), *y.shape).clone()
-
-    def rate(self, t: Tensor, y: Tensor) -> Tensor:
-        """Time derivative of the states ``(R, B, N, ...)`` at time ``t`` (s)."""
-        return self._rate(self._parameters, t, y)
-
-    def recorded_rate(self, t: Tensor, y: Tensor) -> Rate:
-        """:meth:`rate` for many calls with states like ``y``."""
-        names, values = list(self._parameters), list(self._parameters.values())
-
-        def rate(t: Tensor, y: Tensor, *values: Tensor) -> Tensor:
-            found: Tensor = self._rate(dict(zip(names, values, strict=True)), t, y)
-            return found
-
-        graph = recorded(rate, [t, y, *values])
-        return lambda t, y: graph(t, y, *values)
+def runs_of(system: System, rows: Tensor) -> dict[str, Tensor]:
+    """``(R, ...)`` the calibrated parameters of R runs by name, from rows ``(R, K)``."""
+    own = trained(system)
+    parts = rows.split([p.numel() for p in own.values()], 1)
+    return {
+        name: part.reshape(-1, *p.shape) for (name, p), part in zip(own.items(), parts, strict=True)
+    }
 
 
-def runge_kutta(rate: Rate, t: Tensor, y: Tensor, h: float, k1: Tensor) -> Tensor:
+def runge_kutta(
+    rate: Callable[[_Time, _States], _States], t: _Time, y: _States, h: float, k1: _States
+) -> _States:
     """The states after a step of ``h`` s by the classical method of fourth order, from those
     and their rates ``k1`` before."""
     k2 = rate(t + h / 2, y + h / 2 * k1)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from scipy import stats
+from scipy.sparse import csr_array
 
 from nnode.calibrate.least_squares import box_step
 from nnode.discover.residuals.engine import Engine, fill, names_of, row_of
@@ -134,8 +135,9 @@ def _moved(parts: list[_Others], least: float) -> np.ndarray:
 
 def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:
     """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1."""
-    found = np.zeros((int(label.max()) + 1, *values.shape[1:]))
-    np.add.at(found, label, values)
+    number, count = int(label.max()) + 1, len(label)
+    member = csr_array((np.ones(count), (label, np.arange(count))), (number, count))
+    found: np.ndarray = member @ values
     return found
 
 

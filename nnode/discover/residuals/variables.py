@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.discover.residuals.comparison import Comparison
-from nnode.models.term import State
+from nnode.models.term import Interval, State, Term
 
 #: Knots over which a wave is reported, and its lengths that they span.
 WAVE_KNOTS, WAVES = 17, 2.0
@@ -44,8 +44,11 @@ class Variable:
         value = self.value(state)
         if self.lengths:
             turn = 2 * torch.pi / torch.tensor(self.lengths, dtype=value.dtype)
-            angle = value[..., None] * turn
-            return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+            # a clock is the same for all agents
+            own = value[..., :1] if value.stride(-1) == 0 else value
+            angle = own[..., None] * turn
+            found = torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+            return found.expand(*value.shape, -1)
         return hats(value, self.knots)
 
     def wave(self, number: int) -> Variable:
@@ -55,6 +58,17 @@ class Variable:
         knots = tuple(first + float(s) * length for s in np.linspace(0, WAVES, WAVE_KNOTS))
         return replace(self, lengths=(length,), knots=knots)
 
+    def curve(self, value: np.ndarray, amounts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A curve by the amounts ``(M,)`` of its weights, and its slope, at values of any shape."""
+        if self.lengths:
+            turn = 2 * np.pi / np.array(self.lengths)
+            angle = value[..., None] * turn
+            sine, cosine = np.sin(angle), np.cos(angle)
+            a, b = amounts[::2], amounts[1::2]
+            return sine @ a + cosine @ b, cosine @ (turn * a) - sine @ (turn * b)
+        slope = np.concatenate([[0.0], np.diff(amounts) / np.diff(self.knots), [0.0]])
+        return np.interp(value, self.knots, amounts), slope[np.searchsorted(self.knots, value)]
+
     def heights(self, amounts: np.ndarray) -> np.ndarray:
         """``(knots, ...)`` a curve at the knots by the amounts ``(M, ...)`` of its weights."""
         if not self.lengths:
@@ -62,6 +76,25 @@ class Variable:
         turn = 2 * np.pi * np.array(self.knots) / self.lengths[0]
         found: np.ndarray = np.stack([np.sin(turn), np.cos(turn)], 1) @ amounts
         return found
+
+
+class Curve(Term):
+    """A curve as the last term of a model: the flexible fit of what is left."""
+
+    name = "curve"
+    formula = "f(variable)"
+    source = "a curve without a formula, fitted to what a model leaves"
+
+    def __init__(self, variable: Variable, amounts: np.ndarray) -> None:
+        super().__init__()
+        self.variable = variable
+        self.amounts = torch.from_numpy(amounts)
+        self.declare("scale", 1.0, unit="1", bounds=Interval(0.0, 2.0))
+        self.scale: Tensor
+
+    def forward(self, state: State) -> Tensor:
+        amount = self.scale * (self.variable.weights(state) @ self.amounts)
+        return amount[..., None] * self.variable.direction(state)
 
 
 def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:

@@ -1,0 +1,101 @@
+"""R runs of one model side by side: by its formula, or by PyTorch where a term is code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.func import functional_call
+
+from nnode.data.sequence import Batch
+from nnode.discover.lanes.bent import motion_of
+from nnode.discover.lanes.motion import Leaders, Motion
+from nnode.discover.residuals.engine import runs_of
+from nnode.discover.residuals.traced import recorded
+from nnode.models.scene import Scene
+from nnode.models.system import System
+
+
+class Runs(Protocol):
+    """States and their rates are arrays of whatever kind."""
+
+    def start(self, batch: Batch) -> Any:
+        """At the first sample."""
+        ...
+
+    def rate(self, t: float, y: Any) -> Any:
+        """Time derivative of the states at time ``t`` (s)."""
+        ...
+
+    def states(self, found: list[Any]) -> Tensor:
+        """``(R, K, B, N, W)`` of K times."""
+        ...
+
+
+def side_by_side(system: System, rows: Tensor, scene: Scene) -> Runs:
+    """Runs of a model with parameters ``(R, K)``, see
+    :func:`~nnode.discover.residuals.engine.row_of`."""
+    motion = motion_of(system, scene, runs_of(system, rows))
+    if motion is None:
+        return _ByCode(system, rows, scene)
+    return _ByFormula(system, len(rows), motion, Leaders(scene))
+
+
+class _ByFormula:
+    """States are ``(M, N, R, B)``; see :class:`Motion`."""
+
+    def __init__(self, system: System, number: int, motion: Motion, leaders: Leaders) -> None:
+        self._system, self._number, self._motion, self._leaders = system, number, motion, leaders
+
+    def start(self, batch: Batch) -> np.ndarray:
+        with torch.no_grad():
+            y = self._system.initial(batch).permute(2, 1, 0).numpy()[:, :, None]
+        return np.repeat(y, self._number, 2)
+
+    def rate(self, t: float, y: np.ndarray) -> np.ndarray:
+        motion = self._motion
+        place, speed = self._leaders.at(t)
+        y = motion.placed(y, place)
+        found = motion.rates(y, motion.given(t, y, speed))
+        if motion.measured:
+            # a leader's state is never read: its place is known at every time
+            np.copyto(found, 0.0, where=motion.leads)
+        return found
+
+    def states(self, found: list[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.stack(found)).permute(3, 0, 4, 2, 1).contiguous()
+
+
+class _ByCode:
+    """States are ``(R, B, N, W)``; a step is recorded, so that it is arithmetic alone."""
+
+    def __init__(self, system: System, rows: Tensor, scene: Scene) -> None:
+        self._system, self._scene = system, scene
+        self._parameters = runs_of(system, rows)
+        self._number = len(rows)
+        self._graph: Callable[..., Tensor] | None = None
+
+    def start(self, batch: Batch) -> Tensor:
+        y = self._system.initial(batch)
+        return y.expand(self._number, *y.shape).clone()
+
+    def rate(self, t: float, y: Tensor) -> Tensor:
+        time, values = torch.tensor(t, dtype=torch.float64), list(self._parameters.values())
+        if self._graph is None:
+            self._graph = recorded(self._every, [time, y, *values])
+        return self._graph(time, y, *values)
+
+    def states(self, found: list[Tensor]) -> Tensor:
+        return torch.stack(found, 1)
+
+    def _every(self, t: Tensor, y: Tensor, *values: Tensor) -> Tensor:
+        own = dict(zip(self._parameters, values, strict=True))
+        found: Tensor = torch.func.vmap(self._one, in_dims=(0, None, 0))(own, t, y)
+        return found
+
+    def _one(self, parameters: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
+        found: Tensor = functional_call(self._system, parameters, (t, y, self._scene))
+        return found
