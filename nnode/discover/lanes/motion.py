@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.discover.lanes.straight import Straight, straight
+from nnode.laws.arrays import Straight, straight
 from nnode.laws.differentiate import derivatives
 from nnode.laws.expression import Expr
 from nnode.laws.lane import Lane

@@ -16,9 +16,9 @@ from nnode.data.sequence import Sequence
 from nnode.discover.lanes import along, response, runs
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.lanes.straight import straight
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.variables import Curve
+from nnode.laws.arrays import straight
 from nnode.laws.parse import parse
 from nnode.laws.tensors import computed
 from nnode.models import System
