@@ -76,6 +76,15 @@ def bring(room: Any, table: Any, a: Any, low: int, n: int) -> None:
 
 
 @njit(**LOOP)
+def less(room: Any, table: Any, a: Any, n: int) -> None:
+    """From what is in the room: the first number of rows of a."""
+    for r in range(table.shape[0]):
+        target, first = room[table[r, 0] :], a[table[r, 1], 0]
+        for t in range(np.uint64(n)):
+            target[t] = target[t] - first
+
+
+@njit(**LOOP)
 def bring_back(a: Any, table: Any, low: int, room: Any, n: int) -> None:
     """Out of the room."""
     for r in range(table.shape[0]):

@@ -16,11 +16,13 @@ from nnode.laws.crowd import OTHERS, POINTS, SEEN, WALLS, CrowdLaw
 from nnode.laws.expression import Expr, below, symbol, symbols
 from nnode.laws.tensors import computed
 from nnode.laws.text import plain
+from nnode.simulate.affine import Feature, split
 from nnode.simulate.crowd_rows import SIZE
-from nnode.simulate.crowd_templates import DENSE, HEAD, MEET, OWN, SPARSE, SPARSE_MEET
+from nnode.simulate.crowd_templates import DENSE, HEAD, KNOW, MEET, OWN, SPARSE, SPARSE_MEET
 from nnode.simulate.loops import Loop
 
 _STATE = ("x", "y", "vx", "vy")
+_POINT = ("x", "y", "normal_x", "normal_y")
 _FIELDS = ("goal_x", "goal_y", "people", "points", "start")
 #: Places of what is seen of others in the rows of states, and in the tables of walls.
 _RELATIVE = {OTHERS: ("dx", "dy", "dvx", "dvy"), POINTS: ("dx", "dy"), WALLS: ("dx", "dy")}
@@ -45,6 +47,16 @@ class CrowdSource:
         return [*self.law.owned, *self.law.settings]
 
     @cached_property
+    def _split(self) -> tuple[CrowdLaw, dict[str, dict[str, Feature]]]:
+        # pair by pair there is little to save
+        return (self.law, {}) if self.near else split(self.law, self.uniform)
+
+    @property
+    def features(self) -> dict[str, dict[str, Feature]]:
+        """Numbers of receivers and sources whose differences sums are made of, if they are."""
+        return self._split[1]
+
+    @cached_property
     def fields(self) -> list[str]:
         """What people have besides their states, in the rows behind those."""
         names = [*_FIELDS, *self.law.inputs]
@@ -58,7 +70,7 @@ class CrowdSource:
     @cached_property
     def over(self) -> dict[str, dict[str, Expr]]:
         """What sums run over, and these."""
-        return {over: found for over, found in self.law.sums.items() if found}
+        return {over: found for over, found in self._split[0].sums.items() if found}
 
     @cached_property
     def sums(self) -> list[str]:
@@ -68,6 +80,8 @@ class CrowdSource:
     def mutual(self) -> bool:
         """Whether partners do the opposite to each other, so that one of both tells it all."""
         found = list(self.over.get(OTHERS, {}).values())
+        if OTHERS in self.features:
+            return False
         return bool(found) and _opposite(found, [self.law.swapped(s) for s in found])
 
     @cached_property
@@ -85,7 +99,8 @@ class CrowdSource:
 
     @cached_property
     def _rate(self) -> dict[str, Expr]:
-        return {"O_x": self.law.rate[0], "O_y": self.law.rate[1]}
+        x, y = self._split[0].rate
+        return {"O_x": x, "O_y": y}
 
     @cached_property
     def _slopes_own(self) -> dict[str, str]:
@@ -97,6 +112,9 @@ class CrowdSource:
         seen = [name for over in self.over for name in SEEN[over]]
         state = [*self.own, *dict.fromkeys(seen), *(f"{n}_j" for n in self.law.inputs)]
         weights = [f"W_{name}" for name in (*self.sums, "O_x", "O_y")]
+        seen += [z for found in self.features.values() for z in found]
+        state += [z for found in self.features.values() for z in found]
+        weights += [f"W_{z}" for found in self.features.values() for z in found]
         slopes = [f"D_{name}" for name in (*_STATE, *dict.fromkeys(seen), *self.sums)]
         return [*state, *self.sums, "O_x", "O_y", *weights, *slopes]
 
@@ -119,9 +137,12 @@ class CrowdSource:
             text += self._tables(over)
             text += self.loop.function(f"law_{over}", found)
             text += self.loop.pulled(f"law_{over}_pull", _seeds(found), self._slopes(over), [])
-            opposite = self.mutual and over == OTHERS
+            if over in self.features:
+                text += self._known(over)
+            opposite, moving = self.mutual and over == OTHERS, over == OTHERS
             template = SPARSE_MEET if self.near else MEET
-            text += template.format(over=over, mutual=opposite, moving=over == OTHERS)
+            moving = moving or over in self.features
+            text += template.format(over=over, mutual=opposite, moving=moving)
         text += self._own_tables() + self.loop.function("law_own", self._rate)
         text += self.loop.pulled("law_own_pull", _seeds(self._rate), self._slopes_own, [])
         turned = [("own, sums, rate",), ("own, sums, weight", "to_own, to_sums")]
@@ -136,7 +157,31 @@ class CrowdSource:
         )
         return text + (SPARSE if self.near else DENSE).format(**self._pieces())
 
+    def _known(self, over: str) -> str:
+        """Features of receivers and of sources, and their gradients."""
+        text, found = "", self.features[over]
+        for whose in ("own", "other"):
+            formulas = {z: getattr(feature, whose) for z, feature in found.items()}
+            columns = _STATE if over == OTHERS or whose == "own" else _POINT
+            used = set(symbols(formulas.values()))
+            takes = {n: i for i, n in enumerate(columns) if n in used}
+            # walls do not move
+            moves = columns is _STATE
+            gives = {f"D_{n}": i for n, i in takes.items() if moves}
+            name = f"{whose}_{over}"
+            text += self._table(f"TAKES_{name}", takes) + self._table(f"GIVES_{name}", gives)
+            text += self._table(f"PLACE_{name}", {n: i for n, i in takes.items() if i < 2})
+            text += self.loop.function(f"know_{name}", formulas)
+            slopes = {row: row[2:] for row in gives}
+            text += self.loop.pulled(f"know_{name}_pull", _seeds(formulas), slopes, [])
+            text += KNOW.format(name=name, over=over)
+        numbers = {z: i for i, z in enumerate(found)}
+        text += self._table(f"KNOWN_{over}", numbers)
+        return text + self._table(f"WEIGHED_{over}", {f"W_{z}": i for z, i in numbers.items()})
+
     def _slopes(self, over: str) -> dict[str, str]:
+        if over in self.features:
+            return {f"D_{z}": z for z in self.features[over]}
         used = set(symbols(self.over[over].values()))
         names = [n for n in (*_RELATIVE[over], *_STATE) if n in used]
         return {f"D_{name}": name for name in names}
@@ -150,13 +195,14 @@ class CrowdSource:
         """What a sum takes from receivers and sources, and what it gives back."""
         used, relative, seen = symbols(self.over[over].values()), _RELATIVE[over], [*SEEN[over]]
         apart = {n: relative.index(n) for n in used if n in relative}
+        apart |= {z: i for i, z in enumerate(self.features.get(over, ()))}
         own = {n: self.own.index(n) for n in used if n in self.own}
         other = {n: seen.index(n) for n in used if n in seen and n not in relative}
         other |= {n: self.own.index(n[:-2]) for n in used if n.endswith("_j")}
         sums = {n: self.sums.index(n) for n in self.over[over]}
         found = {
             "APART": apart, "OWN": own, "OTHER": other, "SUMS": sums,
-            "WEIGHTS": {f"W_{n}": place for n, place in sums.items()},
+            "WEIGHTS": {f"W_{n}": i for n, i in sums.items() if not self.over[over][n].is_number()},
             "TO_BOTH": {f"D_{n}": place for n, place in apart.items()},
             "TO_OWN": {f"D_{n}": c for c, n in enumerate(_STATE) if n in used},
         }  # fmt: skip
@@ -202,13 +248,59 @@ class CrowdSource:
             else:
                 table = f"barrier(members, people, {count}, table_{over})"
                 barriers.append(f"rows_{over}, real_{over} = {table}")
+            if over in self.features:
+                barriers += self._spaces(over)
+                meets += self._knowing(over)
+                pulls += self._knowing(over)
+                source = source.replace("y, length", f"own_{over}, length").replace(
+                    "exists, y," if over == OTHERS else f"rows_{over},",
+                    f"exists, other_{over}," if over == OTHERS else f"other_{over},",
+                )
+                back = back.replace("to_own", f"to_own_{over}")
+                pulls += [f"clear(to_own_{over})", f"clear(to_other_{over})"]
             meets.append(f"{calls}{source}, {rest}, reaction)")
-            pulls.append(f"{pull}{source}, {back}, to_other)")
+            to_other = f"to_other_{over}" if over in self.features else "to_other"
+            pulls.append(f"{pull}{source}, {back}, {to_other})")
+            if over in self.features:
+                pulls += self._given_back(over)
         return {
             "width": len(self.own), "sums": len(self.sums), "mutual": self.mutual,
             "kept_width": 4 + len(self.kept), "meets": _lines(3, meets),
             "pulls": _lines(3, pulls), "barriers": _lines(2, barriers),
         }  # fmt: skip
+
+    def _spaces(self, over: str) -> list[str]:
+        """Places for features, and for their gradients."""
+        number = len(self.features[over])
+        size = "2 * length" if over == OTHERS else f"rows_{over}.shape[1]"
+        return [
+            f"own_{over}, other_{over} = blank({number}, length, y), blank({number}, {size}, y)",
+            f"to_own_{over}, to_other_{over} = 0 * own_{over}, 0 * other_{over}",
+        ]
+
+    def _knowing(self, over: str) -> list[str]:
+        """Features of everybody; from somebody's place on, for large numbers cost digits."""
+        source = "y" if over == OTHERS else f"rows_{over}"
+        number = "2 * length" if over == OTHERS else f"rows_{over}.shape[1]"
+        rest = "q, time, dt, total"
+        return [
+            f"all_own_{over}(room, y, y, length, {rest}, own_{over})",
+            f"all_other_{over}(room, {source}, y, {number}, {rest}, other_{over})",
+        ]
+
+    def _given_back(self, over: str) -> list[str]:
+        rest = "q, time, dt, total"
+        found = [f"all_own_{over}_pull(room, y, y, length, {rest}, to_own_{over}, to_own)"]
+        if over == OTHERS:
+            return [
+                *found,
+                f"clear(to_own_{over})",
+                f"fold(to_own_{over}, to_other_{over}, length)",
+                f"all_other_{over}_pull(room, y, y, length, {rest}, to_own_{over}, to_own)",
+            ]
+        number = f"rows_{over}.shape[1]"
+        call = f"all_other_{over}_pull(room, rows_{over}, y, {number}, {rest}, to_other_{over}"
+        return [*found, f"{call}, to_own)"]
 
 
 def _seeds(formulas: dict[str, Expr]) -> dict[Expr, Expr]:

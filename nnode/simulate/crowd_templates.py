@@ -14,7 +14,7 @@ from nnode.simulate._math import INLINE, exp, log, logistic, real, torch_softplu
 from nnode.simulate.crowd_rows import (
     LOOP, SIZE, add_product, barrier, blank, bring, bring_back, bring_less, bring_pairs, clear,
     clear_end, decrease, decrease_pairs, filled, fold, fold_in, increase, increase_pairs,
-    keep, keep_back, load, meeting, periods, pieces, put, repeat, space, store, subtract,
+    keep, keep_back, less, load, meeting, periods, pieces, put, repeat, space, store, subtract,
     subtract_pairs, subtract_product, take, weigh, weigh_less, who,
 )
 from nnode.simulate.lane_rows import add
@@ -24,6 +24,31 @@ from nnode.simulate.neighbours import (
 
 ROWS = {rows}
 {places}'''
+
+#: Features of all receivers, or of all sources.
+KNOW = """
+
+@njit(**LOOP)
+def all_{name}(room, rows, y, number, q, t, dt, total, found):
+    for low in range(0, number, SIZE):
+        n = min(SIZE, number - low)
+        bring(room, TAKES_{name}, rows, low, n)
+        less(room, PLACE_{name}, y, n)
+        know_{name}(room, 0, filled(n), q, t, dt, 0, total)
+        bring_back(found, KNOWN_{over}, low, room, n)
+
+
+@njit(**LOOP)
+def all_{name}_pull(room, rows, y, number, q, t, dt, total, weight, to_own):
+    for low in range(0, number, SIZE):
+        n = min(SIZE, number - low)
+        bring(room, TAKES_{name}, rows, low, n)
+        less(room, PLACE_{name}, y, n)
+        bring(room, WEIGHED_{over}, weight, low, n)
+        clear_end(room, WEIGHED_{over}, n, filled(n))
+        know_{name}_pull(room, 0, filled(n), q, t, dt, 0, total)
+        increase(to_own, GIVES_{name}, low, room, n)
+"""
 
 #: Everybody meets everything.
 MEET = """
