@@ -20,7 +20,7 @@ from nnode.laws.expression import Expr, below
 Straight = Callable[[Mapping[str, Any], tuple[Any, ...]], list[Any]]
 
 #: What a node is in Python, by operation; as PyTorch computes it, but for rounding.
-_TEXT = {
+OPERATIONS = {
     "add": "{0} + {1}",
     "sub": "{0} - {1}",
     "mul": "{0} * {1}",
@@ -65,7 +65,7 @@ def straight(outputs: tuple[Expr, ...], known: tuple[Expr, ...] = ()) -> Straigh
             continue
         text = f"g[{node.value!r}]"
         if node.op != "symbol":
-            text = _TEXT[node.op].format(*(label[a] for a in node.args))
+            text = OPERATIONS[node.op].format(*(label[a] for a in node.args))
         label[node] = f"n{len(lines)}"
         lines.append(f"    {label[node]} = {text}\n")
     found = ", ".join(label[node] for node in outputs)

@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from nnode.laws import differentiate, expression, parse, tensors
+from nnode.laws import arrays, differentiate, expression, parse, tensors
 from nnode.models import build_model
 from nnode.simulate import loops, source
 
@@ -32,7 +32,7 @@ def test_your_own_law_in_one_line() -> None:
 
 def test_every_function_is_known_everywhere() -> None:
     operations = set(tensors.OPERATIONS)
-    assert operations == set(loops.OPERATIONS)
+    assert operations == set(loops.OPERATIONS) == set(arrays.OPERATIONS)
     assert set(expression.UNARY) < operations
     for name in operations:
         arguments = {"choose": 3, "max": 2, "min": 2, "add": 2, "sub": 2, "mul": 2}.get(name, 1)
