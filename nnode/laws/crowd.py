@@ -7,6 +7,7 @@ name                unit    meaning
 ==================  ======  =================================================================
 x, y, vx, vy        m, m/s  a person's place and velocity
 goal_x, goal_y      m       his destination
+way_x, way_y        1       the direction to it
 speed, e_x, e_y     m/s, 1  his speed and walking direction
 t, clock            s       time since the first sample, and time of the day
 people, points      1       how many people there are, and wall points
@@ -37,7 +38,7 @@ from typing import Any
 from nnode.errors import ConfigError
 from nnode.laws.expression import Expr, apply, below, const, substitute, symbol, symbols
 from nnode.laws.parse import parse
-from nnode.laws.units import check
+from nnode.laws.units import check, shown, unit_of
 
 #: Distances (m) and speeds (m/s) are smoothed at this scale, so that their gradient exists at 0.
 SMOOTHING = 1e-6
@@ -70,6 +71,9 @@ def _names() -> dict[str, Expr]:
     found = {name: symbol(name) for name in UNITS if name != "start"}
     found["clock"] = symbol("start") + symbol("t")
     vx, vy, dx, dy = (symbol(name) for name in ("vx", "vy", "dx", "dy"))
+    to_x, to_y = symbol("goal_x") - symbol("x"), symbol("goal_y") - symbol("y")
+    far = _length(to_x, to_y, "small_m")
+    found["way_x"], found["way_y"] = to_x / far, to_y / far
     found["speed"], found["d"] = _length(vx, vy, "small_v"), _length(dx, dy, "small_m")
     found["e_x"], found["e_y"] = vx / found["speed"], vy / found["speed"]
     found["n_x"], found["n_y"] = dx / found["d"], dy / found["d"]
@@ -86,7 +90,7 @@ class CrowdRule:
     Attributes:
         rate: both components of the acceleration that it adds, of its sums.
         others, points, walls: name to (unit, summand) of sums over the others, over wall points,
-            over walls.
+            over walls; without a unit it is that of the summand.
         where: name to formula of parts; ``name(dx=...)`` is one with other quantities in it.
         constants: name to (value, unit) of fixed quantities.
         settings: name to unit of fixed quantities that each term of the kind has its own of.
@@ -210,15 +214,18 @@ def with_rule(
                 f"{name}: {text} names {strange[0]}, which there is not in "
                 f"{f'a sum over {over}' if over else 'a rate'}"
             )
-        check(part, found, every, unit)
+        if unit:
+            check(part, found, every, unit)
         return found
 
     sums = {over: dict(found) for over, found in law.sums.items()}
     for over in sums:
         for part, (unit, text) in getattr(rule, over).items():
             label = f"{name}__{part}"
-            sums[over][label] = finished(label, text, unit, over)
-            every[label], names[part] = unit, symbol(label)
+            sums[over][label] = summand = finished(label, text, unit, over)
+            own_unit = unit_of(summand, every)
+            every[label] = unit or ("*" if own_unit is None else shown(own_unit))
+            names[part] = symbol(label)
     rate = [finished(name, text, "m/s^2", None) for text in rule.rate]
     known = dict(law.known)
     if rule.force is not None:

@@ -14,7 +14,7 @@ from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import VARIABLE, load_own
-from nnode.models.own_law import law_from
+from nnode.models.own_law import FormulaForce, law_from
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
 
@@ -40,6 +40,8 @@ def _log(options: Options, generator: torch.Generator) -> System:
 
 def _formula(options: Options, generator: torch.Generator) -> System:
     law = law_from(str(options["name"]), options["law"])
+    if isinstance(law, FormulaForce):
+        return Crowd([law])
     leader = str(getattr(options["leader"], "value", options["leader"]))
     if leader == "constant" and law.order == 1 and "v0" not in law.scalars:
         raise ConfigError(

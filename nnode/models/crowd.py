@@ -55,11 +55,7 @@ class Relaxation(CrowdBase):
     formula = "(|v| (x_D - x) / |x_D - x| - v) / tau"
     source = "Göttlich & Totzeck, equation (relaxation)"
     rule = CrowdRule(
-        rate=(
-            "((goal_x - x)*(speed/far) - vx)/tau",
-            "((goal_y - y)*(speed/far) - vy)/tau",
-        ),
-        where={"far": "sqrt((goal_x - x)**2 + (goal_y - y)**2 + small_m**2)"},
+        rate=("(speed*way_x - vx)/tau", "(speed*way_y - vy)/tau"),
         settings={"tau": "s"},
         drive=True,
     )

@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 
 from nnode.errors import ConfigError
+from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
 from nnode.laws.expression import symbol
 from nnode.laws.lane import Lane, Rule, of_rule
 from nnode.laws.units import in_si
+from nnode.models.crowd_formula import CrowdBase, formula_of
 from nnode.models.formula import Law, parameters_of
-from nnode.models.term import Interval, State
+from nnode.models.term import Interval, State, Term
 
 #: What is 0 where everybody drives at one speed, as far as a law may name it.
 _AT_REST = ("dv", "t", "clock", "x", "x_1", "x_2", "v_2", "length_1", "gap_1", "dx_1", "v", "v_1")
@@ -21,10 +23,41 @@ _AT_REST = ("dv", "t", "clock", "x", "x_1", "x_2", "v_2", "length_1", "gap_1", "
 FASTEST = 100.0
 #: What a law's description may say.
 _KEYS = ("parameters", "where", "rate", "source")
+_SUMS = (OTHERS, POINTS, WALLS)
 _PARAMETER = ("value", "low", "high")
 
 
-class FormulaLaw(Law):
+class _Own(Term):
+    """What laws of one's own share."""
+
+    def _declare(self, name: str, given: Any) -> None:
+        if not name.isidentifier() or "__" in name or hasattr(self, name):
+            raise ConfigError(f"model.law.parameters: {name} cannot be the name of a parameter")
+        entry = given if isinstance(given, Mapping) else {"value": given}
+        unknown = sorted(set(entry) - set(_PARAMETER))
+        if unknown or "value" not in entry:
+            raise ConfigError(
+                f"model.law.parameters.{name}={given}: expected a quantity such as 30 m/s, or "
+                "{value: 30 m/s, low: 0 m/s, high: 60 m/s}"
+            )
+        found = {key: in_si(str(value)) for key, value in entry.items()}
+        units = {unit for _, unit in found.values()}
+        if len(units) > 1:
+            raise ConfigError(
+                f"model.law.parameters.{name} has the units {', '.join(sorted(units))}; value, "
+                "low and high need the same kind of unit"
+            )
+        bounds = {key: value for key, (value, _) in found.items() if key != "value"}
+        self.declare(
+            name, found["value"][0], unit=units.pop(), bounds=Interval(**bounds) if bounds else None
+        )
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, self.name, repr(self.rule), tuple(self.units.items()))
+
+
+class FormulaLaw(_Own, Law):
     """A law of a lane, written as a formula; of first order if it says dx/dt, of second if dv/dt.
 
     Args:
@@ -56,7 +89,7 @@ class FormulaLaw(Law):
         if not isinstance(rate, Mapping) or list(rate) not in (["x"], ["v"]):
             raise ConfigError(
                 f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
-                "or v: a formula of an acceleration (second order)"
+                "or v: a formula of an acceleration (second order); or vx and vy, of a crowd"
             )
         ((state, text),) = rate.items()
         self.order = 1 if state == "x" else 2
@@ -66,32 +99,6 @@ class FormulaLaw(Law):
         for own, value in parameters.items():
             self._declare(str(own), value)
         self.lane(self.name)  # says what is wrong with the formula
-
-    def _declare(self, name: str, given: Any) -> None:
-        if not name.isidentifier() or "__" in name or hasattr(self, name):
-            raise ConfigError(f"model.law.parameters: {name} cannot be the name of a parameter")
-        entry = given if isinstance(given, Mapping) else {"value": given}
-        unknown = sorted(set(entry) - set(_PARAMETER))
-        if unknown or "value" not in entry:
-            raise ConfigError(
-                f"model.law.parameters.{name}={given}: expected a quantity such as 30 m/s, or "
-                "{value: 30 m/s, low: 0 m/s, high: 60 m/s}"
-            )
-        found = {key: in_si(str(value)) for key, value in entry.items()}
-        units = {unit for _, unit in found.values()}
-        if len(units) > 1:
-            raise ConfigError(
-                f"model.law.parameters.{name} has the units {', '.join(sorted(units))}; value, "
-                "low and high need the same kind of unit"
-            )
-        bounds = {key: value for key, (value, _) in found.items() if key != "value"}
-        self.declare(
-            name, found["value"][0], unit=units.pop(), bounds=Interval(**bounds) if bounds else None
-        )
-
-    @property
-    def shape(self) -> tuple[Any, ...]:
-        return (*super().shape, self.name, self.order, repr(self.rule), tuple(self.units.items()))
 
     def lane(self, owner: str) -> Lane:
         parameters, owned, units = parameters_of(self, owner, 0)
@@ -125,7 +132,54 @@ class FormulaLaw(Law):
         )
 
 
-def law_from(name: str, description: Any) -> FormulaLaw:
+class FormulaForce(_Own, CrowdBase):
+    """A law of people, written as formulas of both components of their acceleration.
+
+    Args:
+        name, parameters, where, source: as of :class:`FormulaLaw`.
+        rate: ``{vx: formula, vy: formula}``, m/s²; what they may name stands in
+            :mod:`nnode.laws.crowd`.
+        others, points, walls: name to summand of sums over the others, wall points, walls.
+
+    Raises:
+        ConfigError: what is missing, cannot be read, or has the wrong unit.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Mapping[str, Any],
+        rate: Mapping[str, str],
+        where: Mapping[str, str] | None = None,
+        source: str = "",
+        **sums: Mapping[str, str],
+    ) -> None:
+        super().__init__()
+        self.name, self.source = str(name), str(source)  # type: ignore[misc]
+        if set(rate) != {"vx", "vy"}:
+            raise ConfigError(
+                f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
+                "components of a person's acceleration"
+            )
+        self.formula = f"{rate['vx']}, {rate['vy']}"  # type: ignore[misc]
+        over = {
+            kind: {str(part): ("", str(text)) for part, text in (found or {}).items()}
+            for kind, found in sums.items()
+        }
+        parts = {str(k): str(v) for k, v in (where or {}).items()}
+        self.rule = CrowdRule(
+            rate=(str(rate["vx"]), str(rate["vy"])),
+            others=over.get(OTHERS, {}),
+            points=over.get(POINTS, {}),
+            walls=over.get(WALLS, {}),
+            where=parts,
+        )
+        for own, value in parameters.items():
+            self._declare(str(own), value)
+        formula_of(self)  # says what is wrong with the formula
+
+
+def law_from(name: str, description: Any) -> FormulaLaw | FormulaForce:
     """A law from its entry in a configuration or a checkpoint.
 
     Raises:
@@ -136,9 +190,13 @@ def law_from(name: str, description: Any) -> FormulaLaw:
             "model.law needs parameters and rate, as in {parameters: {v0: 30 m/s, L: 5 m}, "
             "rate: {x: v0*(1 - L/gap)}}"
         )
-    unknown = sorted(set(map(str, description)) - set(_KEYS))
+    rate = description["rate"]
+    people = isinstance(rate, Mapping) and not {"vx", "vy"}.isdisjoint(rate)
+    keys = (*_KEYS, *(_SUMS if people else ()))
+    unknown = sorted(set(map(str, description)) - set(keys))
     if unknown:
         raise ConfigError(
-            f"model.law has the unknown entries {', '.join(unknown)}; there are {', '.join(_KEYS)}"
+            f"model.law has the unknown entries {', '.join(unknown)}; there are {', '.join(keys)}"
         )
-    return FormulaLaw(name, **{str(key): value for key, value in description.items()})
+    kind = FormulaForce if people else FormulaLaw
+    return kind(name, **{str(key): value for key, value in description.items()})
