@@ -37,7 +37,7 @@ from nnode.data.split import Split, split
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.files import write_json
-from nnode.models import System, build_model
+from nnode.models import InteractionForce, System, build_model
 from nnode.models.term import short_names
 from nnode.plots import force_figure
 from nnode.solvers import Solver, TorchdiffeqSolver, substeps
@@ -238,7 +238,8 @@ def _trainer(
             split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in _PARTS},
             free_speed=free_speed,
         ),
-        force_figure,
+        # a law of people of one's own has no force that could be drawn by itself
+        None if model.domain == "crowd" and model.find(InteractionForce) is None else force_figure,
         world,
     )
     if config.resume is not None:

@@ -14,6 +14,8 @@ from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.laws.lane import Rule
 from nnode.models import FollowTheLeader, Relaxation, System, Traffic
+from nnode.models.own_law import FormulaForce
+from nnode.models.term import Term
 from nnode.solvers.base import Solver, Trajectory
 
 #: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
@@ -161,14 +163,15 @@ def no_interaction(system: System, solver: Solver, free_speed: float | None) -> 
     """Baseline: the model without its interaction.
 
     Traffic: everyone at ``free_speed`` (m/s), the leader as in the model. Crowds: relaxation
-    towards the destination alone.
+    towards the destination alone, and laws of one's own without their sums.
     """
     bare: System
     if isinstance(system, Traffic):
         speed = 0.0 if free_speed is None else free_speed
         bare = Traffic([FreeFlow(speed)], leader=system.leader)
     else:
-        kept = [term for term in system.terms if isinstance(term, Relaxation)]
+        kept: list[Term] = [t for t in system.terms if isinstance(t, Relaxation)]
+        kept += [t.alone() for t in system.terms if isinstance(t, FormulaForce)]
         bare = type(system)(kept, system.wall_spacing)
     bare.to(next(system.parameters()))
     return lambda batch: solver(bare, batch)

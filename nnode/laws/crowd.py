@@ -139,12 +139,13 @@ class CrowdLaw:
 
     def flat(self) -> CrowdLaw:
         """With fixed quantities written as numbers, and without sums that nothing needs."""
-        needed = set(symbols(self.rate))
+        none = {k: v for found in self.sums.values() for k, v in found.items() if v.is_number(0)}
+        x, y = (substitute(rate, self.fixed | none) for rate in self.rate)
+        needed = set(symbols([x, y]))
         sums = {
             over: {k: substitute(v, self.fixed) for k, v in found.items() if k in needed}
             for over, found in self.sums.items()
         }
-        x, y = (substitute(rate, self.fixed) for rate in self.rate)
         return replace(self, rate=(x, y), sums=sums)
 
     @property

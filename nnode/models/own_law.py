@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -177,6 +179,17 @@ class FormulaForce(_Own, CrowdBase):
         for own, value in parameters.items():
             self._declare(str(own), value)
         formula_of(self)  # says what is wrong with the formula
+
+    def alone(self) -> FormulaForce:
+        """The same law where nobody meets anybody, nor a wall."""
+        law, found = formula_of(self), copy.copy(self)
+        assert isinstance(self.rule, CrowdRule)
+
+        def none(over: str) -> dict[str, tuple[str, str]]:
+            return {n: (law.units[f"{self.name}__{n}"], "0") for n in getattr(self.rule, over)}
+
+        found.rule = replace(self.rule, others=none(OTHERS), points=none(POINTS), walls=none(WALLS))
+        return found
 
 
 def law_from(name: str, description: Any) -> FormulaLaw | FormulaForce:

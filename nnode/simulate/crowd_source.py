@@ -322,6 +322,8 @@ def _opposite(found: list[Expr], swapped: list[Expr]) -> bool:
         for node in below([*found, *swapped])
         if node.op == "symbol"
     }
+    if not values:
+        return False
     here, there = computed(found, values), computed(swapped, values)
     return all(
         torch.allclose(a, -b, rtol=1e-9, atol=1e-12) for a, b in zip(here, there, strict=True)

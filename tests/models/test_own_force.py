@@ -83,3 +83,17 @@ def test_it_is_compiled() -> None:
 def test_what_is_wrong_is_told(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         own(**changes)
+
+
+def test_without_interaction_it_is_its_drive() -> None:
+    batch, model = collate([people(5, 1), people(3, 2)]), own()
+    bare = Crowd([model.terms[0].alone()])  # type: ignore[union-attr, operator]
+    wanted = rates(Crowd([Relaxation(0.7)]), batch)
+    torch.testing.assert_close(rates(bare, batch), wanted, rtol=1e-12, atol=1e-12)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            FusedSolver(0.02)(bare, batch).x[batch.valid],
+            FusedSolver(0.02)(Crowd([Relaxation(0.7)]), batch).x[batch.valid],
+            rtol=1e-12, atol=1e-12,
+        )  # fmt: skip
+    torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)
