@@ -37,10 +37,11 @@ class Squares:
     sequence: np.ndarray
 
     def means(self) -> np.ndarray:
-        """``(S,)`` mean square error of each sequence; infinite where it blows up."""
+        """``(S,)`` mean square error of each sequence; infinite where it blows up, NaN where
+        nothing of it is compared."""
         total = np.bincount(self.sequence, np.nan_to_num(self.value, nan=np.inf))
-        found: np.ndarray = total / np.bincount(self.sequence)
-        return found
+        number = np.bincount(self.sequence)
+        return np.divide(total, number, out=np.full(len(total), np.nan), where=number > 0)
 
 
 class Engine(Protocol):
