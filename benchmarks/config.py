@@ -14,7 +14,7 @@ from nnode.calibrate.options import Precision
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`benchmarks.speed.run`."""
 
-    # problems: paper | stress | effects | steps | crowd | people | scale
+    # problems: paper | stress | effects | steps | crowd | crowd_effects | people | scale
     shapes: list[str] = field(
         default_factory=lambda: [
             "paper",
@@ -22,6 +22,7 @@ class BenchmarkOptions:
             "effects",
             "steps",
             "crowd",
+            "crowd_effects",
             "people",
             "scale",
         ]

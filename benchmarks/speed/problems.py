@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models import Crowd, NetworkForce, Relaxation, SocialForce, System, Traffic
+from nnode.models import Crowd, NetworkForce, Relaxation, SocialForce, System
 from nnode.models.build import MODELS, add_effects
 
 
@@ -55,6 +55,7 @@ SHAPES: dict[str, tuple[Shape, ...]] = {
     # a law, the same with one and three effects, and a law of second order
     "effects": (Shape("traffic", ("lin", "lin+1", "lin+3", "idm"), 100, 10, 50, 100, 0.002),),
     "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
+    "crowd_effects": (Shape("crowd", ("sf", "sf+1", "sf+3"), 16, 44, 25, 1, 0.04),),
     # one hall: few enough people for every engine, then as many as cell lists allow
     "people": tuple(_hall(people) for people in (50, 100, 200)),
     "scale": tuple(_hall(people) for people in (500, 1000, 2000, 5000, 10000)),
@@ -62,11 +63,18 @@ SHAPES: dict[str, tuple[Shape, ...]] = {
 
 
 #: What is added to a law, in this order.
-EFFECTS = (
-    {"name": "relative_speed", "kappa": 0.3},
-    {"name": "speed_zone", "alpha": 0.8, "a": 100.0, "b": 300.0},
-    {"name": "multi_anticipation", "c": 0.1},
-)
+EFFECTS: dict[str, tuple[dict[str, Any], ...]] = {
+    "traffic": (
+        {"name": "relative_speed", "kappa": 0.3},
+        {"name": "speed_zone", "alpha": 0.8, "a": 100.0, "b": 300.0},
+        {"name": "multi_anticipation", "c": 0.1},
+    ),
+    "crowd": (
+        {"name": "alignment", "c": 0.2},
+        {"name": "anticipation", "T_a": 0.2},
+        {"name": "preferred_speed", "c": 0.5, "v_pref": 1.3},
+    ),
+}
 #: The Intelligent Driver Model, gaps from front to front (Treiber, Hennecke & Helbing 2000).
 IDM = {
     "parameters": {"v0": "30 m/s", "T": "1.2 s", "s0": "2 m", "a": "1.3 m/s²", "b": "1.7 m/s²"},
@@ -139,6 +147,13 @@ def _people(shape: Shape, draw: np.random.Generator) -> list[Sequence]:
 
 
 def _system(model: str) -> System:
+    name, _, number = model.partition("+")
+    system = _law(name)
+    add_effects(system, EFFECTS[system.domain][: int(number or 0)])
+    return system
+
+
+def _law(model: str) -> System:
     generator = torch.Generator().manual_seed(1)
     if model == "sf":
         return Crowd([Relaxation(), SocialForce(5.0, 30.0, 10.0, B=0.1)])
@@ -150,11 +165,8 @@ def _system(model: str) -> System:
     elif model == "idm":
         term, extra = "formula", {"name": "idm", "law": IDM}
     else:
-        term, extra = model.partition("+")[0], {"L": 4.0, "L_min": 2.0}
-    system = MODELS[term]({"v0": 18.0, "leader": "constant", **extra}, generator)
-    assert isinstance(system, Traffic)
-    add_effects(system, EFFECTS[: int(model.partition("+")[2] or 0)])
-    return system
+        term, extra = model, {"L": 4.0, "L_min": 2.0}
+    return MODELS[term]({"v0": 18.0, "leader": "constant", **extra}, generator)
 
 
 def pose(shape: Shape, model: str, dtype: torch.dtype) -> Problem:
