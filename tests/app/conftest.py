@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from nnode.data.synthetic import demo_data
+from tests.app.forked import Forks
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,8 +32,8 @@ def environment() -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
-def script() -> Script:
-    """Run ``scripts/<name>.py`` with overrides; returns the finished process."""
+def started() -> Script:
+    """Run ``scripts/<name>.py`` with overrides in a new Python, as a user does."""
 
     def run(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -46,3 +47,14 @@ def script() -> Script:
         )
 
     return run
+
+
+@pytest.fixture(scope="session")
+def script(started: Script) -> Iterator[Script]:
+    """The same in a process that is forked, where the system can: without seconds of imports."""
+    if not hasattr(os, "fork"):
+        yield started
+        return
+    forks = Forks(environment())
+    yield forks.run
+    forks.close()
