@@ -31,29 +31,30 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
 
 
+def start_script(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """What :func:`started` gives."""
+    return subprocess.run(
+        [sys.executable, f"scripts/{name}.py", *overrides],
+        cwd=ROOT,
+        env={**environment(), **env},
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+
+
 @pytest.fixture(scope="session")
 def started() -> Script:
     """Run ``scripts/<name>.py`` with overrides in a new Python, as a user does."""
-
-    def run(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, f"scripts/{name}.py", *overrides],
-            cwd=ROOT,
-            env={**environment(), **env},
-            capture_output=True,
-            text=True,
-            timeout=900,
-            check=False,
-        )
-
-    return run
+    return start_script
 
 
 @pytest.fixture(scope="session")
-def script(started: Script) -> Iterator[Script]:
+def script() -> Iterator[Script]:
     """The same in a process that is forked, where the system can: without seconds of imports."""
     if not hasattr(os, "fork"):
-        yield started
+        yield start_script
         return
     forks = Forks(environment())
     yield forks.run
