@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from nnode.data.synthetic import demo_data
+from tests.app.forked import Forks
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,19 +31,31 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
 
 
+def start_script(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """What :func:`started` gives."""
+    return subprocess.run(
+        [sys.executable, f"scripts/{name}.py", *overrides],
+        cwd=ROOT,
+        env={**environment(), **env},
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+
+
 @pytest.fixture(scope="session")
-def script() -> Script:
-    """Run ``scripts/<name>.py`` with overrides; returns the finished process."""
+def started() -> Script:
+    """Run ``scripts/<name>.py`` with overrides in a new Python, as a user does."""
+    return start_script
 
-    def run(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, f"scripts/{name}.py", *overrides],
-            cwd=ROOT,
-            env={**environment(), **env},
-            capture_output=True,
-            text=True,
-            timeout=900,
-            check=False,
-        )
 
-    return run
+@pytest.fixture(scope="session")
+def script() -> Iterator[Script]:
+    """The same in a process that is forked, where the system can: without seconds of imports."""
+    if not hasattr(os, "fork"):
+        yield start_script
+        return
+    forks = Forks(environment())
+    yield forks.run
+    forks.close()

@@ -29,11 +29,11 @@ def files_outside(folder: Path) -> set[Path]:
 
 
 @pytest.fixture(scope="module")
-def traffic(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def traffic(started: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished training on synthetic traffic."""
     folder = tmp_path_factory.mktemp("run") / "traffic"
     before = files_outside(folder)
-    done = script(
+    done = started(
         "train",
         "experiment=demo_traffic",
         f"data.source={raw}",
@@ -65,10 +65,10 @@ def test_load_gives_the_model_of_the_best_checkpoint(traffic: Path) -> None:
 
 
 def test_evaluate_beats_the_baselines_and_agrees_with_training(
-    script: Script, traffic: Path, raw: Path, tmp_path: Path
+    started: Script, script: Script, traffic: Path, raw: Path, tmp_path: Path
 ) -> None:
     best = traffic / "checkpoints" / "best.pt"
-    done = script("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path}")
+    done = started("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path}")
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     result = json.loads((traffic / "result.json").read_text())["summary"]
@@ -91,9 +91,9 @@ def test_evaluate_beats_the_baselines_and_agrees_with_training(
     assert everything["J"] == metrics["J"]  # and there is no fault to keep in them
 
 
-def test_plot_forces_draws_one_and_many(script: Script, traffic: Path, tmp_path: Path) -> None:
+def test_plot_forces_draws_one_and_many(started: Script, traffic: Path, tmp_path: Path) -> None:
     paths = ",".join(str(traffic / "checkpoints" / name) for name in ("best.pt", "last.pt"))
-    done = script("plot_forces", f"checkpoint=[{paths}]", f"hydra.run.dir={tmp_path}")
+    done = started("plot_forces", f"checkpoint=[{paths}]", f"hydra.run.dir={tmp_path}")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "forces.png").stat().st_size > 10_000
     assert len(pd.read_csv(tmp_path / "forces.csv")) > 10
@@ -284,13 +284,33 @@ def test_the_fused_solver_trains_to_the_same_numbers(
     assert metrics["J"] == pytest.approx(found["fused"]["cost_heldout"], rel=1e-9)
 
 
+#: An effect of the user's own, whose code nobody reads.
+OWN = """
+import torch
+from nnode.models.effects import CATALOGUE, Effect, Strength
+from nnode.models.term import Interval
+
+@CATALOGUE.add
+class Draught(Effect):
+    name = "draught"
+    domain = "crowd"
+    formula = "+ (c, 0)"
+    source = "none"
+    strengths = {"c": Strength(neutral=0.0, step=0.1, range=Interval(-1.0, 1.0), unit="m/s²")}
+
+    def forward(self, state):
+        return torch.stack([self.c, 0 * self.c]).expand_as(state.x)
+"""
+
+
 @pytest.mark.parametrize(
     ("data", "model", "effect"),
-    [("demo_traffic", "lin", "relative_speed"), ("demo_crowd", "nn", "preferred_speed")],
+    [("demo_traffic", "lin", "relative_speed"), ("demo_crowd", "sf", "draught")],
 )
 def test_a_run_without_compiled_code_says_so(
     script: Script, raw: Path, tmp_path: Path, data: str, model: str, effect: str
 ) -> None:
+    (tmp_path / "draught.py").write_text(OWN)
     done = script(
         "train",
         f"data={data}",
@@ -300,11 +320,12 @@ def test_a_run_without_compiled_code_says_so(
         "trainer.max_epochs=0",
         f"data.source={raw}",
         f"hydra.run.dir={tmp_path}",
+        NNODE_EFFECTS=str(tmp_path / "draught.py"),
     )
     assert done.returncode == 0, done.stderr
     shown = done.stdout + done.stderr
     solver = json.loads((tmp_path / "result.json").read_text())["solver"]
-    if data == "demo_traffic":
+    if effect == "relative_speed":
         assert solver == {"name": "fused", "uncompiled": None}
         assert "batched PyTorch" not in shown
     else:

@@ -54,6 +54,7 @@ def make_trainer(store: Store) -> Callable[..., Trainer]:
         optimizer: OptimizerOptions | None = None,
         seed: int = 0,
         batch_size: int = 2,
+        dt: float = 0.1,
         **options: object,
     ) -> Trainer:
         model = build_model(LIN, seed)
@@ -69,7 +70,7 @@ def make_trainer(store: Store) -> Callable[..., Trainer]:
         config = {"model": LIN, "seed": seed, "trainer": {"dtype": "float64"}}
         return Trainer(
             model,
-            TorchdiffeqSolver(dt=0.02),
+            TorchdiffeqSolver(dt=dt),
             build_optimizer(model, chosen, seed),
             train,
             heldout,

@@ -65,7 +65,7 @@ def make_trainer(case: str, store: Store, folder: Path) -> Trainer:
     config = {"model": options, "seed": 0, "trainer": {"dtype": "float64"}}
     return Trainer(
         model,
-        TorchdiffeqSolver(dt=0.02),
+        TorchdiffeqSolver(dt=0.1),
         build_optimizer(model, optimizer, 0),
         loader(range(5), size),
         loader(range(5, 7), 1),

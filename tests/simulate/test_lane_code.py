@@ -53,8 +53,17 @@ def fresh(tmp_path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
-@pytest.mark.parametrize("law", [Linear, Logarithmic, NetworkSpeed])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("law", "dtype"),
+    [
+        (NetworkSpeed, torch.float64),
+        (NetworkSpeed, torch.float32),
+        (Logarithmic, torch.float64),
+        pytest.param(Logarithmic, torch.float32, marks=pytest.mark.thorough),
+        pytest.param(Linear, torch.float64, marks=pytest.mark.thorough),
+        pytest.param(Linear, torch.float32, marks=pytest.mark.thorough),
+    ],
+)
 def test_loops_are_vector_code(law, dtype, ragged, fresh, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     # losing this makes everything ten times slower and nothing else would tell
     modules = []
@@ -71,6 +80,13 @@ def test_loops_are_vector_code(law, dtype, ragged, fresh, monkeypatch) -> None: 
     function = modules[-1].backward
     (signature,) = function.signatures
     assert is_vector_code(function.inspect_asm(signature))
+    # modules of the same text that are loaded later do not compile
+    gradient(Traffic([law()]).to(dtype), FusedSolver(0.1), batch)
+    first, second = (
+        [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
+        for module in modules
+    )
+    assert (first, second) == ([0, 0], [1, 1])
 
 
 @pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
@@ -161,6 +177,7 @@ print(json.dumps({"hits": hits}))
 """
 
 
+@pytest.mark.thorough
 def test_a_second_process_does_not_compile(tmp_path) -> None:  # type: ignore[no-untyped-def]
     environment = {**os.environ, "NNODE_CACHE": str(tmp_path)}
     runs = []

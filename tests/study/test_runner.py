@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -63,9 +63,20 @@ def test_kept_results_are_those_of_one_function_and_fingerprint(tmp_path: Path) 
     assert found == {"square-1": {"y": 1.0}, "square-3": {"y": 9.0}}
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_results_are_the_same_in_any_number_of_processes(workers: int, tmp_path: Path) -> None:
+@pytest.fixture
+def threads() -> Iterator[int]:
+    """Two threads of torch's, whatever the tests are run with."""
     before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield 2
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_are_the_same_in_any_number_of_processes(
+    workers: int, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
     todo = [*squares(tmp_path, 3.0, 1.0, 2.0), Task("conditions", work.conditions, {})]
     found = run_tasks(todo, tmp_path, workers=workers, fingerprint="f")
     assert list(found) == ["square-3", "square-1", "square-2", "conditions"]
@@ -78,7 +89,7 @@ def test_results_are_the_same_in_any_number_of_processes(workers: int, tmp_path:
     assert (found["conditions"]["process"] == os.getpid()) == (workers == 1)
     if workers > 1:
         assert found["conditions"]["blas"] == "1"
-    assert torch.get_num_threads() == before
+    assert torch.get_num_threads() == threads
     again = run_tasks(todo, tmp_path, workers=workers, fingerprint="f")
     assert json.dumps(again) == json.dumps(found)
     assert len(calls(tmp_path)) == 3

@@ -36,10 +36,10 @@ PROBLEM = (
 
 
 @pytest.fixture(scope="module")
-def prepared(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+def prepared(started: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The override that takes prepared traffic."""
     folder = tmp_path_factory.mktemp("prepared")
-    done = script(
+    done = started(
         "prepare_data", "data=demo_traffic", f"data.source={raw}", f"hydra.run.dir={folder}"
     )
     assert done.returncode == 0, done.stderr
@@ -117,7 +117,9 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("model=n5", "error: model=n5 is unknown"),  # before the work starts
+        pytest.param(  # before the work starts
+            "model=n5", "error: model=n5 is unknown", marks=pytest.mark.thorough
+        ),
         ("solver.dt=0.03", "error: solver.dt=0.03 s does not divide"),  # with the data
     ],
 )

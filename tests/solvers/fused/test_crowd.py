@@ -42,6 +42,10 @@ MODELS = {
     "nn_open": lambda: [network(3, mass=2.0, walls=False), Relaxation()],
     "nn_self": lambda: [Relaxation(), network(self_interaction=True)],
 }
+#: Every model but those of which another one tells as much; each is compiled for seconds.
+COMPILED = [
+    pytest.param(name, marks=pytest.mark.thorough if name == "nn_open" else ()) for name in MODELS
+]
 
 
 @pytest.fixture(autouse=True)
@@ -93,13 +97,17 @@ def check(model: System, batch: Batch, solver: Solver, limit: float = 1e-10) -> 
     assert difference(own, wanted) < limit
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", COMPILED)
 def test_states_and_gradient(name: str, people: list[Sequence]) -> None:
     batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
     for threads in (1, 2):
         check(model, batch, FusedSolver(DT, threads))
-    if name not in ("sf", "nn"):
-        return  # each precision is compiled for
+
+
+# each precision is compiled for
+@pytest.mark.parametrize("name", ["sf", pytest.param("nn", marks=pytest.mark.thorough)])
+def test_single_precision(name: str, people: list[Sequence]) -> None:
+    batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
     found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
     assert found.x.dtype == own.dtype == torch.float32
@@ -180,12 +188,14 @@ def test_directional_derivative(people: list[Sequence]) -> None:
     assert float(found[: len(flat)] @ flat) == pytest.approx(quotient, rel=1e-6)
 
 
-@pytest.mark.parametrize("options", [{}, {"cutoff": 30.0}], ids=["dense", "lists"])
-def test_padding_stands_still(options: dict[str, float], people: list[Sequence]) -> None:
+@pytest.mark.parametrize(
+    ("name", "options"), [("nn", {}), ("sf", {"cutoff": 30.0})], ids=["dense", "lists"]
+)
+def test_padding_stands_still(name: str, options: dict[str, float], people: list[Sequence]) -> None:
     batch = single(people)
     x0, v0 = batch.x.clone().requires_grad_(), batch.v.clone().requires_grad_()
     moving = Batch(**{**vars(batch), "x": x0, "v": v0})
-    model = Crowd(MODELS["nn"]())
+    model = Crowd(MODELS[name]())
     law = compiled.supports(model, moving)
     assert law is not None
     x, _ = compiled.simulate(model, law, moving, 2, **options)
@@ -303,7 +313,14 @@ EFFECTS = {
 }
 
 
-@pytest.mark.parametrize(("base", "chosen"), [("sf", "walls"), ("nn", "force"), ("sf", "sums")])
+@pytest.mark.parametrize(
+    ("base", "chosen"),
+    [
+        ("nn", "force"),
+        ("sf", "sums"),
+        pytest.param("sf", "walls", marks=pytest.mark.thorough),  # they are below, among neighbours
+    ],
+)
 def test_effects(base: str, chosen: str, people: list[Sequence]) -> None:
     names = ("g", "", "h", "g", "h", "g", "i", "h")
     people = [replace(item, group=names[: item.x.shape[1]]) for item in people]

@@ -37,7 +37,9 @@ def check(model: System, batch: Any) -> None:
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
-@pytest.mark.parametrize("effects", EFFECTS)
+@pytest.mark.parametrize(
+    "effects", [pytest.param("one", marks=pytest.mark.thorough), *list(EFFECTS)[1:]]
+)
 def test_traffic_with_effects(effects: str, leader: str, ragged: Any) -> None:
     model = build_model({**LAW, "leader": leader, "effects": EFFECTS[effects]})
     check(model, single(ragged))
@@ -51,5 +53,5 @@ def test_a_crowd_with_an_effect(crowd: Any) -> None:
 def test_no_compiled_law_ignores_an_effect(ragged: Any) -> None:
     batch = single(ragged)
     plain = FusedSolver(DT)(build_model({**LAW, "leader": "constant"}), batch)
-    slow = build_model({**LAW, "leader": "constant", "effects": EFFECTS["one"]})
+    slow = build_model({**LAW, "leader": "constant", "effects": EFFECTS["both"]})
     assert (FusedSolver(DT)(slow, batch).x - plain.x).abs().max() > 0.01

@@ -35,8 +35,11 @@ def spread(model: torch.nn.Module, runs: int) -> dict[str, Tensor]:
     }
 
 
+LOG = pytest.param("log", marks=pytest.mark.thorough)  # compiled like the others
+
+
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [LOG if name == "log" else name for name in MODELS])
 def test_every_run_is_its_own(name, threads, ragged, crowd) -> None:  # type: ignore[no-untyped-def]
     people = [crowd(3, samples=4, name="a"), crowd(2, samples=3, name="b")]
     batch = single(people if name == "crowd" else ragged)
@@ -96,7 +99,9 @@ def test_refusals(ragged) -> None:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("name", ["lin", "log", "n4"])
+@pytest.mark.parametrize(
+    "name", ["n4", *(pytest.param(law, marks=pytest.mark.thorough) for law in ("lin", "log"))]
+)
 def test_both_arrangements_agree(name, dtype, equal, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     batch, model = single(equal).to(dtype=dtype), MODELS[name]().to(dtype)
     found = []

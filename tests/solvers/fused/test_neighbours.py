@@ -95,8 +95,8 @@ def test_pairs_grow_with_people() -> None:
     assert shares[1] / shares[0] < 1.3
 
 
-def hall(n: int, samples: int = 3, dt: float = 0.04) -> Batch:
-    """People at one per square metre, of whom many touch, between two walls; padding."""
+def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
+    """People at one per square metre, of whom many touch, between (two) walls; padding."""
     draw = np.random.default_rng(3)
     side = n**0.5
     t = dt * np.arange(samples)[:, None, None]
@@ -112,7 +112,9 @@ def hall(n: int, samples: int = 3, dt: float = 0.04) -> Batch:
                 x=x0 + t * v,
                 v=np.broadcast_to(v, (samples, count, 2)),
                 destination=x0 + np.array([20.0, 0.0]),
-                walls=np.array([[0, 0, side, 0], [side, side, 0, side]])[: 2 if name == "a" else 1],
+                walls=np.array([[0, 0, side, 0], [side, side, 0, side]])[
+                    : walls if name == "a" else walls // 2
+                ],
             )
         )
     return collate(items)
@@ -121,10 +123,10 @@ def hall(n: int, samples: int = 3, dt: float = 0.04) -> Batch:
 @pytest.mark.parametrize("cutoff_error", [1e-3, 1e-6, 1e-10])
 def test_the_bound_holds(cutoff_error: float) -> None:
     A, mass, n = 3.0, 2.0, 300
-    batch = hall(n)
+    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, mass=mass)])
     # wall points would be averaged over their own number: one bound at a time
     for walls in (False, True):
-        model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, mass=mass, walls=walls)])
+        batch = hall(n, walls=2 * walls)
         with torch.no_grad():
             v = FusedSolver(batch.dt, cutoff_error=cutoff_error)(model, batch).v
             exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
@@ -140,8 +142,8 @@ def test_the_bound_holds(cutoff_error: float) -> None:
 @pytest.mark.parametrize("cutoff", [0.8, 1.5])
 def test_the_bound_of_a_given_distance(cutoff: float) -> None:
     A, decay, mass = 3.0, 0.1, 2.0
-    batch = hall(40)  # small crowds have a cutoff where one is given
-    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, B=decay, mass=mass, walls=False)])
+    batch = hall(40, walls=0)  # small crowds have a cutoff where one is given
+    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, B=decay, mass=mass)])
     with torch.no_grad():
         v = FusedSolver(batch.dt, cutoff=cutoff, cutoff_error=0)(model, batch).v
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
@@ -203,8 +205,8 @@ def test_models_that_cannot_have_a_cutoff() -> None:
 def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
     # the force on one person, not divided by the number of people
     A, n = 3.0, 2000
-    batch = hall(n)
-    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, walls=False)])
+    batch = hall(n, walls=0)
+    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0)])
     with torch.no_grad():
         law = crowds.supports(model, batch)
         assert law is not None
@@ -224,7 +226,7 @@ def test_the_formula_of_the_bound() -> None:
             neighbours.cutoff_distance(0.5, 0.1, error)
 
 
-@pytest.mark.parametrize("walls", [False, True])
+@pytest.mark.parametrize("walls", [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_lists_give_the_gradient(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0, walls=walls)])
@@ -238,6 +240,14 @@ def test_lists_give_the_gradient(walls: bool) -> None:
         assert (found.x[mask] != exact.x[mask]).any()
     _, own = gradient(model, FusedSolver(0.02, cutoff=100.0), batch)
     assert difference(own, wanted) < 1e-10
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("walls", [False, True])
+def test_lists_in_single_precision(walls: bool) -> None:
+    batch = hall(crowds.LISTS_FROM + 20)
+    model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0, walls=walls)])
+    _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     single = gradient(model.to(torch.float32), FusedSolver(0.02), batch.to(dtype=torch.float32))
     assert difference(single[1], wanted) < 1e-4
 

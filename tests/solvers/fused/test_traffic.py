@@ -25,7 +25,7 @@ def network(hidden: int) -> NetworkSpeed:
 LAWS = {
     "lin": lambda: Linear(18.0, 4.0),
     "log": lambda: Logarithmic(18.0, 6.0),
-    **{f"n{h}": partial(network, h) for h in (2, 4)},
+    "n4": partial(network, 4),
 }
 
 
@@ -51,6 +51,18 @@ def test_states_and_gradient(law, items, leader, request) -> None:  # type: igno
         found, own = gradient(model, FusedSolver(DT, threads), batch)
         torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-9)
         assert difference(own, wanted) < 1e-10
+
+
+# each precision is compiled for
+@pytest.mark.parametrize("leader", ["constant", "measured"])
+@pytest.mark.parametrize("items", ["ragged", "equal"])
+@pytest.mark.parametrize(
+    "law", ["n4", *(pytest.param(law, marks=pytest.mark.thorough) for law in ("lin", "log"))]
+)
+def test_single_precision(law, items, leader, request) -> None:  # type: ignore[no-untyped-def]
+    batch = single(request.getfixturevalue(items))
+    model = Traffic([LAWS[law]()], leader=leader).to(torch.float32).to(torch.float64)
+    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
     found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
     assert found.x.dtype == own.dtype == torch.float32
     measured = batch.valid[..., None].expand_as(exact.x)
@@ -96,7 +108,7 @@ def test_threads_change_nothing(equal, threads: int) -> None:  # type: ignore[no
 
 
 def test_backward_twice(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = collate(ragged), Traffic([network(2)])
+    batch, model = collate(ragged), Traffic([network(4)])
     cost = FusedSolver(DT)(model, batch).x.square().sum()
     weights = list(model.parameters())
     once = torch.autograd.grad(cost, weights, retain_graph=True, allow_unused=True)
@@ -106,7 +118,7 @@ def test_backward_twice(ragged) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_without_gradient_nothing_is_stored(equal) -> None:  # type: ignore[no-untyped-def]
-    batch, model = collate(equal), Traffic([network(2)])
+    batch, model = collate(equal), Traffic([network(4)])
     with torch.no_grad():
         found = FusedSolver(DT)(model, batch).x
     assert not found.requires_grad
@@ -138,7 +150,7 @@ def test_refusals(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("hidden", [1, 10])
+@pytest.mark.parametrize("hidden", [1, 2, 10])
 def test_other_networks(hidden: int, ragged) -> None:  # type: ignore[no-untyped-def]
     batch, model = single(ragged), Traffic([network(hidden)])
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
