@@ -92,19 +92,12 @@ class InteractionForce(CrowdBase):
         wall's unit normal."""
         raise NotImplementedError  # pragma: no cover - every force defines its own
 
-    def pairs(self, state: State, ahead: Tensor | float = 0.0) -> Tensor:
+    def pairs(self, state: State) -> Tensor:
         """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third),
-        0 where they are one.
-
-        Args:
-            state: positions and velocities.
-            ahead: s; all positions are extrapolated by this time at their velocities.
-        """
+        0 where they are one."""
         x, v, scene = state.x, velocity(state), state.scene
         other, speed = state.others
         dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
-        if isinstance(ahead, Tensor) or ahead:
-            dx = dx + ahead * dv
         apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
         acts = (scene.agent[:, None, :] & apart)[..., None]
         return self.pair_force(dx, dv) * (acts / (self.mass * scene.count[..., None]))

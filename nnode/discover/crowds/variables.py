@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,12 +11,7 @@ from torch import Tensor
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
 from nnode.models.crowd import dot, norm, velocity
 from nnode.models.crowd_formula import walls_of
-from nnode.models.effects.crowd_pairs import (
-    Neighbours,
-    heading,
-    local_density,
-    right_of,
-)
+from nnode.models.effects.crowd_pairs import heading
 from nnode.models.term import State
 
 Of = Callable[[State], Tensor]
@@ -160,3 +156,42 @@ def wall_distance(state: State) -> tuple[Tensor, Tensor]:
     away = offset - share[..., None] * along
     d = norm(away)
     return torch.where(real[:, None], d, FAR), away / d[..., None]
+
+
+def right_of(direction: Tensor) -> Tensor:
+    """``(..., 2)``: the direction turned to the right by a quarter."""
+    return torch.stack([direction[..., 1], -direction[..., 0]], -1)
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """What person i (second axis) sees of person j (third axis).
+
+    Attributes:
+        d: ``(B, N, N)`` distance, m.
+        n: ``(B, N, N, 2)`` unit vector from j to i.
+        dv: ``(B, N, N, 2)`` velocity of j relative to i, m/s.
+        acts: ``(B, N, N)`` 1 where j is a real person other than i, else 0.
+    """
+
+    d: Tensor
+    n: Tensor
+    dv: Tensor
+    acts: Tensor
+
+    @classmethod
+    def of(cls, state: State) -> Neighbours:
+        """Everyone's neighbours, where ``state.others`` has them."""
+        x, v = state.x, velocity(state)
+        other, speed = state.others
+        dx = x[:, :, None] - other[:, None]
+        d = norm(dx)
+        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
+        acts = (state.scene.agent[:, None, :] & apart).to(x.dtype)
+        return cls(d, dx / d[..., None], speed[:, None] - v[:, :, None], acts)
+
+
+def local_density(pair: Neighbours, kernel: float) -> Tensor:
+    """``(B, N)`` 1/m²: of the others, by a Gaussian of width ``kernel`` (m)."""
+    spread = torch.exp(-(pair.d**2) / (2 * kernel**2)) / (2 * torch.pi * kernel**2)
+    return (spread * pair.acts).sum(2)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
 from nnode.laws.crowd import CrowdRule
-from nnode.models.crowd import norm, velocity
+from nnode.models.crowd import norm
 from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.system import System
-from nnode.models.term import Interval, State
+from nnode.models.term import Interval
 
 
 def heading(v: Tensor) -> Tensor:
@@ -21,42 +19,9 @@ def heading(v: Tensor) -> Tensor:
     return v / norm(v)[..., None]
 
 
-def right_of(direction: Tensor) -> Tensor:
-    """``(..., 2)``: the direction turned to the right by a quarter."""
-    return torch.stack([direction[..., 1], -direction[..., 0]], -1)
-
-
 def company(batch: Batch) -> bool:
     """Whether anyone has others around."""
     return bool((batch.agent.sum(1) > 1).any())
-
-
-@dataclass(frozen=True)
-class Neighbours:
-    """What person i (second axis) sees of person j (third axis).
-
-    Attributes:
-        d: ``(B, N, N)`` distance, m.
-        n: ``(B, N, N, 2)`` unit vector from j to i.
-        dv: ``(B, N, N, 2)`` velocity of j relative to i, m/s.
-        acts: ``(B, N, N)`` 1 where j is a real person other than i, else 0.
-    """
-
-    d: Tensor
-    n: Tensor
-    dv: Tensor
-    acts: Tensor
-
-    @classmethod
-    def of(cls, state: State) -> Neighbours:
-        """Everyone's neighbours, where ``state.others`` has them."""
-        x, v = state.x, velocity(state)
-        other, speed = state.others
-        dx = x[:, :, None] - other[:, None]
-        d = norm(dx)
-        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
-        acts = (state.scene.agent[:, None, :] & apart).to(x.dtype)
-        return cls(d, dx / d[..., None], speed[:, None] - v[:, :, None], acts)
 
 
 class PairEffect(Effect):
@@ -164,9 +129,3 @@ class DensitySlowdown(PairEffect):
     separated_by = "the same people at different densities"
 
     c: Tensor
-
-
-def local_density(pair: Neighbours, kernel: float) -> Tensor:
-    """``(B, N)`` 1/m²: of the others, by a Gaussian of width ``kernel`` (m)."""
-    spread = torch.exp(-(pair.d**2) / (2 * kernel**2)) / (2 * torch.pi * kernel**2)
-    return (spread * pair.acts).sum(2)
