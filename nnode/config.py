@@ -35,7 +35,7 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.discover.options import DiscoverOptions
-from nnode.models.field import FIELD
+from nnode.models.field import FIELD, NEURONS
 from nnode.models.options import (
     FormulaOptions,
     LawOptions,
@@ -126,7 +126,12 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "formula_schema"): FormulaOptions(term="formula"),
-    ("model", "idm_schema"): FormulaOptions(term="formula", law=FIELD["idm"]),
+    **{
+        ("model", f"{name}_schema"): FormulaOptions(
+            term="formula", law=law, network=NEURONS.get(name)
+        )
+        for name, law in FIELD.items()
+    },
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),
     ("model", "network_force_schema"): NetworkForceOptions(term="network_force"),

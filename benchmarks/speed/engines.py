@@ -51,7 +51,7 @@ class LoopSolver:
         self.dt = dt
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
-        n = substeps(batch.dt, self.dt, system.domain)
+        n = substeps(batch.dt, self.dt, system)
         scene, y = system.scene(batch), system.initial(batch)
         step = batch.dt / n
         found = [y]
@@ -113,7 +113,7 @@ class _Batched:
         self.dt = dt
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
-        steps = substeps(batch.dt, self.dt, system.domain)
+        steps = substeps(batch.dt, self.dt, system)
         y = fallback.simulate(system, batch, steps, list(system.parameters()))
         return Trajectory(*system.observe(y, batch))
 

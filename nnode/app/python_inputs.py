@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from nnode.data.options import TableOptions
 from nnode.errors import ConfigError
-from nnode.models.field import FIELD
+from nnode.models.field import FIELD, NEURONS
 
 #: Models by the names that ``conf/model`` gives them.
 MODELS: dict[str, dict[str, Any]] = {
@@ -20,7 +20,10 @@ MODELS: dict[str, dict[str, Any]] = {
     "n2": {"term": "network_speed", "hidden": 2},
     "n4": {"term": "network_speed", "hidden": 4},
     "n10": {"term": "network_speed", "hidden": 10},
-    "idm": {"term": "formula", "law": FIELD["idm"]},
+    **{
+        name: {"term": "formula", "law": law, "network": NEURONS.get(name)}
+        for name, law in FIELD.items()
+    },
     "formula": {"term": "formula"},
     "sf": {"term": "social_force"},
     "nn": {"term": "network_force"},

@@ -213,7 +213,7 @@ def _trainer(
         if parts.heldout
         else None
     )
-    n = substeps(store[0].dt, config.solver.dt, model.domain)
+    n = substeps(store[0].dt, config.solver.dt, model)
     log.info(
         "%s: %d sequences train, %d held out, %d dropped between; %d steps per sample",
         data.name, len(parts.train), len(parts.heldout), len(parts.dropped), n,

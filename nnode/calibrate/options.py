@@ -44,7 +44,12 @@ class SolverOptions:
     """What all solvers share."""
 
     name: str = MISSING  # of the solver
-    dt: float | None = None  # s, step; null: 0.002 in traffic, 0.0625 in crowds
+    dt: float | None = (
+        None  # s, step; null: 0.002 for speeds, 0.1 for accelerations in traffic, 0.0625 in crowds
+    )
+    # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: ballistic for
+    # accelerations of vehicles, otherwise euler
+    method: str | None = None
 
 
 @dataclass
@@ -52,7 +57,6 @@ class TorchdiffeqOptions(SolverOptions):
     """See :class:`nnode.solvers.TorchdiffeqSolver`."""
 
     name: str = "torchdiffeq"
-    method: str = "euler"  # of torchdiffeq: euler, midpoint, rk4, dopri5, ...
     gradient: Gradient = Gradient.adjoint
     rtol: float = 1e-6  # relative tolerance of methods that choose their steps
     atol: float = 1e-8  # absolute tolerance of those, m

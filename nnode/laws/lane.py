@@ -11,6 +11,7 @@ gap, gap_1      m       x_1 - x, x_2 - x_1
 dv              m/s     v - v_1
 dx_1            m/s     the speed of the vehicle ahead, as the whole model makes it
 t, clock        s       time since the first sample, and time of the day
+dt              s       length of a step, in laws that say what holds one step later
 length_1        m       length of the vehicle ahead; 0 where no length is known
 second          1       1 where there is a second vehicle ahead
 measured        m/s     measured speed, for a leader
@@ -26,7 +27,16 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from nnode.laws.expression import Expr, below, const, substitute, symbol, symbols
+from nnode.laws.expression import (
+    Expr,
+    apply,
+    below,
+    const,
+    reciprocal,
+    substitute,
+    symbol,
+    symbols,
+)
 from nnode.laws.parse import parse
 from nnode.laws.units import check
 
@@ -34,7 +44,7 @@ from nnode.laws.units import check
 UNITS = {
     "x": "m", "x_1": "m", "x_2": "m", "gap": "m", "gap_1": "m",
     "v": "m/s", "v_1": "m/s", "v_2": "m/s", "dv": "m/s", "dx_1": "m/s", "measured": "m/s",
-    "length_1": "m", "t": "s", "clock": "s", "second": "1",
+    "length_1": "m", "t": "s", "clock": "s", "dt": "s", "second": "1",
 }  # fmt: skip
 #: Of these the others are made.
 _MADE = {
@@ -55,17 +65,24 @@ class Rule:
             it does nothing to followers.
         leader: what becomes of the speed of a leader that drives by itself, ``W`` before;
             empty: it stays.
-        states: name to (unit, rate) of states that the term adds.
+        states: name to (unit, rate) of states that the term adds, or (unit, rate, start); without
+            a start the term's ``remember`` tells it.
+        delayed: name to (formula, unit, delay), the formula's value some time ago; the delay
+            in s, from none to as many steps as the term remembers. Before the first sample
+            it was what it is there.
         where: name to formula of parts.
         constants: name to (value, unit) of fixed quantities.
+        remembered: steps that delayed quantities are remembered for.
         inputs: name to unit of what a vehicle has from the data.
     """
 
     rate: str = ""
     leader: str = ""
-    states: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    states: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    delayed: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     where: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    remembered: int = 0
     inputs: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -82,6 +99,8 @@ class Lane:
         inputs: what vehicles have from the data, symbol to whose it is.
         units: of all symbols.
         fixed: symbols of fixed quantities to their numbers.
+        starts: added state to its value at the start.
+        leads: rates of a leader's other states, where they are not 0.
     """
 
     order: int
@@ -92,6 +111,8 @@ class Lane:
     inputs: dict[str, Any]
     units: dict[str, str]
     fixed: dict[str, Expr] = field(default_factory=dict)
+    starts: dict[str, Expr] = field(default_factory=dict)
+    leads: dict[str, Expr] = field(default_factory=dict)
 
     @property
     def top(self) -> str:
@@ -101,7 +122,8 @@ class Lane:
     @cached_property
     def symbols(self) -> frozenset[str]:
         """Names in the rates."""
-        return frozenset(symbols([*self.rates.values(), self.leader]))
+        every = [*self.rates.values(), self.leader, *self.leads.values(), *self.starts.values()]
+        return frozenset(symbols(every))
 
     @cached_property
     def ahead(self) -> list[tuple[str, int]]:
@@ -122,7 +144,10 @@ class Lane:
         if self.order > 1:
             made["dx_1"] = symbol("v_1")
         rates = {state: substitute(rate, made) for state, rate in self.rates.items()}
-        return replace(self, rates=rates, leader=substitute(self.leader, made))
+        starts: dict[str, Expr] = {}
+        for state, start in self.starts.items():  # one may name those before it
+            starts[state] = substitute(substitute(start, made), starts)
+        return replace(self, rates=rates, leader=substitute(self.leader, made), starts=starts)
 
 
 def begun(
@@ -147,6 +172,7 @@ def of_rule(
     leader: Expr,
     owned: Mapping[str, Any],
     units: Mapping[str, str],
+    laws: Mapping[str, Any] | None = None,
 ) -> Lane:
     """A law alone, from text.
 
@@ -155,6 +181,7 @@ def of_rule(
         leader: speed of a leader that drives by itself, m/s.
         owned: symbol to what it is.
         units: of the symbols.
+        laws: networks by their names in the formula, see :func:`nnode.laws.parse.parse`.
 
     Raises:
         ConfigError: it cannot be read, names what there is not, or its units are wrong.
@@ -165,10 +192,59 @@ def of_rule(
         **parameters,
         **{k: symbol(f"{name}__{k}") for k in rule.constants},
     }
+    every = {**UNITS, **units, **own_units}
+    for part, (unit, *_) in rule.states.items():
+        names[part], every[f"{name}__{part}"] = symbol(f"{name}__{part}"), unit
+    states, starts = _delays(name, rule, names, every)
     for part, formula in rule.where.items():
-        names[part] = parse(formula, names)
-    found = begun(name, parse(rule.rate, names), order, leader, owned, {**units, **own_units})
-    return replace(found, fixed=fixed)
+        names[part] = parse(formula, names, laws)
+    _add_states(name, rule, names, every, states, starts, laws)
+    found = begun(name, parse(rule.rate, names, laws), order, leader, owned, every)
+    return replace(found, fixed=fixed, rates={**found.rates, **states}, starts=starts)
+
+
+def _add_states(
+    name: str, rule: Rule, names: Mapping[str, Expr], units: Mapping[str, str],
+    rates: dict[str, Expr], starts: dict[str, Expr], laws: Mapping[str, Any] | None,
+) -> None:  # fmt: skip
+    """Add rates and starts of a rule's states to those that there are."""
+    for part, (unit, formula, *start) in rule.states.items():
+        own = f"{name}__{part}"
+        rates[own] = parse(formula, names, laws)
+        check(f"d{part}/dt of {name}", rates[own], units, f"{unit}/s")
+        for text in start:
+            starts[own] = parse(text, names, laws)
+            check(f"{part} of {name} at the start", starts[own], units, unit)
+
+
+def _delays(
+    name: str,
+    rule: Rule,
+    names: dict[str, Expr],
+    units: dict[str, str],
+    laws: Mapping[str, Expr] | None = None,
+) -> tuple[dict[str, Expr], dict[str, Expr]]:
+    """Rates and starts of the states that remember delayed quantities; adds those to ``names``.
+
+    State i holds the value of i + 1 steps ago: a step hands every value on to the next state, and
+    a delay between two of them lies between their values.
+    """
+    rates, starts, dt = {}, {}, symbol("dt")
+    for part, (text, unit, delay) in rule.delayed.items():
+        now, wait = parse(text, names, laws), parse(delay, names, laws)
+        check(part, now, units, unit)
+        check(f"the delay of {part}", wait, units, "s")
+        total, newer = now, now
+        for i in range(rule.remembered):
+            own = f"{name}__{part}_{i}"
+            units[own], starts[own] = unit, now
+            older = symbol(own)
+            rates[own] = (newer - older) * reciprocal(dt)
+            past = apply("max", (wait - i * dt) * reciprocal(dt), const(0))
+            total = total + apply("min", past, const(1)) * (older - newer)
+            newer = older
+        names[part] = total
+    return rates, starts
 
 
 def _constants(name: str, rule: Rule) -> tuple[dict[str, Expr], dict[str, str]]:
@@ -216,13 +292,16 @@ def changed(
     for part, unit in rule.inputs.items():
         own = f"{name}__{part}"
         names[part], every[own], inputs[own] = symbol(own), unit, (whose, part)
-    for part, (unit, _) in rule.states.items():
+    for part, (unit, *_) in rule.states.items():
         names[part] = symbol(f"{name}__{part}")
         every[f"{name}__{part}"] = unit
     rates, laws = dict(lane.rates), {} if lane.law is None else {"law": lane.law}
     before = {**names, "W": rates[lane.top]}
     for part, formula in rule.where.items():
         before[part] = names[part] = parse(formula, before, laws)
+    held, starts = _delays(name, rule, before, every, laws)
+    rates.update(held)
+    starts = {**lane.starts, **starts}
 
     def finished(part: str, text: str, given: Mapping[str, Expr], unit: str) -> Expr:
         found = parse(text, given, laws)
@@ -230,8 +309,7 @@ def changed(
         return found
 
     wanted = "m/s" if lane.order == 1 else "m/s^2"
-    for part, (unit, formula) in rule.states.items():
-        rates[f"{name}__{part}"] = finished(f"d{part}/dt of {name}", formula, before, f"{unit}/s")
+    _add_states(name, rule, before, every, rates, starts, laws)
     if rule.rate:
         rates[lane.top] = finished(name, rule.rate, before, wanted)
     leader = lane.leader
@@ -246,4 +324,5 @@ def changed(
         inputs=inputs,
         units=every,
         fixed={**lane.fixed, **fixed},
+        starts=starts,
     )

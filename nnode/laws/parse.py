@@ -32,6 +32,8 @@ _BINARY: dict[type, Callable[[Expr, Expr], Expr]] = {
     ast.Div: lambda a, b: a / b,
     ast.Pow: lambda a, b: a**b,
 }
+#: What a name that is called stands for.
+Part = Expr | Callable[..., Expr]
 _LISTED = "expected + - * / **, brackets, numbers, names, and the functions " + ", ".join(FUNCTIONS)
 
 
@@ -51,14 +53,15 @@ def _around(text: str, column: int) -> tuple[str, int]:
 
 
 def parse(
-    text: str, names: Mapping[str, Expr] | None = None, laws: Mapping[str, Expr] | None = None
+    text: str, names: Mapping[str, Expr] | None = None, laws: Mapping[str, Part] | None = None
 ) -> Expr:
     """A formula.
 
     Args:
         text: such as ``v0*(1 - L/gap)``.
         names: what names stand for; None takes every name as a quantity of its own.
-        laws: name to the formula that ``name(...)`` stands for, with other quantities in it.
+        laws: name to the formula that ``name(...)`` stands for, with other quantities in it; or
+            to what makes a formula of the arguments, as of a network.
 
     Raises:
         FormulaError: anything that is no formula, with its place.
@@ -77,7 +80,7 @@ def parse(
 
 class _Reader:
     def __init__(
-        self, text: str, names: Mapping[str, Expr] | None, laws: Mapping[str, Expr]
+        self, text: str, names: Mapping[str, Expr] | None, laws: Mapping[str, Part]
     ) -> None:
         self.text, self.names, self.laws = text, names, laws
 
@@ -129,7 +132,12 @@ class _Reader:
 
     def call(self, node: ast.Call, name: str, depth: int) -> Expr:
         if name in self.laws:
-            return self.of_law(node, name, depth)
+            part = self.laws[name]
+            if isinstance(part, Expr):
+                return self.of_law(node, name, part, depth)
+            if node.keywords or not node.args:
+                raise self.fail(node, f"{name} takes its inputs one after the other")
+            return part(*(self.read(a, depth + 1) for a in node.args))
         if name not in FUNCTIONS:
             raise self.fail(node, f"there is no function {name}; {_LISTED}")
         if node.keywords or len(node.args) != FUNCTIONS[name]:
@@ -141,15 +149,17 @@ class _Reader:
             return apply("min", apply("max", args[0], args[1]), args[2])
         return apply(name, *args)
 
-    def of_law(self, node: ast.Call, name: str, depth: int) -> Expr:
+    def of_law(self, node: ast.Call, name: str, law: Expr, depth: int) -> Expr:
         values: dict[str, Expr] = {}
         if node.args or any(keyword.arg is None for keyword in node.keywords):
             raise self.fail(node, f"{name} takes what it replaces by name, as {name}(gap=gap_1)")
         for keyword in node.keywords:
             assert keyword.arg is not None
+            if self.names is not None and keyword.arg not in self.names:
+                raise self.fail(node, f"the law has no {keyword.arg} that could be replaced")
             target = self.names.get(keyword.arg) if self.names is not None else None
             if target is not None and target.op != "symbol":
                 raise self.fail(node, f"{keyword.arg} is made of others and cannot be replaced")
             place = keyword.arg if target is None else target.value
             values[place] = self.read(keyword.value, depth + 1)
-        return substitute(self.laws[name], values)
+        return substitute(law, values)

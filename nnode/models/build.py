@@ -39,7 +39,13 @@ def _log(options: Options, generator: torch.Generator) -> System:
 
 
 def _formula(options: Options, generator: torch.Generator) -> System:
-    law = law_from(str(options["name"]), options["law"])
+    law = law_from(
+        str(options["name"]),
+        options["law"],
+        network=options.get("network"),
+        box=options.get("box"),
+        generator=generator,
+    )
     if isinstance(law, FormulaForce):
         return Crowd([law])
     leader = str(getattr(options["leader"], "value", options["leader"]))

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from nnode.laws.crowd import CrowdLaw
-from nnode.laws.expression import Expr, substitute, symbol
+from nnode.laws.expression import Expr, const, substitute, symbol
 from nnode.laws.lane import UNITS, Lane, changed
+from nnode.laws.steps import stepped
 from nnode.laws.tensors import Code, LaneRates, computed
 from nnode.models.scene import Scene
 from nnode.models.term import State, Term
@@ -24,9 +25,11 @@ class Law(Term):
 
     Attributes:
         order: 1: it says a speed; 2: an acceleration.
+        step: its own method of stepping; None: that of its order.
     """
 
     order = 1
+    step: str | None = None
 
     @property
     def speaks(self) -> bool:
@@ -67,6 +70,17 @@ def rule_of(term: Term) -> Any:
     return None
 
 
+def _effect_rule(term: Term, order: int) -> Any:
+    """What an effect does to a law of an order."""
+    return rule_of(term) if order == 1 else term.second
+
+
+def begins(term: Term, order: int) -> bool:
+    """Whether the start of a term's states is a formula."""
+    rule = rule_of(term) if isinstance(term, Law) else _effect_rule(term, order)
+    return bool(rule) and bool(rule.delayed or any(len(s) > 2 for s in rule.states.values()))
+
+
 #: What computes a term.
 _CODE = {
     "forward", "speed", "memory_rate", "pair_force", "wall_force", "pairs", "components",
@@ -77,7 +91,8 @@ def lane_of(terms: Sequence[Term]) -> Lane | None:
     """The formula of a lane with these terms; None where one is code without a formula."""
     if not terms or not isinstance(terms[0], Law) or not terms[0].speaks:
         return None
-    if any(isinstance(e, Law) or rule_of(e) is None for e in terms[1:]):
+    order = terms[0].order
+    if any(isinstance(e, Law) or _effect_rule(e, order) is None for e in terms[1:]):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _KNOWN:
@@ -105,7 +120,7 @@ def with_effect(lane: Lane, term: Term, owner: str, place: int) -> Lane:
         place: of the term in the model.
     """
     parameters, owned, units = parameters_of(term, owner, place)
-    rule = rule_of(term)
+    rule = _effect_rule(term, lane.order)
     assert rule is not None
     return changed(lane, owner, rule, parameters, owned, units, whose=place)
 
@@ -180,12 +195,13 @@ def rates_of(
     values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
     values |= inputs_of(terms, lane, scene) | dict(more or {})
     values["t"], values["start"] = t, scene.start[:, None].expand(y.shape[:2])
+    values["dt"] = y.new_tensor(scene.step)
     lead = None
     if measured or "measured" in lane.symbols:
         values["measured"] = scene.measured_rate_at(t)[..., 0]
         lead = values["measured"] if measured else None
     code = terms[0].code() if isinstance(terms[0], Law) else None
-    return _rates(lane)(y, values, scene.follower, scene.leader, lead, code)
+    return _rates(stepped(lane, scene.method))(y, values, scene.follower, scene.leader, lead, code)
 
 
 def beyond(term: Term, state: State) -> Tensor:
@@ -214,6 +230,30 @@ def beyond(term: Term, state: State) -> Tensor:
 
 #: A law and an effect to the formula of what the effect changes.
 _BEYOND: dict[tuple[Any, ...], Lane] = {}
+
+
+def starts_of(terms: Sequence[Term], lane: Lane, x: Tensor, v: Tensor, scene: Scene) -> dict[str, Tensor]:  # fmt: skip
+    """``(B, N)`` values at the start of a lane's added states, of those whose start is a formula.
+
+    Args:
+        x, v: ``(B, N, 1)`` measured at the start.
+    """
+    if not lane.starts:
+        return {}
+    start = [x, v][: lane.order]
+    y = torch.cat([*start, x.new_zeros(*x.shape[:2], len(lane.rates) - lane.order)], -1)
+    values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
+    values |= inputs_of(terms, lane, scene)
+    values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
+    found = _starts(lane)(y, values, scene.follower, scene.leader, None)
+    return {name: found[..., i] for i, name in enumerate(lane.rates) if name in lane.starts}
+
+
+@cache
+def _starts(lane: Lane) -> LaneRates:
+    zero = const(0)
+    rates = {state: lane.starts.get(state, zero) for state in lane.rates}
+    return LaneRates(replace(lane, rates=rates, leads={}))
 
 
 @cache

@@ -43,6 +43,9 @@ class FormulaOptions(ModelOptions):
     leader: Leader = Leader.measured
     # {parameters: {v0: 30 m/s, ...}, where: {...}, rate: {v: "..."}, source: ...}
     law: Any = MISSING
+    # neurons of a network NN that the law's rate calls, or that stands beside it; null: none
+    network: int | None = None
+    box: float | None = None  # its weights stay in [-box, box]; null leaves them free
 
 
 @dataclass

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,21 +13,48 @@ from torch import Tensor
 
 from nnode.errors import ConfigError
 from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
-from nnode.laws.expression import symbol
+from nnode.laws.expression import Expr, const, symbol
 from nnode.laws.lane import Lane, Rule, of_rule
+from nnode.laws.parse import parse
+from nnode.laws.steps import METHODS
 from nnode.laws.units import in_si
 from nnode.models.crowd_formula import CrowdBase, formula_of
 from nnode.models.formula import Law, parameters_of
+from nnode.models.network import FeedForward
 from nnode.models.term import Interval, State, Term
 
 #: What is 0 where everybody drives at one speed, as far as a law may name it.
 _AT_REST = ("dv", "t", "clock", "x", "x_1", "x_2", "v_2", "length_1", "gap_1", "dx_1", "v", "v_1")
+#: The step that a map from step to step is shown with, s.
+_STEP = 0.1
 #: No vehicle is faster, m/s.
 FASTEST = 100.0
 #: What a law's description may say.
-_KEYS = ("parameters", "where", "rate", "source")
+_KEYS = (
+    "parameters",
+    "constants",
+    "where",
+    "delayed",
+    "remembered",
+    "states",
+    "step",
+    "rate",
+    "source",
+)
 _SUMS = (OTHERS, POINTS, WALLS)
+#: A network beside a law, by its order: what is named is brought to the size of one, SI units.
+_BESIDE = {1: "NN(gap/20)", 2: "NN(gap/20, v/10, dv/2)"}
+_CALLS = re.compile(r"\bNN\s*\(")
 _PARAMETER = ("value", "low", "high")
+
+
+def _three(key: str, name: Any, given: Any) -> tuple[str, str, str]:
+    """An entry of ``states`` or ``delayed``."""
+    if isinstance(given, str) or len(given) != 3:
+        wanted = {"states": "[unit, rate, start]", "delayed": "[formula, unit, delay]"}[key]
+        raise ConfigError(f"model.law.{key}.{name}={given} must be {wanted}")
+    first, second, third = map(str, given)
+    return first, second, third
 
 
 class _Own(Term):
@@ -70,6 +98,16 @@ class FormulaLaw(_Own, Law):
             :mod:`nnode.laws.lane`.
         where: name to formula of parts.
         source: where it comes from.
+        constants: name to a quantity that is not calibrated.
+        delayed: name to ``[formula, delay]``, a value some time ago, of at most ``remembered``
+            steps; the law is then a map from step to step.
+        states: name to ``[unit, rate, start]``, formulas, of what a vehicle remembers.
+        step: the law's own method of stepping, see :mod:`nnode.laws.steps`; None: the field's.
+        network: neurons of the hidden layer of NN, a network that formulas may call with any
+            inputs; where the rate does not, NN(gap/20, v/10, dv/2) is added to it, in SI
+            units, and starts at 0. None: there is none.
+        box: weights stay in [-box, box]; None leaves them free.
+        generator: of the first weights.
 
     A leader that drives by itself keeps the speed v0 in a law of first order, which must have
     such a parameter then, and its first speed in one of second order.
@@ -85,9 +123,19 @@ class FormulaLaw(_Own, Law):
         rate: Mapping[str, str],
         where: Mapping[str, str] | None = None,
         source: str = "",
+        *,
+        constants: Mapping[str, str] | None = None,
+        delayed: Mapping[str, Sequence[str]] | None = None,
+        remembered: int = 0,
+        states: Mapping[str, Sequence[str]] | None = None,
+        step: str | None = None,
+        network: int | None = None,
+        box: float | None = None,
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.name, self.source = str(name), str(source)  # type: ignore[misc]
+        self.network: FeedForward | None = None
         if not isinstance(rate, Mapping) or list(rate) not in (["x"], ["v"]):
             raise ConfigError(
                 f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
@@ -95,26 +143,78 @@ class FormulaLaw(_Own, Law):
             )
         ((state, text),) = rate.items()
         self.order = 1 if state == "x" else 2
-        self.formula = str(text)  # type: ignore[misc]
         parts = {str(k): str(v) for k, v in (where or {}).items()}
-        self.rule = Rule(rate=str(text), where=parts)
+        text, beside = str(text), False
+        if network is not None and not any(_CALLS.search(t) for t in (text, *parts.values())):
+            text, beside = f"{text} + {_BESIDE[self.order]}", True
+        self.formula = text  # type: ignore[misc]
+        self.rule = Rule(
+            rate=text,
+            where=parts,
+            constants={str(k): in_si(str(v)) for k, v in (constants or {}).items()},
+            states={str(k): _three("states", k, v) for k, v in (states or {}).items()},
+            delayed={str(k): _three("delayed", k, v) for k, v in (delayed or {}).items()},
+            remembered=int(remembered),
+        )
+        self.memory = len(self.rule.states) + len(self.rule.delayed) * self.rule.remembered  # type: ignore[misc]
+        self.step = step
+        if step is not None and step not in METHODS:
+            raise ConfigError(f"model.law.step={step} is unknown, expected {', '.join(METHODS)}")
         for own, value in parameters.items():
             self._declare(str(own), value)
+        if network is not None:
+            self._connect(network, beside, generator)
+            if box is not None:
+                self.bound_all("network.", Interval(-box, box))
         self.lane(self.name)  # says what is wrong with the formula
+
+    def _connect(self, hidden: int, beside: bool, generator: torch.Generator | None) -> None:
+        """Make the network, of as many inputs as the formula gives it."""
+        inputs: set[int] = set()
+
+        def count(*values: Expr) -> Expr:
+            inputs.add(len(values))
+            return const(0)
+
+        assert isinstance(self.rule, Rule)
+        for text in (self.rule.rate, *self.rule.where.values()):
+            parse(text, None, {"NN": count})
+        if len(inputs) != 1:
+            raise ConfigError(
+                f"model.law of {self.name}: NN is called with {sorted(inputs) or 'no'} inputs, "
+                "expected the same number everywhere"
+            )
+        self.network = FeedForward((inputs.pop(), int(hidden), 1), generator)
+        if beside:
+            with torch.no_grad():
+                for weight in self.network.layers[-1].parameters():
+                    weight.zero_()
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, None if self.network is None else self.network.sizes)
 
     def lane(self, owner: str) -> Lane:
         parameters, owned, units = parameters_of(self, owner, 0)
+        laws: dict[str, Any] = {}
+        if self.network is not None:
+            network, label, path = self.network, f"{owner}__n", "terms.0.network."
+            _, weights = network.written([const(0)] * network.sizes[0], label, path)
+            owned.update(weights)
+            units.update(dict.fromkeys(weights, "*"))
+            laws["NN"] = lambda *inputs: network.written(list(inputs), label, path)[0][0]
         leader = symbol("v")
         if self.order == 1:
             leader = parameters.get("v0", symbol("measured"))
         assert isinstance(self.rule, Rule)
-        return of_rule(owner, self.rule, self.order, parameters, leader, owned, units)
+        return of_rule(owner, self.rule, self.order, parameters, leader, owned, units, laws)
 
     def speed(self, gap: Tensor) -> Tensor:
         """W at a gap (m) where everybody drives at one speed, m/s; the least such speed of an
         acceleration that is not negative at rest, up to 100 m/s."""
         zero = torch.zeros_like(gap)
-        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap}
+        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "dt": zero + _STEP}
+        known |= {s: zero for s in self.lane(self.name).starts}
         if self.order == 1:
             return self.evaluated(known).expand_as(gap)
 
@@ -192,7 +292,7 @@ class FormulaForce(_Own, CrowdBase):
         return found
 
 
-def law_from(name: str, description: Any) -> FormulaLaw | FormulaForce:
+def law_from(name: str, description: Any, **network: Any) -> FormulaLaw | FormulaForce:
     """A law from its entry in a configuration or a checkpoint.
 
     Raises:
@@ -211,5 +311,7 @@ def law_from(name: str, description: Any) -> FormulaLaw | FormulaForce:
         raise ConfigError(
             f"model.law has the unknown entries {', '.join(unknown)}; there are {', '.join(keys)}"
         )
-    kind = FormulaForce if people else FormulaLaw
-    return kind(name, **{str(key): value for key, value in description.items()})
+    found = {str(key): value for key, value in description.items()}
+    if people:
+        return FormulaForce(name, **found)
+    return FormulaLaw(name, **found, **network)

@@ -32,6 +32,7 @@ class Scene:
         wall_count: ``(B, 1, 1)`` number of real wall points, at least 1.
         segment: ``(B, W, 4)`` walls x1, y1, x2, y2, m; NaN in the padding.
         start: ``(B,)`` clock time of the first sample, s.
+        step: s, of the solver; method: what becomes of a law in it, see :mod:`nnode.laws.steps`.
         names: of the sequences.
         kind, group: per sequence the agents' class and group names, or None.
     """
@@ -51,6 +52,8 @@ class Scene:
     wall_count: Tensor
     segment: Tensor
     start: Tensor
+    step: float = 0.1
+    method: str = "euler"
     names: tuple[str, ...] = ()
     kind: tuple[tuple[str, ...] | None, ...] = ()
     group: tuple[tuple[str, ...] | None, ...] = ()

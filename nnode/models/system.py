@@ -13,7 +13,7 @@ from torch.func import functional_call
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.laws.lane import Lane
-from nnode.models.formula import Law, lane_of, rates_of
+from nnode.models.formula import Law, begins, lane_of, rates_of, starts_of
 from nnode.models.scene import Scene
 from nnode.models.term import Interval, State, Term, physical_parameters, short_names
 
@@ -46,6 +46,12 @@ class System(nn.Module):
         self.terms = nn.ModuleList(terms)
         self.wall_spacing = wall_spacing
 
+    @property
+    def step(self) -> str:
+        """The method of stepping where none is asked for: the law's own, or the field's, ballistic
+        for accelerations of vehicles and otherwise Euler's; see :mod:`nnode.laws.steps`."""
+        return "euler"
+
     def scene(self, batch: Batch) -> Scene:
         """The fixed surroundings of a batch.
 
@@ -61,9 +67,13 @@ class System(nn.Module):
 
     def initial(self, batch: Batch) -> Tensor:
         """``(B, N, order * D)``: the measured state at the first sample."""
+        start = [batch.x[0], batch.v[0]][: self.order]
+        return torch.cat([*start, *self._memories(batch)], -1)
+
+    def _memories(self, batch: Batch) -> list[Tensor]:
+        """``(B, N, M)`` additional states at the start, term by term."""
         x, v = batch.x[0], batch.v[0]
-        own = [term.remember(x, v, self) for term in self._terms() if term.memory]
-        return torch.cat([*[x, v][: self.order], *own], -1)
+        return [term.remember(x, v, self) for term in self._terms() if term.memory]
 
     def acceleration(self, state: State) -> Tensor:
         """``(B, N, D)``: the sum of all terms, m/s (first order) or m/s² (second order)."""
@@ -146,9 +156,26 @@ class Traffic(System):
         self.order = first.order if isinstance(first, Law) else 1
 
     @property
+    def step(self) -> str:
+        law = self.terms[0] if len(self.terms) else None
+        own = law.step if isinstance(law, Law) else None
+        return own or ("ballistic" if self.order > 1 else "euler")
+
+    @property
     def lane(self) -> Lane | None:
         """The model's formula; None where a term is code without one."""
         return lane_of(self._terms())
+
+    def _memories(self, batch: Batch) -> list[Tensor]:
+        lane = self.lane
+        if lane is None or not lane.starts:
+            return super()._memories(batch)
+        x, v, terms = batch.x[0], batch.v[0], self._terms()
+        known = starts_of(terms, lane, x, v, self.scene(batch))
+        told = [t.remember(x, v, self) for t in terms if t.memory and not begins(t, self.order)]
+        others = iter(torch.cat(told, -1).unbind(-1) if told else ())
+        added = list(lane.rates)[self.order :]
+        return [torch.stack([known[s] if s in known else next(others) for s in added], -1)]
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
         place = scene.measured_at(t) if self.leader == "measured" else None

@@ -81,6 +81,7 @@ class Term(nn.Module):
         fast: parameters that these states' time constants are proportional to, with the factor.
         rule: what it does, as formulas, from which everything is made that computes it; None:
             ``forward`` is code of its own, which runs in PyTorch.
+        second: what it does to a law that says an acceleration; None: nothing is known.
     """
 
     name: ClassVar[str]
@@ -89,6 +90,7 @@ class Term(nn.Module):
     memory: ClassVar[int] = 0
     fast: ClassVar[dict[str, float]] = {}
     rule: Rule | CrowdRule | None = None
+    second: Rule | None = None
 
     def __init__(self) -> None:
         super().__init__()

@@ -24,7 +24,6 @@ from nnode.simulate.loops import Loop
 #: Weights and times of the stages of a method.
 TABLEAUS = {
     "euler": ((1.0,), (0.0,)),
-    "ballistic": ((1.0,), (0.0,)),
     "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0)),
 }
 
@@ -34,14 +33,14 @@ class LaneSource:
     """Source of a model.
 
     Attributes:
-        lane: flat.
-        method: ``euler``, ``ballistic`` or ``rk4``.
+        lane: flat, its rates those of a step.
+        stages: ``euler`` or ``rk4``.
         own: whether every simulation has parameters of its own.
         stride: numbers between two rows.
     """
 
     lane: Lane
-    method: str = "euler"
+    stages: str = "euler"
     own: bool = False
     stride: int = 1424
 
@@ -70,15 +69,6 @@ class LaneSource:
         return "measured" in self.lane.symbols or self.recursive
 
     @cached_property
-    def rates(self) -> dict[str, Expr]:
-        """State to its rate in a step of the method."""
-        rates = dict(self.lane.rates)
-        if self.method == "ballistic" and self.lane.order > 1:
-            # the speed in the middle of the step
-            rates["x"] = rates["x"] + 0.5 * symbol("dt") * rates["v"]
-        return rates
-
-    @cached_property
     def inputs(self) -> list[str]:
         """Rows that carry derivatives."""
         ahead = [f"{s}_{j}" for s, j in self.lane.ahead]
@@ -95,7 +85,7 @@ class LaneSource:
         """Row to formula of everybody but the first row."""
         behind, move = symbol("behind"), symbol("move")
         speed, found = self._leader(), {}
-        for s, rate in self.rates.items():
+        for s, rate in self.lane.rates.items():
             every = apply("choose", behind, rate, speed if s == "x" else const(0))
             if self.recursive and s == "x":
                 found["R"] = every
@@ -146,7 +136,7 @@ class LaneSource:
         places = "".join(
             f"_{row} = np.uint64({i * self.stride})\n" for i, row in enumerate(self.rows)
         )
-        weights, times = TABLEAUS[self.method]
+        weights, times = TABLEAUS[self.stages]
         formula = "\n".join(f"d{s}/dt = {plain(rate)}" for s, rate in self.lane.rates.items())
         formula += f"\nleader: {plain(self.lane.leader)}"
         head = HEAD.format(
@@ -213,7 +203,7 @@ class LaneSource:
         rows = {f"A_{s}": s for s in self.states}
         rows |= {f"D_{i}": i for i in self.inputs if i not in self.states}
         grads = {f"G_{p}": p for p in self.parameters} if self.own else {}
-        kept = [f"A_{s}" for s in self.states] if self.method != "rk4" else []
+        kept = [f"A_{s}" for s in self.states] if self.stages != "rk4" else []
         onto = [*kept, *grads]
         text = self.loop.pulled("follow_pull", self._seeds(self.follower), {**rows, **grads}, onto)
         # of the first row only a leader's own speed can matter

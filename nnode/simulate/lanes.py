@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
 from nnode.laws.lane import Lane
+from nnode.laws.steps import STAGES, stepped
 from nnode.models.formula import inputs_of
 from nnode.models.system import System, Traffic, initial_with
 from nnode.models.term import Term
@@ -134,7 +135,7 @@ def simulate(
     substeps: int,
     threads: int = 1,
     parameters: Mapping[str, Tensor] | None = None,
-    method: str = "euler",
+    method: str | None = None,
 ) -> Tensor:
     """Simulate R runs of a lane.
 
@@ -144,7 +145,7 @@ def simulate(
         threads: at most so many threads work on it.
         parameters: the system's parameters by name, each with a leading axis of R runs;
             None makes one run with the system's own.
-        method: ``euler``, ``ballistic`` or ``rk4``.
+        method: of :data:`nnode.laws.steps.METHODS`; None: the law's own.
 
     Returns:
         ``(K, R, B, N, M)`` states at the samples; it can be differentiated by the parameters
@@ -205,7 +206,7 @@ def planned(
     runs: int,
     *,
     own: bool = False,
-    method: str = "euler",
+    method: str | None = None,
 ) -> Plan:
     """How runs of a batch are computed.
 
@@ -216,10 +217,12 @@ def planned(
     assert isinstance(system, Traffic)
     x = batch.x.detach()
     samples, simulations, agents = x.shape[:3]
-    rough = LaneSource(lane, method, own)
+    method = method or system.step
+    lane, kind = stepped(lane, method), STAGES[method]
+    rough = LaneSource(lane, kind, own)
     groups = [(0, runs * simulations)] if own else [(r, simulations) for r in range(runs)]
     jobs, size, slots = _layout(groups, agents, x.element_size(), threads, rough.recursive)
-    source = LaneSource(lane, method, own, stride=_stride(size))
+    source = LaneSource(lane, kind, own, stride=_stride(size))
     last = batch.valid.any(-1).sum(0) - 1
 
     def tiled(values: Tensor) -> np.ndarray:

@@ -12,9 +12,11 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.models.system import System
 
-#: Default Euler steps, s: the paper's for traffic and for crowds at 25 frames/s; crowds
-#: recorded at 16 frames/s keep their own interval.
-DEFAULT_STEP = {"traffic": 0.002, "crowd": 0.0625}
+#: Default steps, s, by domain and order: the paper's for traffic and for crowds at 25 frames/s;
+#: crowds recorded at 16 frames/s keep their own interval. Car following of second order takes the
+#: interval of most recordings, as the field does (Treiber & Kanagaraj 2015).
+DEFAULT_STEP = {("traffic", 1): 0.002, ("traffic", 2): 0.1}
+_CROWD_STEP = 0.0625
 
 
 @dataclass
@@ -37,14 +39,13 @@ class Solver(Protocol):
         """Simulate from the first measured state, at the batch's sampling times."""
 
 
-def substeps(sampling: float, dt: float | None, domain: str) -> int:
+def substeps(sampling: float, dt: float | None, system: System) -> int:
     """Number of steps in a sampling interval; a whole number, never rounded silently.
 
     Args:
         sampling: sampling interval, s.
         dt: step, s; None takes the largest one that divides ``sampling`` and is at most
-            the domain's default.
-        domain: ``traffic`` or ``crowd``.
+            the default of the model's domain and order.
 
     Raises:
         ConfigError: ``dt`` is not positive or does not divide the sampling interval.
@@ -56,7 +57,12 @@ def substeps(sampling: float, dt: float | None, domain: str) -> int:
             "a sequence needs at least two samples at rising times"
         )
     if dt is None:
-        return max(1, math.ceil(sampling / DEFAULT_STEP[domain] - 1e-6))
+        return max(
+            1,
+            math.ceil(
+                sampling / DEFAULT_STEP.get((system.domain, system.order), _CROWD_STEP) - 1e-6
+            ),
+        )
     if not (math.isfinite(dt) and dt > 0):
         raise ConfigError(f"solver.dt={dt} must be a positive number of seconds")
     ratio = sampling / dt

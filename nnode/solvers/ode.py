@@ -12,6 +12,7 @@ from torchdiffeq._impl.solvers import FixedGridODESolver
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
+from nnode.laws.steps import METHODS, STAGES
 from nnode.models.system import System
 from nnode.solvers.base import Trajectory, check_finite, substeps
 from nnode.solvers.rates import Rates
@@ -42,7 +43,9 @@ class TorchdiffeqSolver:
     of steps is the one that is meant, also in float32. Only sampling times are outputs.
 
     Args:
-        method: a torchdiffeq method; fixed-step ones step ``dt``, adaptive ones obey
+        method: a torchdiffeq method, or ``ballistic`` or ``semi_implicit``, which are Euler's of
+            a changed formula (see :mod:`nnode.laws.steps`); None takes ``ballistic`` for
+            accelerations of vehicles and ``euler`` otherwise. Fixed-step ones step ``dt``, adaptive ones obey
             ``rtol`` and ``atol``.
         gradient: ``adjoint`` integrates the adjoint equation backwards (the continuous
             adjoint of the paper, discretised: differs from the exact gradient of the
@@ -59,16 +62,16 @@ class TorchdiffeqSolver:
 
     def __init__(
         self,
-        method: str = "euler",
+        method: str | None = None,
         gradient: str = "adjoint",
         dt: float | None = None,
         rtol: float = 1e-6,
         atol: float = 1e-8,
     ) -> None:
-        if method not in SOLVERS:
+        if method is not None and method not in {*SOLVERS, *METHODS}:
             raise ConfigError(
-                f"solver.method={method} is unknown to torchdiffeq, expected one of "
-                f"{', '.join(sorted(SOLVERS))}"
+                f"solver.method={method} is unknown, expected one of "
+                f"{', '.join(sorted({*SOLVERS, *METHODS}))}"
             )
         if gradient not in GRADIENTS:
             raise ConfigError(
@@ -85,13 +88,15 @@ class TorchdiffeqSolver:
         self.rtol, self.atol = rtol, atol
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
-        n = substeps(batch.dt, self.dt, system.domain)
-        rates = Rates(system, batch, n)
+        n = substeps(batch.dt, self.dt, system)
+        method = self.method or system.step
+        rates = Rates(system, batch, n, method if method in METHODS else "euler")
         y0 = system.initial(batch)
         t = n * torch.arange(batch.n_samples, dtype=y0.dtype, device=y0.device)
-        options = {"grid_constructor": _whole_steps} if self.method in FIXED_STEP else {}
+        method = STAGES.get(method, method)
+        options = {"grid_constructor": _whole_steps} if method in FIXED_STEP else {}
         kwargs: dict[str, Any] = {
-            "method": self.method,
+            "method": method,
             "rtol": self.rtol,
             "atol": self.atol,
             "options": options,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torch import Tensor, nn
 
 from nnode.data.sequence import Batch
@@ -16,11 +18,13 @@ class Rates(nn.Module):
 
     Args:
         steps: in a sampling interval.
+        method: what becomes of a law of vehicles in a step, see :mod:`nnode.laws.steps`.
     """
 
-    def __init__(self, system: System, batch: Batch, steps: int) -> None:
+    def __init__(self, system: System, batch: Batch, steps: int, method: str = "euler") -> None:
         super().__init__()
-        self.system, self.scene, self.dt = system, system.scene(batch), batch.dt / steps
+        self.system, self.dt = system, batch.dt / steps
+        self.scene = replace(system.scene(batch), step=self.dt, method=method)
         last = batch.valid.any(-1).sum(0) - 1
         self.end = steps * last[:, None, None]
         self.ragged = bool((last < batch.n_samples - 1).any())

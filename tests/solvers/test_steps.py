@@ -9,8 +9,14 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError
 from nnode.models import Linear, Relaxation, System, Traffic
+from nnode.models.field import FIELD
+from nnode.models.own_law import law_from
 from nnode.models.system import Crowd
 from nnode.solvers import TorchdiffeqSolver, substeps
+
+#: Speeds in a lane, accelerations in a lane, accelerations of people.
+LANE, PEOPLE = Traffic([Linear()]), Crowd([Relaxation()])
+FOLLOWING = Traffic([law_from("idm", FIELD["idm"])])
 
 
 def count_evaluations(system: System) -> list[int]:
@@ -73,40 +79,42 @@ def test_the_adjoint_takes_as_many_steps_back(platoon, dtype, method, stages) ->
     ],
 )
 def test_substeps(sampling: float, dt: float, number: int) -> None:
-    assert substeps(sampling, dt, "traffic") == number
+    assert substeps(sampling, dt, LANE) == number
 
 
 @pytest.mark.parametrize(
-    ("sampling", "domain", "number"),
+    ("sampling", "system", "number"),
     [
-        (0.2, "traffic", 100),
-        (0.1, "traffic", 50),
-        (0.001, "traffic", 1),
-        (0.0033, "traffic", 2),
-        (0.04, "crowd", 1),
-        (0.0625, "crowd", 1),
-        (0.2, "crowd", 4),
+        (0.2, LANE, 100),
+        (0.1, LANE, 50),
+        (0.001, LANE, 1),
+        (0.0033, LANE, 2),
+        (0.1, FOLLOWING, 1),
+        (0.2, FOLLOWING, 2),
+        (0.04, PEOPLE, 1),
+        (0.0625, PEOPLE, 1),
+        (0.2, PEOPLE, 4),
     ],
 )
 def test_chosen_substeps_are_the_fewest_below_the_default(
-    sampling: float, domain: str, number: int
+    sampling: float, system: System, number: int
 ) -> None:
-    assert substeps(sampling, None, domain) == number
+    assert substeps(sampling, None, system) == number
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, float("nan"), float("inf")])
 def test_a_step_must_be_positive(dt: float) -> None:
     with pytest.raises(ConfigError, match=r"solver\.dt=.*positive"):
-        substeps(0.2, dt, "traffic")
+        substeps(0.2, dt, LANE)
 
 
 @pytest.mark.parametrize("dt", [0.03, 0.3, 0.19, 0.2001, 1e3])
 def test_a_step_that_does_not_divide_is_refused_with_ones_that_do(dt: float) -> None:
     with pytest.raises(ConfigError, match="does not divide") as caught:
-        substeps(0.2, dt, "traffic")
+        substeps(0.2, dt, LANE)
     offered = str(caught.value).split("use solver.dt=")[1].split(",")[0].split(" or ")
     for value in offered:
-        assert substeps(0.2, float(value), "traffic") >= 1
+        assert substeps(0.2, float(value), LANE) >= 1
 
 
 def test_a_single_sample_has_no_sampling_interval(platoon) -> None:  # type: ignore[no-untyped-def]

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
+from nnode.laws.steps import METHODS
 from nnode.models.system import System
 from nnode.simulate import crowds, lanes, neighbours
 from nnode.solvers.base import Trajectory, check_finite, substeps
@@ -48,6 +49,8 @@ class FusedSolver:
             ``cutoff_error`` A / m through people, and as much through walls; see
             :func:`nnode.simulate.neighbours.cutoff_distance`. 0 lets everybody meet
             everybody.
+        method: of lanes, one of :data:`nnode.laws.steps.METHODS`; None takes ``ballistic`` for
+            accelerations and ``euler`` for speeds.
 
     Attributes:
         uncompiled: why the model it warned of is not compiled; empty: there was none.
@@ -63,13 +66,19 @@ class FusedSolver:
         threads: int = 1,
         cutoff: float | None = None,
         cutoff_error: float = 1e-10,
+        method: str | None = None,
     ) -> None:
         if threads < 1:
             raise ConfigError(f"solver.threads={threads} must be a whole number of at least 1")
+        if method is not None and method not in METHODS:
+            raise ConfigError(
+                f"solver.method={method} is unknown to solver=fused, expected one of "
+                f"{', '.join(METHODS)}, or null for the law's own"
+            )
         neighbours.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads
         self.cutoff, self.cutoff_error = cutoff, cutoff_error
-        self.uncompiled = ""
+        self.method, self.uncompiled = method, ""
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         """Simulate from the first measured state, at the batch's sampling times.
@@ -83,7 +92,7 @@ class FusedSolver:
         n = self._substeps(system, batch)
         lane = lanes.supports(system, batch)
         if lane is not None:
-            y = lanes.simulate(system, lane, batch, n, self.threads)[:, 0]
+            y = lanes.simulate(system, lane, batch, n, self.threads, method=self.method)[:, 0]
             found = Trajectory(*system.observe(y, batch))
         else:
             found = self._other(system, batch, n, list(system.parameters()))
@@ -112,7 +121,7 @@ class FusedSolver:
         stacked = _stack(system, parameters)
         lane = lanes.supports(system, batch)
         if lane is not None:
-            y = lanes.simulate(system, lane, batch, n, self.threads, stacked)
+            y = lanes.simulate(system, lane, batch, n, self.threads, stacked, self.method)
             runs = [system.observe(y[:, r], batch)[0] for r in range(y.shape[1])]
             return Trajectory(torch.stack(runs, 1), None)
         found = []
@@ -132,7 +141,7 @@ class FusedSolver:
                 f"solver.cutoff={self.cutoff:g} m works for crowds whose terms are formulas, as "
                 "model=sf or model=nn, only; set it to null"
             )
-        return substeps(batch.dt, self.dt, system.domain)
+        return substeps(batch.dt, self.dt, system)
 
     def _other(self, system: System, batch: Batch, n: int, parameters: list[Tensor]) -> Trajectory:
         law = crowds.supports(system, batch)
