@@ -101,6 +101,7 @@ class Lane:
         fixed: symbols of fixed quantities to their numbers.
         starts: added state to its value at the start.
         leads: rates of a leader's other states, where they are not 0.
+        chained: state to the symbol of its rate of the vehicle ahead, where formulas name it.
     """
 
     order: int
@@ -113,6 +114,7 @@ class Lane:
     fixed: dict[str, Expr] = field(default_factory=dict)
     starts: dict[str, Expr] = field(default_factory=dict)
     leads: dict[str, Expr] = field(default_factory=dict)
+    chained: dict[str, str] = field(default_factory=dict)
 
     @property
     def top(self) -> str:
@@ -147,7 +149,9 @@ class Lane:
         starts: dict[str, Expr] = {}
         for state, start in self.starts.items():  # one may name those before it
             starts[state] = substitute(substitute(start, made), starts)
-        return replace(self, rates=rates, leader=substitute(self.leader, made), starts=starts)
+        lead = substitute(self.leader, made)
+        chained = {"x": "dx_1"} if "dx_1" in symbols([*rates.values(), lead]) else {}
+        return replace(self, rates=rates, leader=lead, starts=starts, chained=chained)
 
 
 def begun(

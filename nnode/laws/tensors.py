@@ -77,7 +77,7 @@ class LaneRates:
         #: nodes that depend on the speed of the vehicle ahead, each after what it is made of
         chain: dict[Expr, None] = {}
         for part in parts:
-            if part.value == "dx_1" or any(a in chain for a in part.args):
+            if part.value in lane.chained.values() or any(a in chain for a in part.args):
                 chain[part] = None
         outside = {a for part in chain for a in part.args if a not in chain}
         #: and those that they need, which are computed for all vehicles at once

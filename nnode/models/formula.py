@@ -232,17 +232,23 @@ def beyond(term: Term, state: State) -> Tensor:
 _BEYOND: dict[tuple[Any, ...], Lane] = {}
 
 
-def starts_of(terms: Sequence[Term], lane: Lane, x: Tensor, v: Tensor, scene: Scene) -> dict[str, Tensor]:  # fmt: skip
+def starts_of(
+    terms: Sequence[Term], lane: Lane, x: Tensor, v: Tensor, scene: Scene,
+    parameters: Mapping[str, Tensor] | None = None,
+) -> dict[str, Tensor]:  # fmt: skip
     """``(B, N)`` values at the start of a lane's added states, of those whose start is a formula.
 
     Args:
         x, v: ``(B, N, 1)`` measured at the start.
+        parameters: by their symbols; None: the terms' own.
     """
     if not lane.starts:
         return {}
     start = [x, v][: lane.order]
     y = torch.cat([*start, x.new_zeros(*x.shape[:2], len(lane.rates) - lane.order)], -1)
-    values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
+    values = dict(parameters or {})
+    if parameters is None:
+        values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
     values |= inputs_of(terms, lane, scene)
     values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
     found = _starts(lane)(y, values, scene.follower, scene.leader, None)

@@ -37,12 +37,14 @@ class LaneSource:
         stages: ``euler`` or ``rk4``.
         own: whether every simulation has parameters of its own.
         stride: numbers between two rows.
+        forward_only: without the gradient.
     """
 
     lane: Lane
     stages: str = "euler"
     own: bool = False
     stride: int = 1424
+    forward_only: bool = False
 
     @cached_property
     def states(self) -> list[str]:
@@ -54,7 +56,7 @@ class LaneSource:
 
     @cached_property
     def recursive(self) -> bool:
-        return "dx_1" in self.lane.symbols
+        return bool(self.lane.chained)
 
     @cached_property
     def fields(self) -> list[str]:
@@ -72,7 +74,7 @@ class LaneSource:
     def inputs(self) -> list[str]:
         """Rows that carry derivatives."""
         ahead = [f"{s}_{j}" for s, j in self.lane.ahead]
-        return [*self.states, *ahead, *(["dx_1"] if self.recursive else [])]
+        return [*self.states, *ahead, *self.lane.chained.values()]
 
     @cached_property
     def loop(self) -> Loop:
@@ -86,9 +88,9 @@ class LaneSource:
         behind, move = symbol("behind"), symbol("move")
         speed, found = self._leader(), {}
         for s, rate in self.lane.rates.items():
-            every = apply("choose", behind, rate, speed if s == "x" else const(0))
-            if self.recursive and s == "x":
-                found["R"] = every
+            every = apply("choose", behind, rate, speed if s == "x" else self._lead(s))
+            if s in self.lane.chained:
+                found[f"R_{s}"] = every
             found[f"I_{s}"] = move * every
         return found
 
@@ -98,9 +100,16 @@ class LaneSource:
         speed = self._leader()
         found = {f"I_{s}": const(0) for s in self.states}
         found["I_x"] = symbol("first_move") * speed
-        if self.recursive:
-            found["R"] = speed
+        for s in self.lane.leads:
+            found[f"I_{s}"] = symbol("first_move") * self._lead(s)
+        for s in self.lane.chained:
+            found[f"R_{s}"] = speed if s == "x" else self._lead(s)
         return found
+
+    def _lead(self, state: str) -> Expr:
+        """Rate of a leader's state other than its place."""
+        rate = self.lane.leads.get(state, const(0))
+        return apply("choose", symbol("drives"), rate, const(0)) if self.recursive else rate
 
     def _leader(self) -> Expr:
         """Speed of a leader; where its places are given it does not move by it."""
@@ -111,7 +120,7 @@ class LaneSource:
     def _seeds(self, formulas: dict[str, Expr]) -> dict[Expr, Expr]:
         found: dict[Expr, Expr] = {}
         for row, node in formulas.items():
-            weight = symbol("RBAR" if row == "R" else f"A_{row[2:]}")
+            weight = symbol("RBAR" if row == "R_x" else f"A_{row[2:]}")
             if not node.is_number():
                 found[node] = found[node] + weight if node in found else weight
         return found
@@ -122,11 +131,15 @@ class LaneSource:
     def rows(self) -> list[str]:
         """All rows, states first, then what is one after the other for every state."""
         every = list(self.states)
-        for group in ("I", "E", "B", "S", "A", *(f"Y{i}" for i in range(4))):
+        back = () if self.forward_only else ("A", *(f"Y{i}" for i in range(4)))
+        for group in ("I", "E", "B", "S", *back):
             every += [f"{group}_{s}" for s in self.states]
         every += [f"{s}_{j}" for s, j in self.lane.ahead]
-        every += ["behind", "second", "move", "first_move", "measured", "dx_1", "R", "RBAR"]
-        every += self.fields + [f"D_{i}" for i in self.inputs if i not in self.states]
+        every += ["behind", "second", "move", "first_move", "measured"]
+        every += [*self.lane.chained.values(), *(f"R_{s}" for s in self.lane.chained)]
+        every += self.fields
+        if not self.forward_only:
+            every += ["RBAR", *(f"D_{i}" for i in self.inputs if i not in self.states)]
         if self.own:
             every += [*self.parameters, *(f"G_{p}" for p in self.parameters)]
         return every
@@ -143,7 +156,9 @@ class LaneSource:
             formula=formula, stride=self.stride, states=len(self.states),
             rows=len(self.rows), places=places, weights=weights, times=times,
         )  # fmt: skip
-        text = head + self._gather() + self._rates() + self._pull()
+        text = head + self._gather() + self._rates()
+        if not self.forward_only:
+            text += self._pull()
         return text + self._own() + SIMULATE.format(**self._pieces())
 
     def _pieces(self) -> dict[str, str]:
@@ -158,7 +173,7 @@ class LaneSource:
                     for i, name in enumerate(self.fields)
                 ),
             ),
-            "ahead_back": self._ahead_back(),
+            "ahead_back": "" if self.forward_only else self._ahead_back(),
         }
 
     def _gather(self) -> str:
@@ -175,7 +190,8 @@ class LaneSource:
             away = "here[k] + safe" if s == "x" else "here[k]"
             text += f"        found[k] = there[k] if mask[k] > zero else {away}\n"
         if self.recursive:
-            text += "    copy(room[_dx_1 + np.uint64(lo):], room[_R + np.uint64(lo + w):], n)\n"
+            for s, ahead in self.lane.chained.items():
+                text += f"    copy(room[_{ahead} + np.uint64(lo):], room[_R_{s} + np.uint64(lo + w):], n)\n"
         return text + "    return\n"
 
     def _rates(self) -> str:

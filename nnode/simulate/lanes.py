@@ -16,7 +16,8 @@ from torch.autograd.function import once_differentiable
 from nnode.data.sequence import Batch
 from nnode.laws.lane import Lane
 from nnode.laws.steps import STAGES, stepped
-from nnode.models.formula import inputs_of
+from nnode.laws.tangent import with_tangents
+from nnode.models.formula import inputs_of, starts_of
 from nnode.models.system import System, Traffic, initial_with
 from nnode.models.term import Term
 from nnode.simulate import _math, _polynomials, lane_rows
@@ -168,6 +169,57 @@ def simulate(
     return out.reshape(len(out), batch.n_samples, runs, simulations, agents).permute(1, 2, 3, 4, 0)
 
 
+def tangents(
+    system: Traffic,
+    lane: Lane,
+    batch: Batch,
+    substeps: int,
+    names: Sequence[str],
+    threads: int = 1,
+    each: Tensor | None = None,
+    method: str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Simulate a lane, and the derivatives of its states by parameters, exact for the method.
+
+    Args:
+        names: P symbols among ``lane.owned``.
+        each: ``(B, P)`` values of these parameters for every sequence; None: the system's.
+
+    Returns:
+        ``(K, B, N, M)`` states and ``(P, K, B, N, M)`` their derivatives. A measured leader's
+        are 0.
+
+    Raises:
+        ValueError: the start of an added state depends on parameters, but is no formula.
+    """
+    added = list(lane.rates)[lane.order :]
+    if any(state not in lane.starts for state in added):
+        raise ValueError("tangents need a start of every added state that is a formula")
+    x, terms = batch.x, cast(list[Term], list(system.terms))
+    own = {name: p.detach()[None] for name, p in system.named_parameters()}
+    q = _row(lane, own).to(x.dtype)
+    every = with_tangents(stepped(lane, method or system.step), tuple(names))
+    if each is not None:
+        q = q.repeat(len(batch), 1)
+        q[:, [list(lane.owned).index(name) for name in names]] = each.to(x.dtype)
+    known = {}
+    if every.starts:
+        values = dict(zip(lane.owned, q.T[..., None] if each is not None else q[0], strict=True))
+        known = starts_of(terms, every, x[0], batch.v[0], system.scene(batch), values)
+    zero = torch.zeros_like(x[0, ..., 0])
+    known = {"x": x[0, ..., 0], "v": batch.v[0, ..., 0], **known}
+    y0 = torch.stack([known.get(state, zero) for state in every.rates])
+    plan = planned(
+        system, lane, batch, substeps, threads, 1,
+        own=each is not None, method=method, tangents=tuple(names),
+    )  # fmt: skip
+    with torch.no_grad():
+        out: Tensor = _Simulate.apply(plan, y0, q)
+    states = out.reshape(1 + len(names), len(lane.rates), *out.shape[1:])
+    states = states.permute(0, 2, 3, 4, 1)
+    return states[0], states[1:]
+
+
 def _row(lane: Lane, parameters: Mapping[str, Tensor]) -> Tensor:
     """``(R, P)`` the parameters' symbols, in few operations: each is one more on the way back."""
     first: dict[str, int] = {}
@@ -207,22 +259,26 @@ def planned(
     *,
     own: bool = False,
     method: str | None = None,
+    tangents: tuple[str, ...] = (),
 ) -> Plan:
     """How runs of a batch are computed.
 
     Args:
         runs: R; simulation b of run r is number ``r * B + b``.
         own: whether every simulation has parameters of its own.
+        tangents: parameters by whose symbols tangents are wanted; there is no gradient then.
     """
     assert isinstance(system, Traffic)
     x = batch.x.detach()
     samples, simulations, agents = x.shape[:3]
     method = method or system.step
     lane, kind = stepped(lane, method), STAGES[method]
+    if tangents:
+        lane = with_tangents(lane, tangents)
     rough = LaneSource(lane, kind, own)
     groups = [(0, runs * simulations)] if own else [(r, simulations) for r in range(runs)]
     jobs, size, slots = _layout(groups, agents, x.element_size(), threads, rough.recursive)
-    source = LaneSource(lane, kind, own, stride=_stride(size))
+    source = LaneSource(lane, kind, own, _stride(size), forward_only=bool(tangents))
     last = batch.valid.any(-1).sum(0) - 1
 
     def tiled(values: Tensor) -> np.ndarray:
