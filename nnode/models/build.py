@@ -13,7 +13,9 @@ from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.models.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
+from nnode.models.effects.base import Effect
 from nnode.models.effects.own import VARIABLE, load_own
+from nnode.models.formula import rule_of
 from nnode.models.own_law import FormulaForce, law_from
 from nnode.models.system import Crowd, System, Traffic
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
@@ -166,4 +168,28 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
         except (ValueError, TypeError) as error:
             raise ConfigError(f"model.effects: {name}: {error}") from error
     for effect in sorted(added, key=lambda effect: effect.rank):
+        _check_order(model, effect)
         model.terms.append(effect)
+        if effect.second is not None and model.order > 1:
+            try:
+                model.lane  # noqa: B018 - says what the law does not have
+            except ConfigError as error:
+                raise ConfigError(f"model.effects: {effect.name} cannot act: {error}") from error
+
+
+def _check_order(model: System, effect: Effect) -> None:
+    """Refuse an effect that is not known for speeds, or for accelerations."""
+    if model.domain != "traffic":
+        return
+    second = effect.second is not None
+    if model.order > 1 and not second:
+        known = [e.name for e in CATALOGUE.of("traffic") if e.second is not None]
+        raise ConfigError(
+            f"model.effects: {effect.name} changes a speed, and this law says an acceleration; "
+            f"for those there are {', '.join(known)}"
+        )
+    if model.order == 1 and second and rule_of(effect) is None:
+        raise ConfigError(
+            f"model.effects: {effect.name} changes an acceleration, and this law says a speed; "
+            "take a law of second order, such as model=idm"
+        )

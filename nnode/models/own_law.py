@@ -214,7 +214,7 @@ class FormulaLaw(_Own, Law):
         acceleration that is not negative at rest, up to 100 m/s."""
         zero = torch.zeros_like(gap)
         known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "dt": zero + _STEP}
-        known |= {s: zero for s in self.lane(self.name).starts}
+        known |= dict.fromkeys(self.lane(self.name).starts, zero)
         if self.order == 1:
             return self.evaluated(known).expand_as(gap)
 

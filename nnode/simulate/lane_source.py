@@ -191,7 +191,10 @@ class LaneSource:
             text += f"        found[k] = there[k] if mask[k] > zero else {away}\n"
         if self.recursive:
             for s, ahead in self.lane.chained.items():
-                text += f"    copy(room[_{ahead} + np.uint64(lo):], room[_R_{s} + np.uint64(lo + w):], n)\n"
+                text += (
+                    f"    copy(room[_{ahead} + np.uint64(lo):], "
+                    f"room[_R_{s} + np.uint64(lo + w):], n)\n"
+                )
         return text + "    return\n"
 
     def _rates(self) -> str:

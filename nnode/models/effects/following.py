@@ -7,12 +7,14 @@ from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.laws.lane import Rule
-from nnode.models.effects.base import CATALOGUE, Effect, Probe, Strength
+from nnode.models.effects.base import CATALOGUE, Effect, Probe, Setting, Strength
 from nnode.models.effects.traffic import gaps, has_law, law_in
 from nnode.models.system import System
 from nnode.models.term import Interval
 
 _KIN = "reaction to the vehicle ahead"
+#: Of an acceleration, kappa is a rate, per second.
+_PER = {"per": (1.0, "s")}
 _EXCITATION = "leaders that brake and accelerate strongly, measured often and precisely"
 
 
@@ -36,6 +38,7 @@ class RelativeSpeed(Effect):
     domain = "traffic"
     formula = "W + kappa (ẋ_{i+1} - W)"
     rule = Rule(rate="W + kappa*(dx_1 - W)")
+    second = Rule(rate="W - kappa*dv/per", constants=_PER)
     source = "full velocity difference: Jiang, Wu & Zhu 2001"
     strengths = {"kappa": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2)}
     rank = 50
@@ -53,6 +56,7 @@ class AsymmetricResponse(Effect):
     domain = "traffic"
     formula = "W + kappa_open (ẋ_{i+1} - W)+ - kappa_close (W - ẋ_{i+1})+"
     rule = Rule(rate="W + kappa_open*max(dx_1 - W, 0) + kappa_close*min(dx_1 - W, 0)")
+    second = Rule(rate="W + (kappa_open*max(-dv, 0) + kappa_close*min(-dv, 0))/per", constants=_PER)
     source = "Gong, Liu & Wang 2008"
     strengths = {
         "kappa_open": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2),
@@ -82,6 +86,14 @@ class ReactionDelay(Effect):
         rate="W + law(gap=max(gap - slope, gap/2)) - law()",
         states={"z": ("m", "slope/T"), "slope": ("m", "(12*(gap - z) - 6*slope)/T")},
     )
+    # of an acceleration all that it was made of is delayed
+    second = Rule(
+        rate="W - slope",
+        states={
+            "z": ("m/s^2", "slope/T", "W"),
+            "slope": ("m/s^2", "(12*(W - z) - 6*slope)/T", "0*W"),
+        },
+    )
     source = "Newell 1961; Padé's approximation of the delay"
     strengths = {"T": Strength(0.0, 0.3, Interval(0.2, 3.0), "s", usual=0.3)}
     rank = 35
@@ -109,6 +121,7 @@ class Inertia(Effect):
     domain = "traffic"
     formula = "tau_v dv/dt = W - v"
     rule = Rule(rate="u", states={"u": ("m/s", "(W - u)/tau_v")})
+    second = Rule(rate="u", states={"u": ("m/s^2", "(W - u)/tau_v", "W")})
     source = "optimal velocity: Bando et al. 1995"
     strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.2, 10.0), "s", usual=0.3)}
     rank = 60
@@ -123,3 +136,60 @@ class Inertia(Effect):
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         return [Probe({}, {"tau_v": tau}) for tau in (0.3, 0.8, 2.0) if has_law(system)]
+
+
+class _SecondOrder(Effect):
+    """An effect on accelerations; speeds have others like it, and it is not looked for."""
+
+    domain = "traffic"
+    strengths = {}
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        return []
+
+
+@CATALOGUE.add
+class PureDelay(_SecondOrder):
+    """Drivers react exactly as they would have some time ago, at most 15 steps.
+
+    Every step hands the acceleration on to the next of 15 states. The acceleration's slope by T
+    jumps where T is a whole number of steps.
+    """
+
+    T: Tensor
+    name = "pure_delay"
+    formula = "W(t - T)"
+    second = Rule(rate="late", delayed={"late": ("W", "m/s^2", "T")}, remembered=15)
+    source = "Treiber, Kesting & Helbing 2006 (reaction time)"
+    settings = {"T": Setting(0.5, Interval(0.0, 1.5), "s")}
+    rank = 36
+    memory = 15
+
+
+@CATALOGUE.add
+class Memory(_SecondOrder):
+    """A driver starts with the time gap that he is seen to have, and relaxes to the common one.
+
+    Seen is (gap - s0)/v in the first state; below 2 m/s it is that of 2 m/s, and it lies between
+    0.1 and 5 s.
+    """
+
+    tau_m: Tensor
+    name = "memory"
+    formula = "law with time gap q in place of T; tau_m dq/dt = T - q"
+    second = Rule(
+        rate="W + law(T=q) - law()",
+        states={
+            "q": (
+                "s",
+                "(T - q)/tau_m",
+                "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)",
+            )
+        },
+        constants={"slowest": (2.0, "m/s"), "shortest": (0.1, "s"), "longest": (5.0, "s")},
+    )
+    source = "after the memory effects of Treiber & Helbing 2003"
+    settings = {"tau_m": Setting(30.0, Interval(1.0, 2000.0), "s")}
+    rank = 14
+    memory = 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -30,6 +31,8 @@ from nnode.models.traffic import FollowTheLeader, LighthillWhithamRichards
 EDGE = {"m": 12.0, "s": 1.0}
 #: 1 inside [a, b], 0 outside, linear over the edge in between.
 _INSIDE = "clip(({at} - a)/edge + 0.5, 0, 1)*clip((b - {at})/edge + 0.5, 0, 1)"
+#: Of an acceleration the desired speed is changed.
+_SLOWER = "W + law(v0=v0*(1 + (alpha - 1)*share)) - law()"
 #: So many cells of a road or a time are looked at one by one.
 CELLS = 32
 
@@ -96,6 +99,7 @@ class SpeedZone(Effect):
         where={"share": _INSIDE.format(at="x")},
         constants={"edge": (EDGE["m"], "m")},
     )
+    second = replace(rule, rate=_SLOWER)
     source = "variable speed limits: Hegyi, De Schutter & Hellendoorn 2005"
     strengths = {"alpha": _FACTOR}
     settings = {"a": Setting(0.0, Interval(), "m"), "b": Setting(100.0, Interval(), "m")}
@@ -125,6 +129,7 @@ class SpeedPeriod(Effect):
         where={"share": _INSIDE.format(at="clock")},
         constants={"edge": (EDGE["s"], "s")},
     )
+    second = replace(rule, rate=_SLOWER)
     source = "weather and light: Hranac et al. 2006 (FHWA-HOP-07-073)"
     strengths = {"alpha": _FACTOR}
     settings = {"a": Setting(0.0, Interval(), "s"), "b": Setting(60.0, Interval(), "s")}
@@ -153,6 +158,8 @@ class VehicleClass(Effect):
     domain = "traffic"
     formula = "W phi for vehicles of one class"
     rule = Rule(rate="W + (phi - 1)*belongs*W", inputs={"belongs": "1"})
+    # of an acceleration the time gap
+    second = replace(rule, rate="W + law(T=T*(1 + (phi - 1)*belongs)) - law()")
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"phi": _FACTOR}
     rank = 12
@@ -194,6 +201,7 @@ class LeaderLength(Effect):
         rate="W + law(gap=gap - beta*longer) - law()",
         inputs={"longer": "m"},
     )
+    second = rule
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"beta": Strength(0.0, 0.1, Interval(-2.0, 3.0), "1", usual=0.5)}
     rank = 33
@@ -242,6 +250,10 @@ class MultiAnticipation(Effect):
     domain = "traffic"
     formula = "W + c (W(gap_{i+1}) - W(gap_i))"
     rule = Rule(rate="choose(second, W + c*(law(gap=gap_1) - law()), W)")
+    # half the way to the second vehicle ahead, and its speed
+    second = Rule(
+        rate="choose(second, W + c*(law(gap=(gap + gap_1)/2, dv=v - v_2, v_1=v_2) - law()), W)"
+    )
     source = "Lenz, Wagner & Sollacher 1999"
     strengths = {"c": Strength(0.0, 0.05, Interval(-1.0, 1.0), "1", usual=0.2)}
     rank = 30
@@ -285,6 +297,7 @@ class DriverHeterogeneity(IndividualEffect):
     domain = "traffic"
     formula = "W (1 + eta_i), eta_i ~ N(0, sigma²)"
     rule = Rule(rate="W + eta*W", inputs={"eta": "1"})
+    second = replace(rule, rate="W + law(T=T*(1 + eta)) - law()")
     source = "Ossen & Hoogendoorn 2011"
     strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 1.0), "1", usual=0.1)}
     rank = 13
