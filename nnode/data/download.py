@@ -126,6 +126,25 @@ c7d8c33d2e9948d6a3eb35e270a92738712979e586ab2b6add5d13769528c352  boa-300-frei.t
 44b35fc50e6f55e6ffcffda33de7eca52bf1d2d705b38025613c6800dac8e4c8  bot-360-160-160.txt
 """),
         ),
+        # read from a copy of the folder: the hashes of its files are not known here
+        "ngsim_pairs": Origin(
+            repository="TeRyZh/Segment-based-Calibration-of-Car-Following-Dynamics",
+            commit="89f4f0c2fc4bfe1d975c70c7ce681d080a16f19c",
+            path="cf_ngsim_I80",
+            licence="the repository states none; original data: U.S. Department of "
+            "Transportation, doi 10.21949/1504477",
+            folders=("ngsim_pairs",),
+            files={},
+        ),
+        "tgsim": Origin(
+            repository="usdot-fhwa-stol/"
+            "To-21-426-modeling-HV-interactions-with-inconspicuous-ACC-equipped-vehicles",
+            commit="bd31e5189d9abef08fb5f1c10b2ace022d9e828d",
+            path="calibration code/Data",
+            licence="Apache-2.0",
+            folders=("tgsim",),
+            files={},
+        ),
     }
 )
 

@@ -34,6 +34,14 @@ class SplitMode(str, Enum):
     auto = "auto"
     random = "random"
     block = "block"
+    published = "published"
+
+
+class Gaps(str, Enum):
+    """What becomes of a record whose equally spaced times have a gap."""
+
+    split = "split"
+    error = "error"
 
 
 class Velocity(str, Enum):
@@ -137,6 +145,37 @@ class VehicleTableOptions(LaneOptions):
     time_unit: str = "s"  # s | ms | frame
     frame_rate: float | None = None  # 1/s, with time_unit=frame
     direction: int = 1  # -1 where positions fall as vehicles drive on
+
+
+@dataclass
+class PairOptions(DataOptions):
+    """Pairs of a follower and its leader: one row per pair and time, in one file or many.
+
+    ``columns`` names the tables' columns by what they mean: ``time``, ``x_follower``,
+    ``x_leader``, and where they exist ``pair``, ``v_follower``, ``v_leader``, ``leader_length``,
+    ``follower_length``, ``spacing`` (bumper to bumper), ``follower``, ``leader`` (identifiers),
+    ``run``, ``lane``, ``split`` (train, test), ``leader_kind``, ``follower_kind``. A column that
+    bears the name of its meaning need not be listed; null leaves an optional one out.
+    """
+
+    name: str = "pairs"
+    domain: str = "traffic"
+    path: str = MISSING  # a file, or a folder of files; relative to data.source where that is given
+    # patterns of the files of a folder, of which the first that fits any is taken
+    files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
+    columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    # a regular expression, searched for in a file's path below the folder: its named groups are
+    # meanings that the file has no column of
+    pattern: str | None = None
+    constant: dict[str, str] = field(default_factory=dict)  # {meaning: its value in every row}
+    position_unit: Any = "m"  # m | ft | cm | km, or by pattern of the file's name {"*.csv": ft}
+    speed_unit: Any = "m/s"  # m/s | km/h | ft/s | mph, or by pattern of the file's name
+    kinds: Any = field(default_factory=dict)  # {class code: name}
+    lane: Any = None  # a lane or a list of lanes; null takes every lane
+    dt: float | None = None  # s, grid to interpolate to; null: the times as they are
+    gaps: Gaps = Gaps.split  # split | error: a gap in the times of a pair
+    window: float | None = None  # s, length of a sequence; null: a pair is as long as it is
+    min_samples: int = 3  # fewest times of a sequence
 
 
 @dataclass
