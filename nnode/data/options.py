@@ -40,7 +40,7 @@ class SplitMode(str, Enum):
 class Gaps(str, Enum):
     """What becomes of a record whose equally spaced times have a gap."""
 
-    split = "split"
+    cut = "cut"
     error = "error"
 
 
@@ -173,9 +173,38 @@ class PairOptions(DataOptions):
     kinds: Any = field(default_factory=dict)  # {class code: name}
     lane: Any = None  # a lane or a list of lanes; null takes every lane
     dt: float | None = None  # s, grid to interpolate to; null: the times as they are
-    gaps: Gaps = Gaps.split  # split | error: a gap in the times of a pair
+    gaps: Gaps = Gaps.cut  # cut | error: a gap in the times of a pair
     window: float | None = None  # s, length of a sequence; null: a pair is as long as it is
     min_samples: int = 3  # fewest times of a sequence
+
+
+@dataclass
+class OpenAccOptions(DataOptions):
+    """Platoons on test tracks of OpenACC: speeds, and gaps from bumper to bumper.
+
+    Of each vehicle is known: ``make``, ``setting`` (the distance setting of the adaptive cruise
+    control, ``none`` for people), ``acc`` (``ACC`` or ``people``), ``order`` (1 leads).
+    """
+
+    name: str = "openacc"
+    domain: str = "traffic"
+    # a file, or a folder of files, relative to data.source where that is given; null: the published
+    path: str | None = None
+    # patterns of the files of a folder, of which the first that fits any is taken
+    files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
+    kind: str | None = "make"  # make | setting | acc | order; null: it is not told
+    group: str | None = "setting"  # make | setting | acc | order; null: it is not told
+    # m, that every vehicle is taken to have, as it is not published: positions are gaps and
+    # lengths; null: positions are gaps alone
+    length: float | None = 5.0
+    dt: float | None = None  # s, a multiple of the files' step; null: that
+    # m by which a gap may change between two samples otherwise than the speeds tell, without being
+    # taken for unknown: the error that one position may have; null: whatever
+    max_error: float | None = 0.5
+    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
+    window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    min_vehicles: int = 2  # fewest vehicles of a platoon
+    min_duration: float = 5.0  # s, shortest sequence where window is null
 
 
 @dataclass

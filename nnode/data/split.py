@@ -5,8 +5,8 @@ they are not - in a corridor everyone takes part in several successive sequences
 whole recording together - one contiguous block of time is held out from each recording, and the
 sequences at its borders that share an agent with it are dropped from training.
 
-Where the source publishes which sequences it trains on and which it tests on, that is taken, so that
-errors can be compared with those that others print.
+Where the source publishes which sequences it trains on and which it tests on, that is taken, so
+that errors can be compared with those that others print.
 """
 
 from __future__ import annotations

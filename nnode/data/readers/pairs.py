@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from nnode.data.download import ORIGINS
 from nnode.data.options import Gaps, PairOptions
 from nnode.data.readers.columns import Table
-from nnode.data.readers.recordings import check_known, one_of, positive, wanted
+from nnode.data.readers.recordings import check_known, one_of, positive, tables_below, wanted
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
@@ -60,39 +59,7 @@ def pair_files(options: PairOptions) -> dict[str, Path]:
         ConfigError: no path, or ``data.source`` is an address.
         DataError: no such file or folder, or one without a table.
     """
-    if not options.path or options.path == "???":
-        raise ConfigError("data.path is not set; expected a table, or a folder of tables")
-    place = Path(options.path).expanduser()
-    if options.source is not None and not place.is_absolute() and not place.exists():
-        if "://" in options.source:
-            raise ConfigError(f"data.source={options.source}: pairs are read from a folder")
-        place = Path(options.source).expanduser() / place
-    if place.is_file():
-        return {place.name: place}
-    if not place.is_dir():
-        raise DataError(
-            f"data.path: {place} is not there; expected a table of pairs or a folder of them"
-            f"{_published(options.name)}"
-        )
-    for pattern in options.files:
-        found = sorted(path for path in place.glob(pattern) if path.is_file())
-        if found:
-            return {path.relative_to(place).as_posix(): path for path in found}
-    raise DataError(
-        f"data.path: the folder {place} holds no file like {' or '.join(options.files)} "
-        f"(data.files){_published(options.name)}"
-    )
-
-
-def _published(name: str) -> str:
-    """Where a data set without an address of its own for every file is published."""
-    origin = ORIGINS.get(name)
-    if origin is None:
-        return ""
-    return (
-        f"; those of {name} lie in {origin.path}/ of github.com/{origin.repository} at commit "
-        f"{origin.commit}: fetch that, and set data.path to the folder"
-    )
+    return tables_below(options, options.path, options.files)
 
 
 def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
@@ -245,8 +212,8 @@ def _steady(table: Table, column: str, cells: np.ndarray, rows: np.ndarray) -> N
     if other.size:
         raise DataError(
             f"{table.path}, {table.row(int(other[0]))}: column {column!r} holds "
-            f"{cells[other[0]]!s}, before it {cells[rows[0]]!s}; it belongs to the pair and must be "
-            "the same in all its rows: name pairs that are to be told apart (data.columns.pair)"
+            f"{cells[other[0]]!s}, before it {cells[rows[0]]!s}; it belongs to the pair and must "
+            "be the same in all its rows: name pairs that are to be told apart (data.columns.pair)"
         )
 
 
@@ -300,7 +267,7 @@ def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
         raise DataError(
             f"{pair.called} steps from {pair.time[i]:g} s to {pair.time[i + 1]:g} s "
             f"({pair.table.row(int(pair.rows[i + 1]))}), expected steps of {usual:g} s "
-            f"({len(gaps)} such gaps); data.gaps=split cuts the pair there"
+            f"({len(gaps)} such gaps); data.gaps=cut cuts the pair there"
         )
     for rows in np.split(np.arange(len(pair.time)), gaps + 1):
         if len(rows) < 2:

@@ -138,7 +138,7 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=said):
             read(path, **options)
-    with pytest.raises(DataError, match="does not fit data.pattern"):
+    with pytest.raises(DataError, match=r"does not fit data\.pattern"):
         read(path, pattern="(?P<run>[0-9]+)_")
 
 
