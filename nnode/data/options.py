@@ -116,6 +116,8 @@ class LaneOptions(DataOptions):
     min_vehicles: int = 3  # fewest vehicles of a platoon
     min_samples: int = 3  # fewest points of the time grid
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    # whether every follower and its leader are a sequence of their own, min_vehicles aside
+    pairs: bool = False
     # s, window of the local cubics that smooth positions and give speeds; null: as measured
     smooth: float | None = None
 

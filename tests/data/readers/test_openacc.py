@@ -166,9 +166,9 @@ def test_files_of_another_layout_are_refused(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text(text)
     with pytest.raises(DataError, match="line 4: expected ACC"):
         read(tmp_path / "c.csv")
+    table = run().astype({"IVS1": object})
+    table.loc[2, "IVS1"] = "x"
     with pytest.raises(DataError, match="line 9: column 'IVS1' holds 'x'"):
-        table = run().astype({"IVS1": object})
-        table.loc[2, "IVS1"] = "x"
         read(save(tmp_path / "e.csv", table))
     with pytest.raises(DataError, match="no sequence; in 1 runs"):
         read(save(tmp_path / "d.csv", run(2.0)))
