@@ -237,6 +237,9 @@ class JuelichOptions(DataOptions):
     view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
     velocity: Velocity = Velocity.forward
     min_agents: int = 1  # fewest people in a sequence
+    # {name: {line: [x1, y1, x2, y2], direction: +x}}, m: destinations on exit lines, by where
+    # people walk (+x | -x | +y | -y | [x, y]); null: their last position in the sequence
+    exits: Any = None
 
 
 @dataclass
@@ -259,3 +262,6 @@ class TableOptions(DataOptions):
     name: str = "table"
     path: str = MISSING  # the table; relative to data.source where that is given
     walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left
+    # {name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}, m: destinations on exit lines,
+    # in place of the columns dest_x, dest_y
+    exits: Any = None
