@@ -112,6 +112,7 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
         name=entry["name"],
         recording=entry["recording"],
         site=entry.get("site", ""),
+        split=entry.get("split", ""),
         time=time[:, 0].copy(),
         x=x,
         v=vectors("v"),

@@ -43,6 +43,7 @@ def index_of(sequences: Iterable[Sequence]) -> list[dict[str, Any]]:
             "name": s.name,
             "recording": s.recording,
             "site": s.site,
+            "split": s.split,
             "start": float(s.time[0]),
             "end": float(s.time[-1]),
             "agents": list(s.agents),

@@ -11,7 +11,7 @@ import difflib
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from urllib.parse import quote
@@ -43,6 +43,7 @@ class Origin:
         licence: licence and attribution that using the files asks for.
         files: SHA-256 by file name.
         folders: names of sub-folders in which a local copy may keep the files.
+        places: path below ``path`` of files that have another name there.
     """
 
     repository: str
@@ -51,10 +52,11 @@ class Origin:
     licence: str
     files: Mapping[str, str]
     folders: tuple[str, ...]
+    places: Mapping[str, str] = field(default_factory=dict)
 
     def url(self, name: str) -> str:
         """Address of one file."""
-        parts = [self.repository, self.commit, self.path, name]
+        parts = [self.repository, self.commit, self.path, self.places.get(name, name)]
         return f"{HOST}/{quote('/'.join(part for part in parts if part))}"
 
 
@@ -125,6 +127,52 @@ c7d8c33d2e9948d6a3eb35e270a92738712979e586ab2b6add5d13769528c352  boa-300-frei.t
 890764d1ee327340fc7e9b28e7f3d547c89f6b8c56c9908d46261bde9746f307  bot-300-100-100.txt
 44b35fc50e6f55e6ffcffda33de7eca52bf1d2d705b38025613c6800dac8e4c8  bot-360-160-160.txt
 """),
+        ),
+        "openacc": Origin(
+            repository="thibault-charlottin/ACC-platoon-fuel-consumption",
+            commit="8781ec31a976113210a9809b98345c76594c3896",
+            path="data/OpenACC_data",
+            licence="European Commission, Joint Research Centre: attribute OpenACC (Makridis, "
+            "Mattas, Anesiadou & Ciuffo 2021), whose terms stand in the JRC data catalogue, "
+            "JRCDBT0001",
+            folders=("openacc", "openacc/zalazone"),
+            files=_sums("""
+8071e7ecb00b90f8d488d23aae1bd35911c60be416ea8f16a758eb033fc1eeab  long_setting_dynamic_part16.csv
+84b0e1c3fdeb14e1e9ae4e7ed133b99eabbdea5f17641904b04247731f38c590  long_setting_handling_part39.csv
+5d6dab96f35ac9da3d623ba4a5d311fbf0accb25bab8e52bce495dec5236e04f  mixed_dynamic_part7.csv
+d6a41ac1a315d6d73723cae3de2189d807e195d9a2495e40383f745b6b110d1d  no_ACC_handling_part40.csv
+84f91a87fae5f00e65ce97002f7e3b967b5d4dcec073cc8f633c5975c78681ab  short_setting_dynamic_part14.csv
+522a982c57987aca16f4b49c3edd4702428e97480cdf52b094efef0c6b2c1676  short_setting_dynamic_part21.csv
+"""),
+            places=MappingProxyType(
+                {
+                    "long_setting_dynamic_part16.csv": "long_setting/dynamic_part16.csv",
+                    "long_setting_handling_part39.csv": "long_setting/handling_part39.csv",
+                    "mixed_dynamic_part7.csv": "mixed/dynamic_part7.csv",
+                    "no_ACC_handling_part40.csv": "no_ACC/handling_part40.csv",
+                    "short_setting_dynamic_part14.csv": "short_setting/dynamic_part14.csv",
+                    "short_setting_dynamic_part21.csv": "short_setting/dynamic_part21.csv",
+                }
+            ),
+        ),
+        # read from a copy of the folder: the hashes of its files are not known here
+        "ngsim_pairs": Origin(
+            repository="TeRyZh/Segment-based-Calibration-of-Car-Following-Dynamics",
+            commit="89f4f0c2fc4bfe1d975c70c7ce681d080a16f19c",
+            path="cf_ngsim_I80",
+            licence="the repository states none; original data: U.S. Department of "
+            "Transportation, doi 10.21949/1504477",
+            folders=("ngsim_pairs",),
+            files={},
+        ),
+        "tgsim": Origin(
+            repository="usdot-fhwa-stol/"
+            "To-21-426-modeling-HV-interactions-with-inconspicuous-ACC-equipped-vehicles",
+            commit="bd31e5189d9abef08fb5f1c10b2ace022d9e828d",
+            path="calibration code/Data",
+            licence="Apache-2.0",
+            folders=("tgsim",),
+            files={},
         ),
     }
 )

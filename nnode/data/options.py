@@ -34,6 +34,14 @@ class SplitMode(str, Enum):
     auto = "auto"
     random = "random"
     block = "block"
+    published = "published"
+
+
+class Gaps(str, Enum):
+    """What becomes of a record whose equally spaced times have a gap."""
+
+    cut = "cut"
+    error = "error"
 
 
 class Velocity(str, Enum):
@@ -108,6 +116,8 @@ class LaneOptions(DataOptions):
     min_vehicles: int = 3  # fewest vehicles of a platoon
     min_samples: int = 3  # fewest points of the time grid
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    # whether every follower and its leader are a sequence of their own, min_vehicles aside
+    pairs: bool = False
     # s, window of the local cubics that smooth positions and give speeds; null: as measured
     smooth: float | None = None
 
@@ -140,6 +150,66 @@ class VehicleTableOptions(LaneOptions):
 
 
 @dataclass
+class PairOptions(DataOptions):
+    """Pairs of a follower and its leader: one row per pair and time, in one file or many.
+
+    ``columns`` names the tables' columns by what they mean: ``time``, ``x_follower``,
+    ``x_leader``, and where they exist ``pair``, ``v_follower``, ``v_leader``, ``leader_length``,
+    ``follower_length``, ``spacing`` (bumper to bumper), ``follower``, ``leader`` (identifiers),
+    ``run``, ``lane``, ``split`` (train, test), ``leader_kind``, ``follower_kind``. A column that
+    bears the name of its meaning need not be listed; null leaves an optional one out.
+    """
+
+    name: str = "pairs"
+    domain: str = "traffic"
+    path: str = MISSING  # a file, or a folder of files; relative to data.source where that is given
+    # patterns of the files of a folder, of which the first that fits any is taken
+    files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
+    columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    # a regular expression, searched for in a file's path below the folder: its named groups are
+    # meanings that the file has no column of
+    pattern: str | None = None
+    constant: dict[str, str] = field(default_factory=dict)  # {meaning: its value in every row}
+    position_unit: Any = "m"  # m | ft | cm | km, or by pattern of the file's name {"*.csv": ft}
+    speed_unit: Any = "m/s"  # m/s | km/h | ft/s | mph, or by pattern of the file's name
+    kinds: Any = field(default_factory=dict)  # {class code: name}
+    lane: Any = None  # a lane or a list of lanes; null takes every lane
+    dt: float | None = None  # s, grid to interpolate to; null: the times as they are
+    gaps: Gaps = Gaps.cut  # cut | error: a gap in the times of a pair
+    window: float | None = None  # s, length of a sequence; null: a pair is as long as it is
+    min_samples: int = 3  # fewest times of a sequence
+
+
+@dataclass
+class OpenAccOptions(DataOptions):
+    """Platoons on test tracks of OpenACC: speeds, and gaps from bumper to bumper.
+
+    Of each vehicle is known: ``make``, ``setting`` (the distance setting of the adaptive cruise
+    control, ``none`` for people), ``acc`` (``ACC`` or ``people``), ``order`` (1 leads).
+    """
+
+    name: str = "openacc"
+    domain: str = "traffic"
+    # a file, or a folder of files, relative to data.source where that is given; null: the published
+    path: str | None = None
+    # patterns of the files of a folder, of which the first that fits any is taken
+    files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
+    kind: str | None = "make"  # make | setting | acc | order; null: it is not told
+    group: str | None = "setting"  # make | setting | acc | order; null: it is not told
+    # m, that every vehicle is taken to have, as it is not published: positions are gaps and
+    # lengths; null: positions are gaps alone
+    length: float | None = 5.0
+    dt: float | None = None  # s, a multiple of the files' step; null: that
+    # m by which a gap may change between two samples otherwise than the speeds tell, without being
+    # taken for unknown: the error that one position may have; null: whatever
+    max_error: float | None = 0.5
+    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
+    window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    min_vehicles: int = 2  # fewest vehicles of a platoon
+    min_duration: float = 5.0  # s, shortest sequence where window is null
+
+
+@dataclass
 class SumoOptions(LaneOptions):
     """SUMO's floating car data (fcd-output, XML, also gzipped)."""
 
@@ -167,6 +237,9 @@ class JuelichOptions(DataOptions):
     view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
     velocity: Velocity = Velocity.forward
     min_agents: int = 1  # fewest people in a sequence
+    # {name: {line: [x1, y1, x2, y2], direction: +x}}, m: destinations on exit lines, by where
+    # people walk (+x | -x | +y | -y | [x, y]); null: their last position in the sequence
+    exits: Any = None
 
 
 @dataclass
@@ -189,3 +262,6 @@ class TableOptions(DataOptions):
     name: str = "table"
     path: str = MISSING  # the table; relative to data.source where that is given
     walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left
+    # {name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}, m: destinations on exit lines,
+    # in place of the columns dest_x, dest_y
+    exits: Any = None

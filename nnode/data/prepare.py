@@ -24,6 +24,8 @@ from nnode.data.options import (
     HighDOptions,
     JuelichOptions,
     NgsimOptions,
+    OpenAccOptions,
+    PairOptions,
     SumoOptions,
     TableOptions,
     VehicleTableOptions,
@@ -36,6 +38,8 @@ from nnode.data.readers.highd import highd_files, read_highd
 from nnode.data.readers.juelich import juelich_files, read_juelich
 from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
 from nnode.data.readers.ngsim import read_ngsim
+from nnode.data.readers.openacc import openacc_files, read_openacc
+from nnode.data.readers.pairs import pair_files, read_pairs
 from nnode.data.readers.sumo import read_sumo, sumo_files
 from nnode.data.readers.table import TABLE, WALLS, read_table, table_files
 from nnode.data.readers.vehicles import read_vehicles, vehicle_files
@@ -89,6 +93,8 @@ FORMATS: dict[type[DataOptions], Format] = {
         walkway_files,
         lambda files, options: read_walkway(files[PEOPLE], options, files.get(GEOMETRY)),
     ),
+    PairOptions: Format(pair_files, read_pairs),
+    OpenAccOptions: Format(openacc_files, read_openacc),
     SumoOptions: Format(sumo_files, _each(read_sumo)),
     HighDOptions: Format(highd_files, read_highd),
 }

@@ -39,6 +39,8 @@ class Sequence:
         destination: ``(N, D)`` m, or None for the last position.
         walls: ``(W, 4)`` segments x1, y1, x2, y2 in m with the walkable side on their
             left, or None.
+        split: the side of the published division that it is on, ``train`` or ``test``; empty: the
+            source publishes none.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Sequence:
     destination: np.ndarray | None = None
     walls: np.ndarray | None = None
     site: str = ""
+    split: str = ""
 
     def __post_init__(self) -> None:
         x = np.asarray(self.x, dtype=np.float64)

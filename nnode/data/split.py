@@ -4,6 +4,9 @@ Where clusters (:mod:`nnode.data.clusters`) are small, whole clusters are drawn 
 they are not - in a corridor everyone takes part in several successive sequences, which chains a
 whole recording together - one contiguous block of time is held out from each recording, and the
 sequences at its borders that share an agent with it are dropped from training.
+
+Where the source publishes which sequences it trains on and which it tests on, that is taken, so
+that errors can be compared with those that others print.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ from nnode.data.options import SplitMode, SplitOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
+#: Sides of a published division.
+TRAIN, TEST = "train", "test"
+
 #: Relative error of the held-out share up to which whole components do, in mode ``auto``.
 TOLERANCE = 0.25
 
@@ -30,8 +36,9 @@ class Split:
     Attributes:
         train: calibrated on.
         heldout: never seen in training.
-        dropped: unused, because they share an agent with a held-out sequence.
-        mode: ``none``, ``random`` (whole components) or ``block`` (of time).
+        dropped: unused, because they share an agent with a held-out sequence, or are on neither
+            side of a published division.
+        mode: ``none``, ``random`` (whole components), ``block`` (of time) or ``published``.
         note: one sentence for the log and the report.
     """
 
@@ -56,7 +63,8 @@ def split(sequences: Store | Index, options: SplitOptions) -> Split:
 
     Raises:
         ConfigError: ``heldout`` outside [0, 1), or a negative ``gap``.
-        DataError: nothing would be left to train on or to hold out.
+        DataError: nothing would be left to train on or to hold out, or the source publishes no
+            division where one is asked for.
     """
     index: Index = sequences.index if isinstance(sequences, Store) else sequences
     share, gap, mode = options.heldout, options.gap, SplitMode(options.mode)
@@ -70,6 +78,9 @@ def split(sequences: Store | Index, options: SplitOptions) -> Split:
         everything = list(range(len(index)))
         note = f"all {len(index)} sequences train"
         return Split(train=everything, heldout=[], dropped=[], mode="none", note=note)
+    sides = {entry.get("split", "") for entry in index}
+    if mode is SplitMode.published or (mode is SplitMode.auto and {TRAIN, TEST} <= sides):
+        return _published(index, gap)
     rng = np.random.default_rng(options.seed)
     if mode is SplitMode.block:
         return _by_block(index, share, gap, rng)
@@ -79,6 +90,30 @@ def split(sequences: Store | Index, options: SplitOptions) -> Split:
     if mode is SplitMode.auto and not (near and result.heldout and result.train):
         return _by_block(index, share, gap, rng)
     return _checked(result, share, "data.split.mode=block holds out a block of time instead")
+
+
+def _published(index: Index, gap: float) -> Split:
+    """The source's own division, agents on both sides included: they are told."""
+    sides = {
+        side: [i for i, entry in enumerate(index) if entry.get("split", "") == side]
+        for side in (TRAIN, TEST)
+    }
+    train, held = sides[TRAIN], sides[TEST]
+    if not train or not held:
+        raise DataError(
+            f"data.split.mode=published: {len(train)} sequences are marked {TRAIN!r} and "
+            f"{len(held)} {TEST!r} by the source, expected some of both; set "
+            "data.split.mode=auto, or give the data a column split"
+        )
+    label = clusters(index, gap)
+    both = [i for i in train if label[i] in set(label[held])]
+    rest = sorted(set(range(len(index))) - {*train, *held})
+    note = f"{len(held)} of {len(index)} sequences held out, as the source publishes it"
+    if both:
+        note += f"; {len(both)} that train {relation(index, gap)} with a held-out one"
+    if rest:
+        note += f"; {len(rest)} are on neither side and not used"
+    return Split(train=train, heldout=held, dropped=rest, mode="published", note=note)
 
 
 def _by_component(index: Index, share: float, gap: float, rng: np.random.Generator) -> Split:

@@ -41,8 +41,9 @@ class Store:
         folder: where the data set lies.
         manifest: what the preparation recorded, as it was given to :func:`write_store`.
         index: per sequence a dict with ``name``, ``recording``, ``n_samples``, ``n_agents``,
-            ``start`` and ``end`` (s), ``agents`` (identifiers, empty where unknown) and
-            ``walls`` (position in the list of distinct walls, or None).
+            ``start`` and ``end`` (s), ``agents`` (identifiers, empty where unknown),
+            ``split`` (side of the published division) and ``walls`` (position in the list of
+            distinct walls, or None).
         dims: D, the number of space dimensions; 0 for an empty store.
 
     Raises:
@@ -210,6 +211,7 @@ def _entry(item: Sequence, walls: list[np.ndarray]) -> dict[str, Any]:
         "name": item.name,
         "recording": item.recording,
         "site": item.site,
+        "split": item.split,
         "n_samples": item.n_samples,
         "n_agents": item.n_agents,
         "start": float(item.time[0]),

@@ -255,8 +255,13 @@ def test_a_file_of_the_sister_archive_is_found_under_either_name(
 @pytest.mark.real
 def test_the_published_hashes_are_those_of_the_recordings(real_data: Path) -> None:
     counts = {name: len(files) for name, files in download.FILES.items()}
-    assert counts == {"esimas": 20, "juelich": 1, "hermes": 7}
+    assert counts == {
+        **{"esimas": 20, "juelich": 1, "hermes": 7},
+        **{"openacc": 6, "ngsim_pairs": 0, "tgsim": 0},
+    }
     for name, files in download.FILES.items():
-        folder = real_data / ("esimas" if name == "esimas" else "juelich")
+        folder = real_data / {"esimas": "esimas", "openacc": "openacc/zalazone"}.get(
+            name, "juelich"
+        )
         for file, digest in files.items():
             assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest

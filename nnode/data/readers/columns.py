@@ -30,7 +30,7 @@ class Table:
 
     def __init__(self, path: Path, names: list[str] | None = None, **csv: Any) -> None:
         self.path = path
-        self._first = 2 if names is None else 1
+        self._first = (2 if names is None else 1) + int(csv.get("skiprows", 0))
         self.parquet = path.suffix.lower() in (".parquet", ".pq")
         if not path.is_file():
             raise DataError(f"there is no table {path}; set data.path, or data.source, to it")

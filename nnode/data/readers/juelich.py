@@ -17,6 +17,7 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 
+from nnode.data.exits import Exit, destinations, exits_of, read_exits
 from nnode.data.options import JuelichOptions, Velocity
 from nnode.data.readers.recordings import one_of, positive, raw_files
 from nnode.data.sequence import Sequence
@@ -53,8 +54,8 @@ def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
 
     Returns:
         Sequences named ``recording/number`` after the file, with people's ids as agents, their
-        last position as destination, and the corridor's two walls. ``v`` is None with forward
-        differences, which are what :meth:`Sequence.velocity` computes.
+        last position, or a point of their exit, as destination, and the corridor's two walls. ``v``
+        is None with forward differences, which are what :meth:`Sequence.velocity` computes.
 
     Raises:
         ConfigError: an option out of its range, a ``t_seq`` that is no whole number of frames,
@@ -108,6 +109,7 @@ def cut_people(
     v = _velocity(x, rate, options.velocity)
     if walls is None:
         walls = _walls(path.stem, options.walls, axis, x, view)
+    exits = _exits(path, read_exits(options.exits), x, ids)
     inside = np.isfinite(x[:, :, axis])
     if view is not None:
         with np.errstate(invalid="ignore"):
@@ -127,7 +129,9 @@ def cut_people(
                 x=positions,
                 v=None if v is None else v[rows][:, people],
                 agents=tuple(str(ids[i]) for i in people),
-                destination=positions[-1],
+                destination=destinations([exits[i] for i in people], positions[0])
+                if exits
+                else positions[-1],
                 walls=walls,
             )
         )
@@ -138,6 +142,20 @@ def cut_people(
             "data.t_seq or data.min_agents, widen data.view, or leave it out of data.recording"
         )
     return found
+
+
+def _exits(path: Path, exits: list[Exit], x: np.ndarray, ids: np.ndarray) -> list[Exit]:
+    """Everybody's exit by where he is first and last seen in the file, or an empty list."""
+    if not exits:
+        return []
+    known = np.isfinite(x).all(axis=2)
+    column = np.arange(x.shape[1])
+    first = x[known.argmax(axis=0), column]
+    last = x[len(x) - 1 - known[::-1].argmax(axis=0), column]
+    try:
+        return exits_of(exits, first, last, [str(i) for i in ids])
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def _interval(option: str, value: list[float] | None) -> tuple[float, float] | None:

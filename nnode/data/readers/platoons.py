@@ -80,7 +80,8 @@ def cut_vehicles(
     view. With it, time is cut into consecutive windows that share their boundary sample, and a
     sequence is a platoon of vehicles in view throughout; where a vehicle is in view for part of
     the window, the platoon is cut at its place, so that nobody follows a vehicle that is not
-    its leader.
+    its leader. With ``pairs`` a sequence is a vehicle and the one in front of it, as long as that
+    is the same one, in whole windows where there are such.
 
     Args:
         recordings: by name, to which ``_`` and the lane are added.
@@ -268,9 +269,13 @@ def _cut(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
     """Vehicles, first and last grid time of every sequence of one lane, in order of time."""
     if not stints:
         return
-    pieces = _intervals(stints) if options.window is None else _windows(stints, options)
+    if options.pairs:
+        pieces, least = _pairs(stints, options), 2
+    else:
+        pieces = _intervals(stints) if options.window is None else _windows(stints, options)
+        least = options.min_vehicles
     for platoon, first, last in pieces:
-        if len(platoon) >= options.min_vehicles and last - first + 1 >= options.min_samples:
+        if len(platoon) >= least and last - first + 1 >= options.min_samples:
             yield sorted(platoon, key=lambda s: s.x[first - s.first]), first, last
 
 
@@ -278,6 +283,25 @@ def _intervals(stints: list[_Stint]) -> Iterator[_Platoon]:
     changes = sorted({s.first for s in stints} | {s.last + 1 for s in stints})
     for first, after in pairwise(changes):
         yield [s for s in stints if s.first <= first and s.last >= after - 1], first, after - 1
+
+
+def _pairs(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:
+    """Followers with their leaders, as long as nobody comes between them, in order of time."""
+    spans: dict[tuple[int, int], list[tuple[_Stint, _Stint, int, int]]] = {}
+    for platoon, first, last in _intervals(stints):
+        row = sorted(platoon, key=lambda s: s.x[first - s.first])
+        for follower, leader in pairwise(row):
+            known = spans.setdefault((id(follower), id(leader)), [])
+            if known and known[-1][3] + 1 == first:
+                first_of_all = known.pop()[2]
+                known.append((follower, leader, first_of_all, last))
+            else:
+                known.append((follower, leader, first, last))
+    found = sorted((span for own in spans.values() for span in own), key=lambda span: span[2])
+    for follower, leader, first, last in found:
+        steps = last - first if options.window is None else round(options.window / options.dt)
+        for start in range(first, last - steps + 1, max(steps, 1)):
+            yield [follower, leader], start, start + steps
 
 
 def _windows(stints: list[_Stint], options: LaneOptions) -> Iterator[_Platoon]:

@@ -134,6 +134,55 @@ def table_path(options: DataOptions, option: str, path: str) -> Path:
     return place
 
 
+def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> dict[str, Path]:
+    """A file, or the files of a folder, by their path below it; a single file by its name.
+
+    Args:
+        options: ``name`` and ``source`` are read.
+        path: as ``data.path`` gives it, or else below ``data.source``.
+        patterns: of the files of a folder, of which the first that fits any is taken.
+
+    Raises:
+        ConfigError: no path, or ``data.source`` is an address.
+        DataError: no such file or folder, or one without such a file.
+    """
+    if not path or path == "???":
+        raise ConfigError("data.path is not set; expected a table, or a folder of tables")
+    place = Path(path).expanduser()
+    if options.source is not None and not place.is_absolute() and not place.exists():
+        if "://" in options.source:
+            raise ConfigError(
+                f"data.source={options.source}: tables are read from a folder, not an address"
+            )
+        place = Path(options.source).expanduser() / place
+    if place.is_file():
+        return {place.name: place}
+    if not place.is_dir():
+        raise DataError(
+            f"data.path: {place} is not there; expected a table or a folder of tables"
+            f"{_published(options.name)}"
+        )
+    for pattern in patterns:
+        found = sorted(path for path in place.glob(pattern) if path.is_file())
+        if found:
+            return {path.relative_to(place).as_posix(): path for path in found}
+    raise DataError(
+        f"data.path: the folder {place} holds no file like {' or '.join(patterns)} (data.files)"
+        f"{_published(options.name)}"
+    )
+
+
+def _published(name: str) -> str:
+    """Where a data set is published whose files have no addresses of their own."""
+    origin = download.ORIGINS.get(name)
+    if origin is None:
+        return ""
+    return (
+        f"; those of {name} lie in {origin.path}/ of github.com/{origin.repository} at commit "
+        f"{origin.commit}: fetch that, and set data.path to the folder"
+    )
+
+
 def _matches(pattern: re.Pattern[str], names: Iterable[str]) -> list[str]:
     found = (pattern.fullmatch(name) for name in names)
     return [match.group(1) for match in found if match]

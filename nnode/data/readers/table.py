@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nnode.data.exits import destinations, exits_of, read_exits
 from nnode.data.options import TableOptions
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import check_known, table_path, wanted
@@ -64,6 +65,11 @@ def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> 
     goals = tuple(f"dest_{axis}" for axis in axes)
     if any(goal in names for goal in goals) and not all(goal in names for goal in goals):
         raise DataError(f"{path}: a destination needs the columns {' and '.join(goals)}")
+    exits = read_exits(options.exits)
+    if exits and (not crowd or goals[0] in names):
+        raise ConfigError(
+            "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
+        )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
     time = table.numbers(names["time"])
     values = {name: table.numbers(names[name]) for name in (*axes, *goals) if name in names}
@@ -115,6 +121,13 @@ def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> 
                 _constant(table, key, column, at, owner)
         x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
         length = values["length"][owner] if "length" in values else None
+        group = tuple(words["group"][owner]) if "group" in words else None
+        goal = None
+        if goals[0] in values:
+            goal = np.stack([values[goal][owner] for goal in goals], axis=-1)
+        elif exits:
+            start, end = (np.stack([values[a][i] for a in axes], -1) for i in _ends(at))
+            goal = destinations(exits_of(exits, start, end, people, group), start)
         found.append(
             Sequence(
                 name=name,
@@ -124,16 +137,18 @@ def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> 
                 agents=tuple(people),
                 length=None if length is None or np.isnan(length).all() else length,
                 kind=tuple(words["kind"][owner]) if "kind" in words else None,
-                group=tuple(words["group"][owner]) if "group" in words else None,
-                destination=(
-                    np.stack([values[goal][owner] for goal in goals], axis=-1)
-                    if goals[0] in values
-                    else None
-                ),
+                group=group,
+                destination=goal,
                 walls=segments,
             )
         )
     return found
+
+
+def _ends(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every agent's first and last row in the table, of those at its times (-1: none)."""
+    known = [column[column >= 0] for column in at.T]
+    return np.array([rows[0] for rows in known]), np.array([rows[-1] for rows in known])
 
 
 def _is_crowd(options: TableOptions) -> bool:

@@ -265,3 +265,35 @@ def test_damaged_parquet_and_missing_table(tmp_path: Path) -> None:
 def test_two_vehicles_where_three_are_asked_for(platoon: Path) -> None:
     with pytest.raises(DataError, match=r"4 vehicles in one lane .*\(3 vehicles, 1 lanes\)"):
         read(platoon, min_vehicles=4)
+
+
+def test_pairs_end_where_somebody_comes_between(tmp_path: Path) -> None:
+    cars = [drive(name, 0, 10, x0, lane=1) for name, x0 in (("a", 60), ("b", 30), ("c", 0))]
+    # d is in lane 2 but from 4 s to 6 s between b and a, e comes late
+    d = drive("d", 0, 10, 45, lane=2)
+    d.loc[(d.time > 3.95) & (d.time < 6.05), "lane"] = 1
+    path = save(tmp_path / "road.csv", *cars, d, drive("e", 8, 10, -30, lane=1))
+    found = {(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in read(path, pairs=True)}
+    assert found == {
+        (("b", "a"), 0.0, 3.8),
+        (("c", "b"), 0.0, 10.0),
+        (("b", "d"), 4.0, 6.0),
+        (("d", "a"), 4.0, 6.0),
+        (("b", "a"), 6.2, 10.0),
+        (("e", "c"), 8.0, 10.0),
+    }
+    windows = read(path, pairs=True, window=3.0)
+    assert {s.n_samples for s in windows} == {16}
+    assert [s.agents for s in windows].count(("c", "b")) == 3
+    assert [s.agents for s in windows].count(("b", "a")) == 2
+
+
+def test_a_lane_changer_parts_its_platoon(tmp_path: Path) -> None:
+    cars = [drive(name, 0, 10, x0, lane=1) for name, x0 in (("a", 60), ("b", 30), ("c", 0))]
+    d = drive("d", 0, 10, 45, lane=2)
+    d.loc[d.time > 5.95, "lane"] = 1
+    path = save(tmp_path / "road.csv", *cars, d)
+    spans = [(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in read(path, lane=1)]
+    assert spans == [(("c", "b", "a"), 0.0, 5.8), (("c", "b", "d", "a"), 6.0, 10.0)]
+    windows = read(path, lane=1, window=5.0, min_vehicles=2)
+    assert [s.agents for s in windows] == [("c", "b", "a"), ("c", "b")]

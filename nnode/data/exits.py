@@ -1,0 +1,167 @@
+"""Where people want to go, where the data tell it: exit lines, or headings, by direction and group.
+
+Everybody's exit is one for his group, or else for all, and for his direction; of several the
+nearest to where he was last seen. His destination is the nearest point of its line to where he is
+at the start of the sequence; with a heading in place of a line it is far ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as ListLike
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nnode.errors import ConfigError, DataError
+
+#: m; so far ahead lies the destination of who walks in a direction.
+FAR = 1e4
+
+#: Directions by their words.
+DIRECTIONS = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
+
+_KEYS = ("line", "heading", "direction", "group")
+
+
+@dataclass(frozen=True)
+class Exit:
+    """Where some people want to go.
+
+    Attributes:
+        name: of the exit.
+        line: ``(2, 2)`` m, its two end points, or None.
+        heading: ``(2,)`` of length 1, in place of a line.
+        direction: ``(2,)`` of length 1: the exit is for those who walk this way; None: for all.
+        group: the exit is for this group; None: for all.
+    """
+
+    name: str
+    line: np.ndarray | None = None
+    heading: np.ndarray | None = None
+    direction: np.ndarray | None = None
+    group: str | None = None
+
+    def point(self, x: np.ndarray) -> np.ndarray:
+        """``(2,)`` m, the destination of who is at ``x``."""
+        if self.line is None:
+            assert self.heading is not None
+            return np.asarray(x + FAR * self.heading)
+        start, along = self.line[0], self.line[1] - self.line[0]
+        share = np.clip((x - start) @ along / (along @ along), 0.0, 1.0)
+        return np.asarray(start + share * along)
+
+
+def read_exits(told: Any) -> list[Exit]:
+    """Exits as ``data.exits`` tells them.
+
+    Args:
+        told: ``{name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}`` (m), with ``heading``
+            ([x, y] or a word as for ``direction``) in place of ``line``; or None.
+
+    Raises:
+        ConfigError: names the exit and what is wrong with it.
+    """
+    found = []
+    for name, own in dict(told or {}).items():
+        if not isinstance(own, Mapping) or not set(own) <= set(_KEYS):
+            raise ConfigError(
+                f"data.exits.{name}={own}: expected some of {', '.join(_KEYS)}, such as "
+                "{line: [5, 0, 5, 4], direction: +x}"
+            )
+        if (own.get("line") is None) == (own.get("heading") is None):
+            raise ConfigError(f"data.exits.{name}={dict(own)}: expected a line or a heading")
+        line = None
+        if own.get("line") is not None:
+            line = _numbers(f"{name}.line", own["line"], 4).reshape(2, 2)
+            if (line[0] == line[1]).all():
+                raise ConfigError(f"data.exits.{name}.line: ends where it begins")
+        group = own.get("group")
+        found.append(
+            Exit(
+                name=str(name),
+                line=line,
+                heading=_unit(f"{name}.heading", own.get("heading")),
+                direction=_unit(f"{name}.direction", own.get("direction")),
+                group=None if group is None else str(group),
+            )
+        )
+    return found
+
+
+def _numbers(what: str, value: Any, number: int) -> np.ndarray:
+    try:
+        numbers = np.array([float(item) for item in value])
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (number,) or not np.isfinite(numbers).all():
+        raise ConfigError(f"data.exits.{what}={value}: expected {number} numbers")
+    return numbers
+
+
+def _unit(what: str, value: Any) -> np.ndarray | None:
+    if value is None:
+        return None
+    if isinstance(value, str):
+        if value not in DIRECTIONS:
+            raise ConfigError(
+                f"data.exits.{what}={value}: expected [x, y] or one of {', '.join(DIRECTIONS)}"
+            )
+        return np.array(DIRECTIONS[value])
+    way = _numbers(what, value, 2)
+    if not way.any():
+        raise ConfigError(f"data.exits.{what}={value}: expected a direction, not zero")
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def exits_of(
+    exits: list[Exit],
+    first: np.ndarray,
+    last: np.ndarray,
+    names: ListLike[str],
+    groups: ListLike[str] | None = None,
+) -> list[Exit]:
+    """Everybody's exit.
+
+    Args:
+        exits: at least one.
+        first, last: ``(N, 2)`` m, where people were first and last seen.
+        names: N, for messages.
+        groups: N names, or None.
+
+    Raises:
+        DataError: somebody whom no exit is for.
+    """
+    found = []
+    for i, name in enumerate(names):
+        way = last[i] - first[i]
+        fits = [
+            one
+            for one in exits
+            if (one.group is None or (groups is not None and groups[i] == one.group))
+            and (one.direction is None or way @ one.direction > 0)
+        ]
+        if not fits:
+            of = f" of group {groups[i]!r}" if groups is not None and groups[i] else ""
+            raise DataError(
+                f"no exit (data.exits) is for person {name}{of}, who goes from "
+                f"({first[i][0]:.1f}, {first[i][1]:.1f}) m to ({last[i][0]:.1f}, "
+                f"{last[i][1]:.1f}) m; add one without direction and group"
+            )
+        # what is for a group goes before what is for all
+        own = [one for one in fits if one.group is not None] or fits
+        found.append(min(own, key=lambda one: _distance(one, last[i], way)))
+    return found
+
+
+def _distance(one: Exit, last: np.ndarray, way: np.ndarray) -> float:
+    """m from where somebody was last seen; of a heading, the part of the way aside or back."""
+    if one.heading is None:
+        return float(np.linalg.norm(one.point(last) - last))
+    return float(np.linalg.norm(way - max(way @ one.heading, 0.0) * one.heading))
+
+
+def destinations(own: ListLike[Exit], x: np.ndarray) -> np.ndarray:
+    """``(N, 2)`` m, the destinations of people with their exits who are at ``x`` (N, 2)."""
+    return np.stack([one.point(place) for one, place in zip(own, x, strict=True)])

@@ -1,0 +1,334 @@
+"""Reader of pairs: one row per follower, its leader, and time, as car following is published.
+
+A pair is its own little platoon of two, the leader last. Where the source gives the spacing from
+bumper to bumper in place of the leader's length, that follows from it and from the positions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nnode.data.options import Gaps, PairOptions
+from nnode.data.readers.columns import Table
+from nnode.data.readers.recordings import check_known, one_of, positive, tables_below, wanted
+from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError, DataError
+
+_REQUIRED = ("time", "x_follower", "x_leader")
+_METRES = ("leader_length", "follower_length", "spacing")
+_SPEEDS = ("v_follower", "v_leader")
+#: What belongs to a pair as a whole.
+_WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
+
+#: m by which a length that follows from spacings may vary within a pair: the error that a single
+#: position may have without being a fault (:mod:`nnode.data.quality`).
+UNSTEADY = 0.5
+#: Share of the sampling interval by which a step may deviate.
+UNEVEN = 0.01
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A pair's rows in one file, in order of time, and what belongs to it as a whole."""
+
+    table: Table
+    rows: np.ndarray
+    words: dict[str, str]
+    time: np.ndarray
+    x: np.ndarray
+    v: np.ndarray | None
+    length: np.ndarray
+
+    @property
+    def called(self) -> str:
+        return f"{self.table.path}: pair {self.words['pair']}"
+
+
+def pair_files(options: PairOptions) -> dict[str, Path]:
+    """The tables by their path below the folder; a single file by its name.
+
+    Raises:
+        ConfigError: no path, or ``data.source`` is an address.
+        DataError: no such file or folder, or one without a table.
+    """
+    return tables_below(options, options.path, options.files)
+
+
+def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
+    """Read pairs.
+
+    Args:
+        files: see :func:`pair_files`.
+        options: columns, units, time grid, and what becomes of gaps.
+
+    Returns:
+        Sequences of two vehicles, follower and leader, named ``run/pair``, with a number behind
+        where a pair is cut. Speeds are the measured ones where the source has those of both. A
+        pair without a column of it is a file; without a run, all are of one recording, which is
+        called like the data.
+
+    Raises:
+        ConfigError: an option out of its range, an unknown recording or lane.
+        DataError: columns or cells that are missing or hold no number (names the row), values
+            that change within a pair although they belong to it, a gap in its times where
+            ``gaps=error``, or no pair at all.
+    """
+    _check(options)
+    asked = wanted(options.recording)
+    pairs = [pair for key, path in files.items() for pair in _pairs(key, Table(path), options)]
+    if asked is not None:
+        check_known(asked, [pair.words["run"] for pair in pairs])
+    lanes = _lanes(options, pairs)
+    found: list[Sequence] = []
+    taken: dict[str, str] = {}
+    for pair in pairs:
+        run, lane = pair.words["run"], pair.words.get("lane", "")
+        if (asked is not None and run not in asked) or (lanes and lane not in lanes):
+            continue
+        name = f"{run}/{pair.words['pair']}"
+        if name in taken:
+            raise DataError(
+                f"{pair.called} of run {run} stands in {taken[name]} as well; give pairs names of "
+                "their own (data.columns.pair, data.pattern)"
+            )
+        taken[name] = str(pair.table.path)
+        pieces = list(_pieces(pair, options))
+        for number, (time, x, v) in enumerate(pieces):
+            found.append(_sequence(name, number, len(pieces), pair, time, x, v, options))
+    if not found:
+        raise DataError(
+            f"{next(iter(files.values()))}: no sequence; none of {len(pairs)} pairs has "
+            f"{options.min_samples} equally spaced times"
+            + (f" or lasts for {options.window:g} s" if options.window else "")
+            + "; lower data.min_samples or data.window"
+        )
+    return found
+
+
+def _check(options: PairOptions) -> None:
+    for name in ("dt", "window"):
+        if getattr(options, name) is not None:
+            positive(name, getattr(options, name))
+    if options.min_samples < 2:
+        raise ConfigError(f"data.min_samples={options.min_samples}: expected at least 2")
+    known = (*_REQUIRED, *_METRES, *_SPEEDS, *_WORDS)
+    for key in options.constant:
+        if key not in _WORDS:
+            raise ConfigError(f"data.constant.{key} is unknown; expected {', '.join(_WORDS)}")
+    for key in options.columns:
+        if key not in known:
+            raise ConfigError(f"data.columns.{key} is unknown; expected {', '.join(known)}")
+    try:
+        groups = re.compile(options.pattern or "").groupindex
+    except re.error as error:
+        raise ConfigError(f"data.pattern={options.pattern}: {error}") from error
+    for key in groups:
+        if key not in _WORDS:
+            raise ConfigError(
+                f"data.pattern={options.pattern}: the group {key!r} is unknown; expected "
+                f"{', '.join(_WORDS)}"
+            )
+
+
+def _unit(option: str, value: Any, path: Path, units: dict[str, float]) -> float:
+    """SI units per unit of a file; a mapping gives the unit by pattern of the file's name."""
+    if isinstance(value, str):
+        return one_of(option, value, units)
+    for pattern, unit in dict(value).items():
+        if fnmatch(path.name, pattern):
+            return one_of(f"{option}.{pattern}", unit, units)
+    raise ConfigError(f"data.{option}={value}: no pattern fits {path.name}")
+
+
+def _pairs(key: str, table: Table, options: PairOptions) -> Iterator[_Pair]:
+    names = table.choose(_REQUIRED, (*_METRES, *_SPEEDS, *_WORDS), options.columns)
+    metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
+    speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
+    time = table.numbers(names["time"])
+    x = np.stack([table.numbers(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
+    v = None
+    if all(name in names for name in _SPEEDS):
+        v = np.stack([table.numbers(names[name]) for name in _SPEEDS], -1) * speeds
+    own = {n: table.numbers(names[n], empty=True) * metres for n in _METRES if n in names}
+    words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
+    everywhere = _everywhere(key, table.path, options, set(words))
+    label = np.array(["\0".join(cells) for cells in zip(*_keys(words), strict=True)], dtype=object)
+    codes = np.unique(label, return_inverse=True)[1] if len(label) else np.zeros(len(table), int)
+    first = [int(np.flatnonzero(codes == code)[0]) for code in range(codes.max() + 1)]
+    for code in np.argsort(first):
+        rows = np.flatnonzero(codes == code)
+        rows = rows[np.argsort(time[rows], kind="stable")]
+        again = np.flatnonzero(np.diff(time[rows]) <= 0)
+        if again.size:
+            i, j = sorted(rows[again[0] : again[0] + 2])
+            raise DataError(
+                f"{table.path}, {table.row(j)}: a second row of one pair at {time[j]:g} s (first "
+                f"in {table.row(i)}); expected one row per pair and time"
+            )
+        said = dict(everywhere)
+        for name, cells in words.items():
+            _steady(table, names[name], cells, rows)
+            said[name] = str(cells[rows[0]])
+        yield _Pair(
+            table, rows, said, time[rows], x[rows], None if v is None else v[rows],
+            np.array([_follower(own, rows), _leader(table, own, x, rows)]),
+        )  # fmt: skip
+
+
+def _keys(words: dict[str, np.ndarray]) -> list[np.ndarray]:
+    """The columns that tell pairs apart: their names, else the two vehicles."""
+    if "pair" in words:
+        return [words[n] for n in ("run", "pair") if n in words]
+    return [words[n] for n in ("run", "follower", "leader") if n in words]
+
+
+def _everywhere(key: str, path: Path, options: PairOptions, held: set[str]) -> dict[str, str]:
+    """What is the same in all rows of a file: from its path, or set by hand."""
+    said = {"run": options.name, "pair": path.stem}
+    said |= {str(name): str(value) for name, value in options.constant.items()}
+    if options.pattern is not None:
+        groups = re.compile(options.pattern).groupindex
+        match = re.search(options.pattern, key)
+        if match is None and not set(groups) <= held:
+            raise DataError(
+                f"{path}: its path {key!r} does not fit data.pattern={options.pattern}, and the "
+                f"file has no columns {', '.join(sorted(set(groups) - held))}"
+            )
+        if match is not None:
+            said |= {name: value for name, value in match.groupdict().items() if value}
+    return said
+
+
+def _steady(table: Table, column: str, cells: np.ndarray, rows: np.ndarray) -> None:
+    other = rows[cells[rows] != cells[rows[0]]]
+    if other.size:
+        raise DataError(
+            f"{table.path}, {table.row(int(other[0]))}: column {column!r} holds "
+            f"{cells[other[0]]!s}, before it {cells[rows[0]]!s}; it belongs to the pair and must "
+            "be the same in all its rows: name pairs that are to be told apart (data.columns.pair)"
+        )
+
+
+def _follower(own: dict[str, np.ndarray], rows: np.ndarray) -> float:
+    return float(own["follower_length"][rows[0]]) if "follower_length" in own else float("nan")
+
+
+def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.ndarray) -> float:
+    """The leader's length (m): given, or what is left of the distance without the spacing."""
+    if "leader_length" in own:
+        return float(own["leader_length"][rows[0]])
+    if "spacing" not in own:
+        return float("nan")
+    length = x[rows, 1] - x[rows, 0] - own["spacing"][rows]
+    usual = float(np.nanmedian(length))
+    off = np.abs(length - usual)
+    if np.nanmax(off) > UNSTEADY:
+        i = int(rows[np.nanargmax(off)])
+        raise DataError(
+            f"{table.path}, {table.row(i)}: x_leader - x_follower - spacing is "
+            f"{length[np.nanargmax(off)]:.2f} m, {usual:.2f} m in other rows of the pair; expected "
+            "one length of the leader: leave out data.columns.spacing and give leader_length"
+        )
+    return usual
+
+
+def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
+    if options.lane is None:
+        return []
+    chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
+    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
+    present = sorted({pair.words.get("lane", "") for pair in pairs}, key=lambda n: (len(n), n))
+    for name in names:
+        if name not in present:
+            raise ConfigError(f"data.lane={name}: the pairs have the lanes {', '.join(present)}")
+    return names
+
+
+_Piece = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+
+
+def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
+    """Times, positions and speeds of every part without a gap."""
+    if len(pair.time) < options.min_samples:
+        return
+    step = np.diff(pair.time)
+    usual = float(np.median(step))
+    gaps = np.flatnonzero(np.abs(step - usual) > UNEVEN * usual)
+    if gaps.size and options.gaps is Gaps.error:
+        i = int(gaps[0])
+        raise DataError(
+            f"{pair.called} steps from {pair.time[i]:g} s to {pair.time[i + 1]:g} s "
+            f"({pair.table.row(int(pair.rows[i + 1]))}), expected steps of {usual:g} s "
+            f"({len(gaps)} such gaps); data.gaps=cut cuts the pair there"
+        )
+    for rows in np.split(np.arange(len(pair.time)), gaps + 1):
+        if len(rows) < 2:
+            continue
+        time, x, v = pair.time[rows], pair.x[rows], None if pair.v is None else pair.v[rows]
+        dt = usual
+        if options.dt is not None:
+            dt = options.dt
+            first, last = np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6)
+            grid = np.arange(first, last + 1) * dt
+            x = _at(grid, time, x)
+            v = None if v is None else _at(grid, time, v)
+            time = grid
+        yield from _windows(time, x, v, dt, options)
+
+
+def _at(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(grid, time, column) for column in values.T], -1)
+
+
+def _windows(
+    time: np.ndarray, x: np.ndarray, v: np.ndarray | None, dt: float, options: PairOptions
+) -> Iterator[_Piece]:
+    """Consecutive windows that share their boundary sample; what is left at the end is not used."""
+    starts, steps = [0], len(time) - 1
+    if options.window is not None:
+        steps = round(options.window / dt)
+        if steps < 1 or abs(options.window / dt - steps) > 1e-6 * steps:
+            raise ConfigError(
+                f"data.window={options.window:g} s is no whole number of steps of {dt:g} s"
+            )
+        starts = list(range(0, len(time) - steps, steps))
+    for first in starts:
+        rows = slice(first, first + steps + 1)
+        if len(time[rows]) >= options.min_samples:
+            yield time[rows], x[rows], None if v is None else v[rows]
+
+
+def _sequence(
+    name: str,
+    number: int,
+    pieces: int,
+    pair: _Pair,
+    time: np.ndarray,
+    x: np.ndarray,
+    v: np.ndarray | None,
+    options: PairOptions,
+) -> Sequence:
+    words = pair.words
+    agents = (words.get("follower", ""), words.get("leader", ""))
+    kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
+    codes = (words.get("follower_kind", ""), words.get("leader_kind", ""))
+    kind = tuple(kinds.get(code, code) for code in codes)
+    return Sequence(
+        name=name if pieces == 1 else f"{name}_{number:03d}",
+        recording=words["run"],
+        time=time,
+        x=x[:, :, None],
+        v=None if v is None else v[:, :, None],
+        agents=agents if all(agents) else (),
+        length=None if np.isnan(pair.length).all() else pair.length,
+        kind=kind if any(kind) else None,
+        split=words.get("split", "").lower(),
+    )

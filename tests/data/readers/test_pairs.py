@@ -1,0 +1,229 @@
+"""Reading pairs of a follower and its leader: columns, units, gaps, and the published division."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from omegaconf import OmegaConf
+
+from nnode.data.clusters import clusters, index_of
+from nnode.data.options import Gaps, PairOptions, SplitMode, SplitOptions
+from nnode.data.prepare import prepare
+from nnode.data.readers.pairs import pair_files, read_pairs
+from nnode.data.sequence import Sequence
+from nnode.data.split import split
+from nnode.errors import ConfigError, DataError
+
+FOOT = 0.3048
+CONF = Path(__file__).parents[3] / "conf" / "data"
+
+
+def drive(first: int = 0, last: int = 50, unit: float = 1.0, **more: object) -> pd.DataFrame:
+    """A follower at 10 m/s, 20 m of it behind a leader of 4 m at 11 m/s, in ``unit`` m."""
+    k = np.arange(first, last + 1)
+    t = k * 0.1
+    x, lead = 10.0 * t, 24.0 + 11.0 * t
+    return pd.DataFrame(
+        {
+            "time": t,
+            "x_follower": x / unit,
+            "v_follower": 10.0 / unit,
+            "x_leader": lead / unit,
+            "v_leader": 11.0 / unit,
+            "spacing": (lead - x - 4.0) / unit,
+            **more,
+        }
+    )
+
+
+def save(path: Path, *parts: pd.DataFrame) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = pd.concat(parts)
+    if path.suffix == ".parquet":
+        table.to_parquet(path)
+    else:
+        table.to_csv(path, index=False)
+    return path
+
+
+def read(path: Path, **options: object) -> list[Sequence]:
+    own = PairOptions(path=str(path), **options)  # type: ignore[arg-type]
+    return read_pairs(pair_files(own), own)
+
+
+def configured(name: str, path: Path | str, source: Path | None = None) -> PairOptions:
+    """The options of a shipped configuration."""
+    said = OmegaConf.load(CONF / f"{name}.yaml")
+    said.pop("defaults")
+    own = OmegaConf.merge(OmegaConf.structured(PairOptions), said, {"path": str(path)})
+    own["source"] = None if source is None else str(source)
+    options = OmegaConf.to_object(own)
+    assert isinstance(options, PairOptions)
+    return options
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
+    more = {"follower": 7, "leader": 5, "run": "a", "leader_kind": "CAV", "split": "Test"}
+    (s,) = read(save(tmp_path / f"one{suffix}", drive(unit=FOOT, **more)),
+                position_unit="ft", speed_unit="ft/s", kinds={"CAV": "automated"})  # fmt: skip
+    assert (s.name, s.recording, s.agents, s.split) == ("a/one", "a", ("7", "5"), "test")
+    assert s.kind == ("", "automated")
+    np.testing.assert_allclose(s.time, 0.1 * np.arange(51), atol=1e-12)
+    np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time, atol=1e-9)
+    np.testing.assert_allclose(s.x[:, 1, 0], 24 + 11 * s.time, atol=1e-9)
+    np.testing.assert_allclose(s.v[:, :, 0], np.tile([10.0, 11.0], (51, 1)))
+    assert s.length is not None
+    assert np.isnan(s.length[0])
+    np.testing.assert_allclose(s.length[1], 4.0)
+
+
+def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> None:
+    parts = [drive(pair=p, leader_length=4.5).drop(columns="spacing") for p in (3, 1)]
+    table = pd.concat(parts).sample(frac=1.0, random_state=1)
+    found = read(save(tmp_path / "all.csv", table), window=1.0)
+    assert len(found) == 10
+    assert {s.name for s in found} == {f"pairs/{p}_{k:03d}" for p in (1, 3) for k in range(5)}
+    assert {s.n_samples for s in found} == {11}
+    assert all(s.agents == () and s.length is not None and s.length[1] == 4.5 for s in found)
+
+
+def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "one.csv", drive(0, 20), drive(30, 50))
+    first, second = read(path)
+    assert (first.name, second.name) == ("pairs/one_000", "pairs/one_001")
+    assert (first.time[-1], second.time[0]) == pytest.approx((2.0, 3.0))
+    with pytest.raises(DataError, match=r"pair one steps from 2 s to 3 s \(line 23\)"):
+        read(path, gaps=Gaps.error)
+
+
+def test_a_coarser_grid(tmp_path: Path) -> None:
+    (s,) = read(save(tmp_path / "one.csv", drive(3, 50)), dt=0.4)
+    np.testing.assert_allclose(s.time, 0.4 * np.arange(1, 13))
+    np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"spacing": np.linspace(20, 30, 51)}, "one length of the leader"),
+        ({"leader": np.arange(51)}, "line 3: column 'leader' holds 1, before it 0"),
+        ({"time": 0.0}, "a second row of one pair at 0 s"),
+        ({"x_leader": "?"}, "line 2: column 'x_leader' holds '\\?'"),
+    ],
+)
+def test_rows_that_are_no_pair_are_refused(
+    tmp_path: Path, change: dict[str, object], said: str
+) -> None:
+    table = drive(pair="p", follower=1).assign(**change)
+    with pytest.raises(DataError, match=said):
+        read(save(tmp_path / "one.csv", table))
+
+
+def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "one.csv", drive(lane=2))
+    assert len(read(path, lane=2)) == 1
+    for options, said in (
+        ({"pattern": "(?P<colour>.*)"}, "group 'colour' is unknown"),
+        ({"pattern": "("}, "data.pattern"),
+        ({"constant": {"x": "1"}}, "data.constant.x"),
+        ({"columns": {"y": "y"}}, "data.columns.y is unknown"),
+        ({"lane": 3}, "lane=3: the pairs have the lanes 2"),
+        ({"window": 0.15}, "no whole number of steps"),
+        ({"position_unit": {"*.parquet": "m"}}, "no pattern fits one.csv"),
+        ({"recording": "b"}, "recording=b: unknown recording"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            read(path, **options)
+    with pytest.raises(DataError, match=r"does not fit data\.pattern"):
+        read(path, pattern="(?P<run>[0-9]+)_")
+
+
+def test_files_as_they_are_published(tmp_path: Path) -> None:
+    table = drive(unit=FOOT, leader_length=4.0 / FOOT).rename(columns={"time": "t"})
+    start = "ngsim_final_I80_trajectories-0400pm-0415pm_runfinal_I80_trajectories-0400pm-0415pm"
+    save(tmp_path / "train" / f"{start}_f13_l15_00035.csv", table)
+    save(tmp_path / "test" / f"{start}_f254_l253_00014.csv", table)
+    save(tmp_path / "manifest.csv", pd.DataFrame({"dataset": ["ngsim"]}))
+    options = configured("ngsim_pairs", tmp_path)
+    one, two = read_pairs(pair_files(options), options)
+    assert (one.name, one.split) == ("0400pm-0415pm/f254_l253_00014", "test")
+    assert (two.agents, two.split) == (("13", "15"), "train")
+    np.testing.assert_allclose(two.x[-1, :, 0], [50.0, 79.0])
+    assert two.length is not None
+    np.testing.assert_allclose(two.length[1], 4.0)
+
+    names = {"time": "timestamp"} | {
+        f"{q}_{who.lower()}": f"{q}{who}Real" for q in "xv" for who in ("Leader", "Follower")
+    }
+    own = drive(follower_id=16, leader_id=6, run_no=1).rename(columns=names)
+    save(tmp_path / "Data" / "CAV" / "run-1-veh-16-pair-7.csv", own)
+    options = configured("tgsim", tmp_path / "Data")
+    (s,) = read_pairs(pair_files(options), options)
+    assert (s.name, s.agents, s.kind) == ("1/run-1-veh-16-pair-7", ("16", "6"), ("HV", "CAV"))
+
+
+def test_without_the_folder_it_is_said_where_it_is_published(tmp_path: Path) -> None:
+    options = configured("tgsim", "tgsim", tmp_path)
+    with pytest.raises(DataError, match=r"github.com/usdot-fhwa-stol/.* at commit bd31e5189d9a"):
+        pair_files(options)
+
+
+def test_the_published_division_is_taken(tmp_path: Path) -> None:
+    sides = ["train", "train", "test", "train", "val"]
+    parts = [
+        drive(pair=i, follower=2 * i, leader=2 * i + 1 if i else 4, split=side)
+        for i, side in enumerate(sides)
+    ]
+    store = prepare(PairOptions(path=str(save(tmp_path / "p.csv", *parts))), tmp_path / "store")
+    for mode in (SplitMode.auto, SplitMode.published):
+        found = split(store, SplitOptions(mode=mode))
+        assert (found.train, found.heldout, found.dropped) == ([0, 1, 3], [2], [4])
+        assert found.mode == "published"
+        assert "1 that train share an agent" in found.note
+    drawn = split(store, SplitOptions(mode=SplitMode.random, heldout=0.4))
+    assert drawn.mode == "random"
+    assert split(store, SplitOptions(heldout=0)).train == [0, 1, 2, 3, 4]
+    none = [{**entry, "split": ""} for entry in store.index]
+    with pytest.raises(DataError, match="0 sequences are marked 'train'"):
+        split(none, SplitOptions(mode=SplitMode.published))
+
+
+@pytest.mark.real
+def test_pairs_of_ngsim(real_data: Path) -> None:
+    options = configured("ngsim_pairs", "ngsim_pairs", real_data)
+    found = read_pairs(pair_files(options), options)
+    table = pd.read_parquet(real_data / "ngsim_pairs" / "i80_pairs.parquet")
+    assert len(found) == 120
+    assert sum(s.n_samples for s in found) == len(table) == 85283
+    assert sorted(s.split for s in found) == ["test"] * 20 + ["train"] * 100
+    for s in found:
+        own = table[table.pair == int(s.name.rpartition("/")[2])]
+        assert s.length is not None
+        gap = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
+        np.testing.assert_allclose(gap, own.spacing, atol=1e-3)
+        np.testing.assert_allclose(s.v[:, 0, 0], own.v_follower)
+    # pairs that share a vehicle within a quarter of an hour, counted by hand
+    shared: dict[tuple[str, int], set[int]] = {}
+    for pair, own in table.groupby("pair"):
+        for vehicle in (own.follower.iloc[0], own.leader.iloc[0]):
+            shared.setdefault((own.run.iloc[0], vehicle), set()).add(int(str(pair)))
+    groups = [{pair} for pair in range(120)]
+    for members in shared.values():
+        joined = [group for group in groups if group & members]
+        groups = [g for g in groups if not g & members] + [set().union(*joined)]
+    assert clusters(index_of(found)).max() + 1 == len(groups) == 114
+
+
+@pytest.mark.real
+def test_pairs_of_tgsim(real_data: Path) -> None:
+    options = configured("tgsim", "tgsim", real_data)
+    found = read_pairs(pair_files(options), options)
+    kinds = [s.kind for s in found]
+    assert (kinds.count(("HV", "HV")), kinds.count(("HV", "CAV"))) == (139, 49)
+    # the spacings were made with vehicles of 5 m
+    assert all(s.length is not None and abs(s.length[1] - 5.0) < 1e-9 for s in found)
+    assert clusters(index_of(found)).max() + 1 == len({s.recording for s in found}) == 10
