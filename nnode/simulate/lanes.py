@@ -178,12 +178,15 @@ def tangents(
     threads: int = 1,
     each: Tensor | None = None,
     method: str | None = None,
+    given: Sequence[str] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Simulate a lane, and the derivatives of its states by parameters, exact for the method.
 
     Args:
         names: P symbols among ``lane.owned``.
-        each: ``(B, P)`` values of these parameters for every sequence; None: the system's.
+        each: ``(B, G)`` values of parameters for every sequence, ``(1, G)`` for all; None: the
+            system's own.
+        given: symbols of the parameters in ``each``; None: those of ``names``.
 
     Returns:
         ``(K, B, N, M)`` states and ``(P, K, B, N, M)`` their derivatives. A measured leader's
@@ -200,18 +203,18 @@ def tangents(
     q = _row(lane, own).to(x.dtype)
     every = with_tangents(stepped(lane, method or system.step), tuple(names))
     if each is not None:
-        q = q.repeat(len(batch), 1)
-        q[:, [list(lane.owned).index(name) for name in names]] = each.to(x.dtype)
+        q = q.repeat(len(each), 1)
+        q[:, [list(lane.owned).index(s) for s in given or names]] = each.to(x.dtype)
     known = {}
     if every.starts:
-        values = dict(zip(lane.owned, q.T[..., None] if each is not None else q[0], strict=True))
+        values = dict(zip(lane.owned, q.T[..., None], strict=True))
         known = starts_of(terms, every, x[0], batch.v[0], system.scene(batch), values)
     zero = torch.zeros_like(x[0, ..., 0])
     known = {"x": x[0, ..., 0], "v": batch.v[0, ..., 0], **known}
     y0 = torch.stack([known.get(state, zero) for state in every.rates])
     plan = planned(
         system, lane, batch, substeps, threads, 1,
-        own=each is not None, method=method, tangents=tuple(names),
+        own=len(q) > 1, method=method, tangents=tuple(names),
     )  # fmt: skip
     with torch.no_grad():
         out: Tensor = _Simulate.apply(plan, y0, q)
