@@ -272,6 +272,8 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
     if "spacing" not in own:
         return float("nan")
     length = x[rows, 1] - x[rows, 0] - own["spacing"][rows]
+    if np.isnan(length).all():
+        return float("nan")
     usual = float(np.nanmedian(length))
     off = np.abs(length - usual)
     if np.nanmax(off) > UNSTEADY:
@@ -320,6 +322,11 @@ def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
         dt = usual
         if options.dt is not None:
             dt = options.dt
+            if dt < usual * (1 - UNEVEN):
+                raise ConfigError(
+                    f"data.dt={dt:g} s is finer than the {usual:g} s of {pair.called}; expected no "
+                    "more times than were measured"
+                )
             first, last = np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6)
             grid = np.arange(first, last + 1) * dt
             x = _at(grid, time, x)

@@ -102,7 +102,10 @@ def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_coarser_grid(tmp_path: Path) -> None:
-    (s,) = read(save(tmp_path / "one.csv", drive(3, 50)), dt=0.4)
+    path = save(tmp_path / "one.csv", drive(3, 50))
+    with pytest.raises(ConfigError, match=r"dt=0\.05 s is finer than the 0\.1 s"):
+        read(path, dt=0.05)
+    (s,) = read(path, dt=0.4)
     np.testing.assert_allclose(s.time, 0.4 * np.arange(1, 13))
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
 
