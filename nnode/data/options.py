@@ -166,6 +166,9 @@ class PairOptions(DataOptions):
     # patterns of the files of a folder, of which the first that fits any is taken
     files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
     columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    # a table in that folder with a row per file: path, and meanings that the files have no columns
+    # of; where it is there, no other file is read
+    index: str | None = None
     # a regular expression, searched for in a file's path below the folder: its named groups are
     # meanings that the file has no column of
     pattern: str | None = None
