@@ -16,6 +16,7 @@ from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
     ConsensusOptions,
+    GaussNewtonOptions,
     LbfgsOptions,
 )
 from nnode.calibrate.options import (
@@ -153,6 +154,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "adam_schema"): AdamOptions,
     ("optimizer", "lbfgs_schema"): LbfgsOptions,
     ("optimizer", "cbo_schema"): ConsensusOptions,
+    ("optimizer", "gauss_newton_schema"): GaussNewtonOptions,
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
 }

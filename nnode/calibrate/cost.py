@@ -57,6 +57,8 @@ _UNITS = {
     Convention.speed: "m²/s²",
 }
 _OF_PLACES = (Convention.integral, Convention.sum)
+#: Those of vehicles that follow another.
+FOLLOWING = tuple(kind for kind in Convention if kind not in _OF_PLACES)
 
 
 def squared_error(trajectory: Trajectory, batch: Batch) -> Tensor:

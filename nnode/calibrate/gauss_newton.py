@@ -19,7 +19,7 @@ from torch import Tensor
 from nnode.calibrate.cost import Convention, changed_gap, errors, net_gaps
 from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step
 from nnode.data.sequence import Batch
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.models.system import System, Traffic
 from nnode.models.term import Interval
 from nnode.simulate import lanes
@@ -101,6 +101,22 @@ class TangentCost:
         for value, (name, place, _) in zip(row, self._places.values(), strict=True):
             own[name].view(-1)[place] = float(value)
         return system
+
+    def physical(self, name: str) -> bool:
+        """Whether a symbol is that of a parameter with a physical meaning, no weight."""
+        return self._places[name][2] is None
+
+    def complain(self, cost: np.ndarray) -> None:
+        """Say which sequences cannot be simulated.
+
+        Raises:
+            SimulationError: always.
+        """
+        bad = [name for name, c in zip(self.batch.names, cost, strict=True) if not np.isfinite(c)]
+        raise SimulationError(
+            f"the simulation of {', '.join(bad[:5])} blew up; check the sequences, start from "
+            "other parameters, or take a smaller solver.dt"
+        )
 
     def costs(self, rows: np.ndarray) -> np.ndarray:
         """``(B,)`` costs for parameters ``(P,)``, or for those of every sequence ``(B, P)``."""
