@@ -138,7 +138,7 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
     """Give a model effects of the catalogue, each in its place in the sum.
 
     Args:
-        chosen: per effect its ``name`` and any of its parameters.
+        chosen: per effect its ``name`` and any of its parameters, or the name alone.
 
     Raises:
         ConfigError: an effect that the catalogue or the model's domain does not have, or a
@@ -148,13 +148,7 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
         load_own()
     added = []
     for entry in chosen:
-        if not isinstance(entry, Mapping) or "name" not in entry:
-            raise ConfigError(
-                f"model.effects has the entry {entry!r}, expected a name and parameters such as "
-                "{name: relative_speed, kappa: 0.3}"
-            )
-        values = {str(key): value for key, value in entry.items() if key != "name"}
-        name = str(entry["name"])
+        name, values = _entry(entry)
         known = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain))]
         if name not in known:
             near = get_close_matches(name, known, n=1)
@@ -175,6 +169,22 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
                 model.lane  # noqa: B018 - says what the law does not have
             except ConfigError as error:
                 raise ConfigError(f"model.effects: {effect.name} cannot act: {error}") from error
+
+
+def _entry(entry: Any) -> tuple[str, dict[str, Any]]:
+    """An effect's name and parameters, in any of the ways to write them."""
+    if isinstance(entry, str):
+        return entry, {}
+    if isinstance(entry, Mapping) and "name" in entry:
+        return str(entry["name"]), {str(k): v for k, v in entry.items() if k != "name"}
+    if isinstance(entry, Mapping) and len(entry) == 1:
+        ((name, values),) = entry.items()
+        if isinstance(values, Mapping):
+            return str(name), {str(k): v for k, v in values.items()}
+    raise ConfigError(
+        f"model.effects has the entry {entry!r}, expected a name, a name and its parameters as "
+        "{relative_speed: {kappa: 0.3}}, or {name: relative_speed, kappa: 0.3}"
+    )
 
 
 def _check_order(model: System, effect: Effect) -> None:
