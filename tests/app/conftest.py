@@ -51,11 +51,14 @@ def started() -> Script:
 
 
 @pytest.fixture(scope="session")
-def script() -> Iterator[Script]:
-    """The same in a process that is forked, where the system can: without seconds of imports."""
-    if not hasattr(os, "fork"):
-        yield start_script
-        return
-    forks = Forks(environment())
-    yield forks.run
-    forks.close()
+def forks() -> Iterator[Forks]:
+    """What runs scripts without seconds of imports."""
+    found = Forks(environment())
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="session")
+def script(forks: Forks) -> Script:
+    """The same as ``started`` in a process that is forked, where the system can."""
+    return forks.run if hasattr(os, "fork") else start_script

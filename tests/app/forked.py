@@ -1,18 +1,21 @@
 """Scripts in processes forked from one that has loaded the libraries: no seconds of imports each.
 
 This file is also the program of that process: it is asked on its standard input, a line of JSON
-for every script, and answers with the exit status. It is started afresh and never works itself,
-so that no thread, no compiled code and no random state is inherited but what imports leave.
+for scripts to run at a time, and answers with their exit statuses. It is started afresh and never
+works itself, so that no thread, no compiled code and no random state is inherited.
 """
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +45,12 @@ class Forks:
 
     def run(self, name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
         """As ``subprocess.run`` with captured text."""
+        return self.together(name, overrides, [env])[0]
+
+    def together(
+        self, name: str, overrides: Sequence[str], envs: list[dict[str, str]]
+    ) -> list[subprocess.CompletedProcess[str]]:
+        """One script in several processes at a time, each with variables of its own."""
         if self._server is None:
             self._server = subprocess.Popen(
                 [sys.executable, "-m", "tests.app.forked"],
@@ -52,13 +61,20 @@ class Forks:
         assert asked is not None
         assert answers is not None
         with tempfile.TemporaryDirectory() as folder:
-            out, errors = Path(folder) / "out", Path(folder) / "errors"
-            order = {"name": name, "overrides": overrides, "env": {**self._environment, **env}}
-            print(json.dumps({**order, "out": str(out), "errors": str(errors)}), file=asked)
-            asked.flush()
-            status = int(answers.readline())
-            words = [path.read_text() for path in (out, errors)]
-        return subprocess.CompletedProcess([name, *overrides], status, *words)
+            orders = [
+                {
+                    "name": name, "overrides": overrides, "env": {**self._environment, **env},
+                    "out": f"{folder}/out{i}", "errors": f"{folder}/errors{i}",
+                }
+                for i, env in enumerate(envs)
+            ]  # fmt: skip
+            print(json.dumps(orders), file=asked, flush=True)
+            statuses = json.loads(answers.readline())
+            said = [[Path(order[k]).read_text() for k in ("out", "errors")] for order in orders]
+        return [
+            subprocess.CompletedProcess([name, *overrides], status, *words)
+            for status, words in zip(statuses, said, strict=True)
+        ]
 
     def close(self) -> None:
         """End the process that was forked from."""
@@ -85,12 +101,15 @@ def main() -> None:
 
     register()
     check_overrides([], ROOT / "conf", "train")  # the children share what Hydra looks up once
+    gc.collect()
+    gc.freeze()
     for line in sys.stdin:
-        order = json.loads(line)
-        child = Child(lambda order=order: typed(order), Path(order["out"]))
-        status = child.status(600)
-        child.kill()
-        print("-9" if status is None else status, flush=True)
+        children = [Child(partial(typed, order), Path(order["out"])) for order in json.loads(line)]
+        for child in children:
+            child.status(600)
+        for child in children:
+            child.kill()  # one that still works
+        print(json.dumps([child.status() for child in children]), flush=True)
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ if __name__ == "__main__":
     run("discover", discover.discover)
     checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
     print("== evaluate")
-    script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={folder}/evaluate")
+    script("evaluate", checkpoint, "solver.dt=0.02", f"hydra.run.dir={folder}/evaluate")
     print("== plot_forces")
     script("plot_forces", checkpoint, f"hydra.run.dir={folder}/forces")
     print("== train")
