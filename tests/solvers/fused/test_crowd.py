@@ -40,13 +40,11 @@ MODELS = {
     "sf_open": lambda: [Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1, walls=False)],
     "nn": lambda: [Relaxation(), network()],
     "nn_open": lambda: [network(3, mass=2.0, walls=False), Relaxation()],
-    "nn_small": lambda: [Relaxation(), network(2)],
     "nn_self": lambda: [Relaxation(), network(self_interaction=True)],
 }
 #: Every model but those of which another one tells as much; each is compiled for seconds.
 COMPILED = [
-    pytest.param(name, marks=pytest.mark.thorough if name in ("nn_open", "nn_small") else ())
-    for name in MODELS
+    pytest.param(name, marks=pytest.mark.thorough if name == "nn_open" else ()) for name in MODELS
 ]
 
 
@@ -340,7 +338,7 @@ def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> 
 
 
 def test_effects_among_neighbours(people: list[Sequence]) -> None:
-    model, batch = with_effects("nn_small", "walls"), single(in_groups(people))
+    model, batch = with_effects("sf", "walls"), single(in_groups(people))
     check(model, batch, FusedSolver(DT, cutoff=50.0))
     # one that leaves people out is another model
     with torch.no_grad():
