@@ -86,7 +86,7 @@ if __name__ == "__main__":
         shutil.copytree(name, f"{folder}/{name}")
     shutil.copy(f"{folder}/run/model.yaml", f"{folder}/conf/model/lin_with_speed_zone.yaml")
     script(
-        "train", "model=lin_with_speed_zone", "solver=fused", "solver.dt=0.02", "data=table",
+        "train", "model=lin_with_speed_zone", "solver.dt=0.02", "data=table",
         f"data.path={folder}/lane.csv", "data.domain=traffic", "trainer.max_epochs=1",
         f"hydra.run.dir={folder}/train", root=folder,
     )

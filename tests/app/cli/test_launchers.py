@@ -35,6 +35,7 @@ PROBLEM = (
     "data.loader.batch_size=7",
     "trainer.max_epochs=4",
     "trainer.figure_every=0",
+    "solver.dt=0.1",
 )
 
 
