@@ -32,9 +32,10 @@ def environment() -> dict[str, str]:
 
 
 def start_script(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """What :func:`started` gives."""
+    """What :func:`started` gives; in place of a script's name may stand code, of several lines."""
+    what = ["-c", name] if "\n" in name else [f"scripts/{name}.py"]
     return subprocess.run(
-        [sys.executable, f"scripts/{name}.py", *overrides],
+        [sys.executable, *what, *overrides],
         cwd=ROOT,
         env={**environment(), **env},
         capture_output=True,

@@ -1,8 +1,9 @@
 """Scripts in processes forked from one that has loaded the libraries: no seconds of imports each.
 
 This file is also the program of that process: it is asked on its standard input, a line of JSON
-for scripts to run at a time, and answers with their exit statuses. It is started afresh and never
-works itself, so that no thread, no compiled code and no random state is inherited.
+for scripts to start at a time or for ones to wait for, and answers with their numbers or their exit
+statuses. It is started afresh and never works itself, so that no thread, no compiled code and no
+random state is inherited.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import gc
 import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -32,6 +34,31 @@ LOADED = (
 )
 
 
+class Forked:
+    """A process, with what is needed of ``subprocess.Popen``."""
+
+    def __init__(self, forks: Forks, pid: int, order: dict[str, Any]) -> None:
+        self.pid, self.returncode = pid, None
+        self._forks, self._order = forks, order
+
+    def poll(self, seconds: float = 0.0) -> int | None:
+        """Its exit status; None where it still works after ``seconds``."""
+        if self.returncode is None:
+            self.returncode = self._forks.ask({"pid": self.pid, "seconds": seconds})
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def communicate(self, timeout: float = 600.0) -> tuple[str, str]:
+        """What it printed, at its end; one that works for longer is ended."""
+        if self.poll(timeout) is None:
+            self.send_signal(signal.SIGKILL)
+            self.poll(60.0)
+        out, errors = (Path(self._order[name]).read_text() for name in ("out", "errors"))
+        return out, errors
+
+
 class Forks:
     """Runs ``scripts/<name>.py``; the process it forks from is started with the first of them.
 
@@ -42,6 +69,8 @@ class Forks:
     def __init__(self, environment: dict[str, str]) -> None:
         self._environment = environment
         self._server: subprocess.Popen[str] | None = None
+        self._folder = tempfile.TemporaryDirectory(prefix="forked-")
+        self._number = 0
 
     def run(self, name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
         """As ``subprocess.run`` with captured text."""
@@ -51,35 +80,40 @@ class Forks:
         self, name: str, overrides: Sequence[str], envs: list[dict[str, str]]
     ) -> list[subprocess.CompletedProcess[str]]:
         """One script in several processes at a time, each with variables of its own."""
+        started = [self.start(name, *overrides, **env) for env in envs]
+        said = [process.communicate() for process in started]
+        return [
+            subprocess.CompletedProcess([name, *overrides], process.returncode or 0, *words)
+            for process, words in zip(started, said, strict=True)
+        ]
+
+    def start(self, name: str, *overrides: str, **env: str) -> Forked:
+        """As ``subprocess.Popen``; in place of a script's name may stand code, of several lines."""
+        self._number += 1
+        order = {
+            "name": name, "overrides": overrides, "env": {**self._environment, **env},
+            **{kind: f"{self._folder.name}/{self._number}.{kind}" for kind in ("out", "errors")},
+        }  # fmt: skip
+        return Forked(self, self.ask(order), order)
+
+    def ask(self, order: dict[str, Any]) -> Any:
+        """What the process that is forked from answers."""
         if self._server is None:
             self._server = subprocess.Popen(
                 [sys.executable, "-m", "tests.app.forked"],
                 cwd=ROOT, env=self._environment, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             )  # fmt: skip
-        asked, answers = self._server.stdin, self._server.stdout
-        assert asked is not None
-        assert answers is not None
-        with tempfile.TemporaryDirectory() as folder:
-            orders = [
-                {
-                    "name": name, "overrides": overrides, "env": {**self._environment, **env},
-                    "out": f"{folder}/out{i}", "errors": f"{folder}/errors{i}",
-                }
-                for i, env in enumerate(envs)
-            ]  # fmt: skip
-            print(json.dumps(orders), file=asked, flush=True)
-            statuses = json.loads(answers.readline())
-            said = [[Path(order[k]).read_text() for k in ("out", "errors")] for order in orders]
-        return [
-            subprocess.CompletedProcess([name, *overrides], status, *words)
-            for status, words in zip(statuses, said, strict=True)
-        ]
+        assert self._server.stdin is not None
+        assert self._server.stdout is not None
+        print(json.dumps(order), file=self._server.stdin, flush=True)
+        return json.loads(self._server.stdout.readline())
 
     def close(self) -> None:
         """End the process that was forked from."""
         if self._server is not None:
             self._server.communicate()
+        self._folder.cleanup()
 
 
 def typed(order: dict[str, Any]) -> None:
@@ -90,7 +124,13 @@ def typed(order: dict[str, Any]) -> None:
     os.dup2(descriptor, 2)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w"), open(2, "w")  # noqa: SIM115
-    script(ROOT, order["name"], list(order["overrides"]))
+    name, overrides = order["name"], list(order["overrides"])
+    if "\n" in name:
+        os.chdir(ROOT)
+        sys.argv = ["-c", *overrides]
+        exec(name, {"__name__": "__main__"})
+    else:
+        script(ROOT, name, overrides)
 
 
 def main() -> None:
@@ -103,13 +143,17 @@ def main() -> None:
     check_overrides([], ROOT / "conf", "train")  # the children share what Hydra looks up once
     gc.collect()
     gc.freeze()
+    children: dict[int, Child] = {}
     for line in sys.stdin:
-        children = [Child(partial(typed, order), Path(order["out"])) for order in json.loads(line)]
-        for child in children:
-            child.status(600)
-        for child in children:
-            child.kill()  # one that still works
-        print(json.dumps([child.status() for child in children]), flush=True)
+        order = json.loads(line)
+        if "pid" in order:
+            answer = children[order["pid"]].status(order["seconds"])
+        else:
+            child = Child(partial(typed, order), Path(order["out"]))
+            answer, children[child.pid] = child.pid, child
+        print(json.dumps(answer), flush=True)
+    for child in children.values():
+        child.kill()  # one that nobody waited for
 
 
 if __name__ == "__main__":

@@ -65,10 +65,10 @@ def test_load_gives_the_model_of_the_best_checkpoint(traffic: Path) -> None:
 
 
 def test_evaluate_beats_the_baselines_and_agrees_with_training(
-    started: Script, script: Script, traffic: Path, raw: Path, tmp_path: Path
+    script: Script, traffic: Path, raw: Path, tmp_path: Path
 ) -> None:
     best = traffic / "checkpoints" / "best.pt"
-    done = started("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path}")
+    done = script("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path}")
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     result = json.loads((traffic / "result.json").read_text())["summary"]
