@@ -44,7 +44,8 @@ MODELS = {
 }
 #: Every model but those of which another one tells as much; each is compiled for seconds.
 COMPILED = [
-    pytest.param(name, marks=pytest.mark.thorough if name == "nn_open" else ()) for name in MODELS
+    pytest.param(name, marks=pytest.mark.thorough if name.endswith("_open") else ())
+    for name in MODELS
 ]
 
 
