@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -24,6 +25,14 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("raw")
     demo_data(folder)
     return folder
+
+
+def examples(words: str) -> list[str]:
+    """The command lines in a script's words, continued lines joined."""
+    joined = words.replace("\\\n", " ")
+    lines = [line.strip() for line in joined.splitlines() if "scripts/" in line]
+    commands = [line for line in lines if re.match(r"(python|torchrun) ", line)]
+    return [re.sub(r"\s+", " ", line) for line in commands]
 
 
 def environment() -> dict[str, str]:

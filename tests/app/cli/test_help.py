@@ -15,10 +15,10 @@ from hydra.core.global_hydra import GlobalHydra
 from benchmarks import config as benchmark_config
 from nnode.app.cli.choices import choices, own_groups
 from nnode.app.cli.flags import read_command_line
-from nnode.app.cli.help import examples, help_text, remarks, script_words
+from nnode.app.cli.help import help_text, remarks, script_words
 from nnode.app.cli.run import check_overrides
 from nnode.config import SCHEMAS
-from tests.app.conftest import ROOT, Script, environment
+from tests.app.conftest import ROOT, Script, environment, examples
 
 CONF = ROOT / "conf"
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
