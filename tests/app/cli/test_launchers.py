@@ -140,9 +140,8 @@ def test_an_error_is_said_once(
     assert (first.stderr + second.stderr).count(message) == 1
 
 
-@pytest.mark.parametrize(
-    "launcher", ["cores", pytest.param("submitit_local", marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough  # every process loads all libraries
+@pytest.mark.parametrize("launcher", ["cores", "submitit_local"])
 def test_runs_of_a_sweep_in_other_processes(
     script: Script, prepared: str, tmp_path: Path, launcher: str
 ) -> None:

@@ -44,7 +44,7 @@ MODELS = {
 }
 #: Every model but those of which another one tells as much; each is compiled for seconds.
 COMPILED = [
-    pytest.param(name, marks=pytest.mark.thorough if name.endswith("_open") else ())
+    pytest.param(name, marks=() if name in ("sf", "nn", "nn_self") else pytest.mark.thorough)
     for name in MODELS
 ]
 
