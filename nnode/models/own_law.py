@@ -213,20 +213,24 @@ class FormulaLaw(_Own, Law):
         """W at a gap (m) where everybody drives at one speed, m/s; the least such speed of an
         acceleration that is not negative at rest, up to 100 m/s."""
         zero = torch.zeros_like(gap)
-        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "dt": zero + _STEP}
-        known |= dict.fromkeys(self.lane(self.name).starts, zero)
+        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
+        lane = self.lane(self.name).flat()
+
+        def says(v: Tensor) -> Tensor:
+            """The formula where everybody has driven at v for long."""
+            values = {**known, "v": v, "v_1": v, "dx_1": v, **dict.fromkeys(lane.starts, zero)}
+            begun = self.computed(list(lane.starts.values()), values)
+            values |= dict(zip(lane.starts, begun, strict=True))
+            return self.evaluated(values).expand_as(gap)
+
         if self.order == 1:
-            return self.evaluated(known).expand_as(gap)
-
-        def wants(v: Tensor) -> Tensor:
-            return self.evaluated({**known, "v": v, "v_1": v, "dx_1": v}).expand_as(gap)
-
+            return says(zero)
         low, high = zero, torch.full_like(gap, FASTEST)
         for _ in range(60):
             half = (low + high) / 2
-            faster = wants(half) > 0
+            faster = says(half) > 0
             low, high = torch.where(faster, half, low), torch.where(faster, high, half)
-        return torch.where(wants(zero) > 0, low, zero)
+        return torch.where(says(zero) > 0, low, zero)
 
     def forward(self, state: State) -> Tensor:
         raise ConfigError(
