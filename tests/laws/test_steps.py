@@ -90,8 +90,7 @@ def test_no_speed_is_ever_negative() -> None:
 
 
 def test_orders_of_accuracy_against_dop853() -> None:
-    """Errors of places fall with the step h: Runge and Kutta's as h⁴, the others' as h; of these
-    the ballistic ones are the smallest."""
+    """Errors of places fall with the step h: Runge and Kutta's as h⁴, the others' as h."""
     system, seconds = model("idm", leader="constant"), 4.0
     p, start, speed = numbers(system), np.array([0.0, 27.0, 55.0]), np.array([15.0, 13.0, 14.0])
 
@@ -113,8 +112,6 @@ def test_orders_of_accuracy_against_dop853() -> None:
     slopes = {m: np.polyfit(np.log(steps), np.log(e), 1)[0] for m, e in errors.items()}
     for method, order in {"euler": 1, "semi_implicit": 1, "ballistic": 1, "rk4": 4}.items():
         assert slopes[method] == pytest.approx(order, abs=0.3), (slopes, errors)
-    others = np.minimum(errors["euler"], errors["semi_implicit"])
-    assert (np.array(errors["ballistic"]) < others).all(), errors
 
 
 class Loop:
