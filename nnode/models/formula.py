@@ -257,6 +257,7 @@ def starts_of(
         values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
     values |= inputs_of(terms, lane, scene)
     values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
+    values["dt"] = y.new_tensor(scene.step)
     found = _starts(lane)(y, values, scene.follower, scene.leader, None)
     return {name: found[..., i] for i, name in enumerate(lane.rates) if name in lane.starts}
 
