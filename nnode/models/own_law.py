@@ -145,7 +145,13 @@ class FormulaLaw(_Own, Law):
         self.order = 1 if state == "x" else 2
         parts = {str(k): str(v) for k, v in (where or {}).items()}
         text, beside = str(text), False
-        if network is not None and not any(_CALLS.search(t) for t in (text, *parts.values())):
+        calls = any(_CALLS.search(t) for t in (text, *parts.values()))
+        if calls and network is None:
+            raise ConfigError(
+                f"model.law of {self.name} calls NN, a network: say how many neurons its hidden "
+                "layer has, as model.network=4"
+            )
+        if network is not None and not calls:
             text, beside = f"{text} + {_BESIDE[self.order]}", True
         self.formula = text  # type: ignore[misc]
         self.rule = Rule(

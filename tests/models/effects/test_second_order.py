@@ -290,6 +290,16 @@ def test_what_is_wrong_with_delays_states_and_constants_is_said(
         model(law)
 
 
+def test_networks_in_formulas_need_their_size() -> None:
+    law = {"parameters": {"c": "1 m/s²"}, "rate": {"v": "c*NN(gap/20)"}}
+    with pytest.raises(ConfigError, match=r"calls NN, a network: .*model\.network=4"):
+        model(law)
+    assert model(law, network=3).terms[0].network.sizes == (1, 3, 1)
+    twice = {**law, "rate": {"v": "c*NN(gap/20) - c*NN(v/10, dv/2)"}}
+    with pytest.raises(ConfigError, match=r"NN is called with \[1, 2\] inputs"):
+        model(twice, network=3)
+
+
 def test_a_law_with_an_unknown_entry_is_refused() -> None:
-    with pytest.raises(ConfigError, match="unknown entries delay; there are .*delayed"):
+    with pytest.raises(ConfigError, match=r"unknown entries delay; there are .*delayed"):
         model({**FIELD["idm"], "delay": {}})
