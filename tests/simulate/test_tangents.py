@@ -125,7 +125,7 @@ def test_of_the_field_s_laws(name: str) -> None:
     system = model(name)
     names = owned(system)
     if name == "gipps":
-        names = [n for n in names if n != "gipps__v0"]  # nobody is near it here
+        names = [n for n in names if n[7:] not in ("v0", "a")]  # nobody drives freely here
     compared(system, platoons(), [n for n in names if n != "krauss__v0"])
 
 
