@@ -145,7 +145,13 @@ class FormulaLaw(_Own, Law):
         self.order = 1 if state == "x" else 2
         parts = {str(k): str(v) for k, v in (where or {}).items()}
         text, beside = str(text), False
-        if network is not None and not any(_CALLS.search(t) for t in (text, *parts.values())):
+        calls = any(_CALLS.search(t) for t in (text, *parts.values()))
+        if calls and network is None:
+            raise ConfigError(
+                f"model.law of {self.name} calls NN, a network: say how many neurons its hidden "
+                "layer has, as model.network=4"
+            )
+        if network is not None and not calls:
             text, beside = f"{text} + {_BESIDE[self.order]}", True
         self.formula = text  # type: ignore[misc]
         self.rule = Rule(
@@ -213,20 +219,24 @@ class FormulaLaw(_Own, Law):
         """W at a gap (m) where everybody drives at one speed, m/s; the least such speed of an
         acceleration that is not negative at rest, up to 100 m/s."""
         zero = torch.zeros_like(gap)
-        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "dt": zero + _STEP}
-        known |= dict.fromkeys(self.lane(self.name).starts, zero)
+        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
+        lane = self.lane(self.name).flat()
+
+        def says(v: Tensor) -> Tensor:
+            """The formula where everybody has driven at v for long."""
+            values = {**known, "v": v, "v_1": v, "dx_1": v, **dict.fromkeys(lane.starts, zero)}
+            begun = self.computed(list(lane.starts.values()), values)
+            values |= dict(zip(lane.starts, begun, strict=True))
+            return self.evaluated(values).expand_as(gap)
+
         if self.order == 1:
-            return self.evaluated(known).expand_as(gap)
-
-        def wants(v: Tensor) -> Tensor:
-            return self.evaluated({**known, "v": v, "v_1": v, "dx_1": v}).expand_as(gap)
-
+            return says(zero)
         low, high = zero, torch.full_like(gap, FASTEST)
         for _ in range(60):
             half = (low + high) / 2
-            faster = wants(half) > 0
+            faster = says(half) > 0
             low, high = torch.where(faster, half, low), torch.where(faster, high, half)
-        return torch.where(wants(zero) > 0, low, zero)
+        return torch.where(says(zero) > 0, low, zero)
 
     def forward(self, state: State) -> Tensor:
         raise ConfigError(

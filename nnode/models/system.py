@@ -65,12 +65,16 @@ class System(nn.Module):
             )
         return Scene.of(batch, self.wall_spacing)
 
-    def initial(self, batch: Batch) -> Tensor:
-        """``(B, N, order * D)``: the measured state at the first sample."""
-        start = [batch.x[0], batch.v[0]][: self.order]
-        return torch.cat([*start, *self._memories(batch)], -1)
+    def initial(self, batch: Batch, step: float | None = None) -> Tensor:
+        """``(B, N, order * D)``: the measured state at the first sample.
 
-    def _memories(self, batch: Batch) -> list[Tensor]:
+        Args:
+            step: s, of the solver, for laws whose formula names it.
+        """
+        start = [batch.x[0], batch.v[0]][: self.order]
+        return torch.cat([*start, *self._memories(batch, step)], -1)
+
+    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
         """``(B, N, M)`` additional states at the start, term by term."""
         x, v = batch.x[0], batch.v[0]
         return [term.remember(x, v, self) for term in self._terms() if term.memory]
@@ -166,12 +170,13 @@ class Traffic(System):
         """The model's formula; None where a term is code without one."""
         return lane_of(self._terms())
 
-    def _memories(self, batch: Batch) -> list[Tensor]:
+    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
         lane = self.lane
         if lane is None or not lane.starts:
-            return super()._memories(batch)
-        x, v, terms = batch.x[0], batch.v[0], self._terms()
-        known = starts_of(terms, lane, x, v, self.scene(batch))
+            return super()._memories(batch, step)
+        x, v, terms, scene = batch.x[0], batch.v[0], self._terms(), self.scene(batch)
+        scene = scene if step is None else replace(scene, step=step)
+        known = starts_of(terms, lane, x, v, scene)
         told = [t.remember(x, v, self) for t in terms if t.memory and not begins(t, self.order)]
         others = iter(torch.cat(told, -1).unbind(-1) if told else ())
         added = list(lane.rates)[self.order :]
@@ -258,12 +263,14 @@ class _Initial(nn.Module):
         super().__init__()
         self.system = system
 
-    def forward(self, batch: Batch) -> Tensor:
-        return self.system.initial(batch)
+    def forward(self, batch: Batch, step: float | None) -> Tensor:
+        return self.system.initial(batch, step)
 
 
-def initial_with(system: System, parameters: Mapping[str, Tensor], batch: Batch) -> Tensor:
+def initial_with(
+    system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
+) -> Tensor:
     """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
     own = {f"system.{name}": value for name, value in parameters.items()}
-    found: Tensor = functional_call(_Initial(system), own, (batch,))
+    found: Tensor = functional_call(_Initial(system), own, (batch, step))
     return found
