@@ -36,6 +36,7 @@ from nnode.data.options import (
 )
 from nnode.discover.options import DiscoverOptions
 from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
 from nnode.models.options import (
     FormulaOptions,
     LawOptions,
@@ -127,6 +128,10 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "formula_schema"): FormulaOptions(term="formula"),
     ("model", "idm_schema"): FormulaOptions(term="formula", law=FIELD["idm"]),
+    **{
+        ("model", f"{name}_schema"): FormulaOptions(term="formula", law=law)
+        for name, law in PEOPLE.items()
+    },
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),
     ("model", "network_force_schema"): NetworkForceOptions(term="network_force"),

@@ -5,14 +5,15 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterator
 
-from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
+from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Rule
 from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.base import Effect
 from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
 from nnode.models.formula import rule_of
-from nnode.models.own_law import FormulaLaw, law_from
+from nnode.models.own_law import FormulaForce, FormulaLaw, law_from
 from nnode.models.term import Interval, Term
 
 
@@ -35,6 +36,8 @@ def lines() -> Iterator[str]:
             yield "Forces on people"
             for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
                 yield from _of(force, "dv/dt = ")
+            for name, description in PEOPLE.items():
+                yield from _of(law_from(name, description), "")
         yield title
         for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
             yield from _of(effect(), "W becomes " if domain == "traffic" else "")
@@ -43,7 +46,11 @@ def lines() -> Iterator[str]:
 def _of(term: Term, left: str) -> Iterator[str]:
     rule = rule_of(term)
     networks = isinstance(term, NetworkSpeed | NetworkForce)
-    about = "" if isinstance(term, FormulaLaw) else (inspect.getdoc(term) or "").splitlines()[0]
+    about = (
+        ""
+        if isinstance(term, FormulaLaw | FormulaForce)
+        else (inspect.getdoc(term) or "").splitlines()[0]
+    )
     yield f"  {term.name}: {about}".rstrip()
     if rule is None or networks:
         yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
@@ -57,10 +64,10 @@ def _of(term: Term, left: str) -> Iterator[str]:
 def _ruled(rule: Rule | CrowdRule, left: str) -> Iterator[str]:
     if isinstance(rule, CrowdRule):
         for axis, text in zip("xy", rule.rate, strict=True):
-            yield f"    dv{axis}/dt: + {text}"
-        for over, what in ((OTHERS, "others"), (POINTS, "wall points"), (WALLS, "walls")):
+            yield f"    dv{axis}/dt: + {text}" if rule.order == 2 else f"    d{axis}/dt = {text}"
+        for over, what in _REDUCED.items():
             for name, (_, text) in getattr(rule, over).items():
-                yield f"    {name} = sum over {what} of {text}"
+                yield f"    {name} = {what} of {text}"
     else:
         yield f"    {left}{rule.rate}" if rule.rate else f"    a leader's W becomes {rule.leader}"
         for name, (_, rate) in rule.states.items():
@@ -71,6 +78,12 @@ def _ruled(rule: Rule | CrowdRule, left: str) -> Iterator[str]:
         yield f"    {name} = {value:g} {'' if unit == '1' else unit}".rstrip()
     for name, unit in rule.inputs.items():
         yield f"    {name}: of each agent, from the data{'' if unit == '1' else f' ({unit})'}"
+
+
+_REDUCED = {
+    "others": "sum over others", "points": "sum over wall points", "walls": "sum over walls",
+    "smallest": "smallest over others", "largest": "largest over others",
+}  # fmt: skip
 
 
 def _bounds(interval: Interval | None) -> str:

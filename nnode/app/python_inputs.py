@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from nnode.data.options import TableOptions
 from nnode.errors import ConfigError
 from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
 
 #: Models by the names that ``conf/model`` gives them.
 MODELS: dict[str, dict[str, Any]] = {
@@ -21,6 +22,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "n4": {"term": "network_speed", "hidden": 4},
     "n10": {"term": "network_speed", "hidden": 10},
     "idm": {"term": "formula", "law": FIELD["idm"]},
+    **{name: {"term": "formula", "law": law} for name, law in PEOPLE.items()},
     "formula": {"term": "formula"},
     "sf": {"term": "social_force"},
     "nn": {"term": "network_force"},

@@ -167,6 +167,9 @@ class JuelichOptions(DataOptions):
     view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
     velocity: Velocity = Velocity.forward
     min_agents: int = 1  # fewest people in a sequence
+    # s before a sequence in which preferred velocities are measured, for model.desired=direction;
+    # 0 measures none. Who is not tracked so long before has the velocity of his first sample
+    history: float = 1.0
 
 
 @dataclass
