@@ -23,7 +23,7 @@ def schema(dims: int) -> pa.Schema:
     units |= {f"preferred_{a}": "m/s" for a in axes}
     order = ["sequence", "recording", "time", "agent", *axes, *(f"v{a}" for a in axes)]
     order += ["length", "kind", "group", *(f"dest_{a}" for a in axes)]
-    order += [f"preferred_{a}" for a in axes]
+    order += [f"preferred_{a}" for a in axes if dims > 1]
     return pa.schema(
         [
             pa.field(name, pa.float64(), metadata={"unit": units[name]})
@@ -98,7 +98,7 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
         return np.array(column.to_numpy()).reshape(k, n)
 
     def vectors(prefix: str) -> np.ndarray | None:
-        columns = [numbers(prefix + axis) for axis in _AXES if axis in table.column_names]
+        columns = [numbers(prefix + a) for a in _AXES if prefix + a in table.column_names]
         found = [column for column in columns if column is not None]
         return np.stack(found, axis=-1) if found else None
 
