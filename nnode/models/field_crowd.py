@@ -35,8 +35,9 @@ PEOPLE: dict[str, dict[str, Any]] = {
         "rate": {"x": "V*to_x/size", "y": "V*to_y/size"},
         "source": "Tordeux, Chraibi & Seyfried 2016: speed V(s_i) and direction e_i",
     },
-    # simplified: bodies' distance is at least d_min and the force fades before r_c, where the
-    # source interpolates by polynomials; the other's ellipse has one's own preferred speed
+    # simplified: bodies' distance is at least d_min, a force at most f_max, and it fades before
+    # r_c, where the source interpolates by polynomials; the other's ellipse has one's own
+    # preferred speed
     "gcfm": {
         "parameters": {
             "eta": {"value": "0.2", "low": "0", "high": "5"},
@@ -45,6 +46,7 @@ PEOPLE: dict[str, dict[str, Any]] = {
         "constants": {
             "a_min": "0.18 m", "tau_a": "0.53 s", "b_min": "0.2 m", "b_max": "0.25 m",
             "d_min": "0.1 m", "r_c": "2 m", "fade": "0.5 m", "v_min": "0.1 m/s",
+            "f_max": "9 m/s²",
         },
         "where": {
             **_DRIVE,
@@ -62,21 +64,22 @@ PEOPLE: dict[str, dict[str, Any]] = {
             "its_r": "its_a*its_b/sqrt((its_b*its_c)**2 + its_a**2*max(1 - its_c**2, 0))",
             "between": "max(d - own_r - its_r, d_min)",
             "near": "clip((r_c - d)/fade, 0, 1)",
-            "push": "near*sees*(eta*pace + closing)**2/between",
+            "push": "near*min(sees*(eta*pace + closing)**2/between, f_max)",
         },
         "others": {"push_x": "push*n_x", "push_y": "push*n_y"},
         "rate": {"vx": "drive_to_x + push_x", "vy": "drive_to_y + push_y"},
         "source": "Chraibi, Seyfried & Schadschneider 2010: driving and repulsive force, ellipse",
     },
     # E(time) = k/time² exp(-time/t0), F = -dE/dx; times below t_min count as t_min, who overlaps
-    # has the radius by which they do, and the sum is at most cap
+    # has the radius by which they do, the sum is at most cap, and the force of who would just
+    # touch, which is infinite in the source, fades where (bodies' width times speed)² is graze
     "ttc": {
         "parameters": {
             "k": {"value": "1.5 m²", "low": "0 m²", "high": "50 m²"},
             "t0": {"value": "3 s", "low": "0.2 s", "high": "20 s"},
             "tau": {"value": "0.54 s", **_TAU},
         },
-        "constants": {"t_min": "0.2 s", "cap": "20 m/s²", "graze": "1e-4 m⁴/s²"},
+        "constants": {"t_min": "0.2 s", "cap": "20 m/s²", "graze": "0.01 m⁴/s²"},
         "where": {
             **_DRIVE,
             "bodies": "choose(2*r - d, 2*r - d, 2*r)",
@@ -84,10 +87,11 @@ PEOPLE: dict[str, dict[str, Any]] = {
             "closing": "-(dx*dvx + dy*dvy)",
             "room": "max(d**2 - bodies**2, 0)",
             "inside": "closing**2 - fast*room",
-            "root": "sqrt(max(inside, graze))",
+            "root": "sqrt(max(inside, 1e-6*graze))",
             "time": "max(room/(max(closing, 0) + root), t_min)",
             "strength": "k*exp(-time/t0)/time**2*(2/time + 1/t0)/fast",
-            "meets": "choose(closing, choose(inside, strength, 0), 0)",
+            "fade": "max(inside, 0)/(max(inside, 0) + graze)",
+            "meets": "choose(closing, fade*strength, 0)",
             "size": "sqrt(f_x**2 + f_y**2 + (1e-6*cap)**2)",
             "less": "cap/max(size, cap)",
         },
