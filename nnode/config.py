@@ -44,7 +44,7 @@ from nnode.models.options import (
     NetworkSpeedOptions,
     SocialForceOptions,
 )
-from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
+from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions, WalkingStudyOptions
 
 
 @dataclass
@@ -151,6 +151,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "cbo_schema"): ConsensusOptions,
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
+    ("study", "walking_study_schema"): WalkingStudyOptions,
 }
 
 

@@ -77,6 +77,7 @@ PEOPLE: dict[str, dict[str, Any]] = {
         "parameters": {
             "k": {"value": "1.5 m²", "low": "0 m²", "high": "50 m²"},
             "t0": {"value": "3 s", "low": "0.2 s", "high": "20 s"},
+            "r": {"value": "0.25 m", "low": "0.05 m", "high": "0.4 m"},
             "tau": {"value": "0.54 s", **_TAU},
         },
         "constants": {"t_min": "0.2 s", "cap": "20 m/s²", "graze": "0.01 m⁴/s²"},

@@ -48,11 +48,11 @@ def sequences(folder: str) -> tuple[Sequence, ...]:
     return tuple(s for s in Store(folder) if s.preferred is not None)
 
 
-def chosen(folders: Iterable[str], held: str, *, test: bool) -> list[Batch]:
-    """The sequences of one run, or of all others, as one batch of each experiment."""
-    found = []
+def chosen(folders: Iterable[str], held: Iterable[str], *, test: bool) -> list[Batch]:
+    """The sequences of some runs, or of all others, as one batch of each experiment."""
+    found, runs = [], set(held)
     for folder in folders:
-        mine = [s for s in sequences(folder) if (s.recording == held) == test]
+        mine = [s for s in sequences(folder) if (s.recording in runs) == test]
         if mine:
             batch = collate(mine)
             assert batch.preferred is not None

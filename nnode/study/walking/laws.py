@@ -24,12 +24,15 @@ LAWS: dict[str, dict[str, Any]] = {
     },
     **{name: PEOPLE[name] for name in ("esf", "ttc", "gcfm", "cfsm")},
 }
-#: Further starts of a calibration beside the law's own, which may lie in another valley.
-STARTS: dict[str, tuple[dict[str, float], ...]] = {
-    "exponential": ({"A": 0.1},),
-    "esf": ({"A": 0.1}, {"A": 0.1, "lam": 1.0}),
-    "ttc": ({"k": 0.02}, {"k": 0.2}),
-    "cfsm": ({"T": 0.3, "l": 0.2},),
+#: Values of parameters from all combinations of which a calibration chooses its starts: forces that
+#: jump where people just touch leave many valleys.
+GRID: dict[str, dict[str, tuple[float, ...]]] = {
+    "alone": {},
+    "exponential": {"A": (0.05, 0.2, 1.0), "B": (0.1, 0.2, 0.5)},
+    "esf": {"A": (0.05, 0.2, 1.0), "B": (0.15, 0.3), "stride": (0.3, 1.0), "lam": (0.06, 1.0)},
+    "ttc": {"k": (0.005, 0.02, 0.1, 0.5), "r": (0.05, 0.1, 0.2), "t0": (1.0, 3.0)},
+    "gcfm": {"eta": (0.05, 0.3), "tau": (0.1, 0.5)},
+    "cfsm": {"T": (0.3, 0.6, 1.0), "l": (0.1, 0.25), "a": (1.0, 5.0), "D": (0.05, 0.15, 0.3)},
 }
 #: How the page calls them.
 LABELS = {

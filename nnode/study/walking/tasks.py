@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,21 +19,22 @@ from nnode.models.scene import Scene, wanted
 from nnode.models.system import System
 from nnode.solvers.fused.engine import FusedSolver
 from nnode.study.walking.data import chosen
-from nnode.study.walking.laws import STARTS, new_system
+from nnode.study.walking.laws import GRID, new_system
 
 Result = dict[str, Any]
-#: Steps of the calibration at most.
-STEPS = 20
+Predict = Callable[[Batch], Tensor]
+#: Steps of a calibration at most, and how many of the best starts go on.
+STEPS, BEST = 12, 2
 
 
-def fit(law: str, desired: str, folders: list[str], held: str) -> Result:
-    """Calibrate a law on all runs but one, and evaluate it on that one.
+def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
+    """Calibrate a law on all runs but some, and evaluate it on those.
 
     Args:
         law: of :data:`nnode.study.walking.laws.LAWS`.
         desired: where people want to go.
         folders: of the prepared data.
-        held: recording that is left out.
+        held: recordings that are left out.
     """
     system = new_system(law, desired)
     train = chosen(folders, held, test=False)
@@ -38,32 +42,39 @@ def fit(law: str, desired: str, folders: list[str], held: str) -> Result:
     first = costs[0]
     names = [name for name, _ in system.terms[0].named_parameters()]
     own = dict(zip(names, first.row(system).tolist(), strict=True))
-    begin = [own, *({**own, **more} for more in STARTS.get(law, ()))]
+    grid = [dict(zip(GRID[law], each, strict=True)) for each in product(*GRID[law].values())]
+    starts = [np.array(list({**own, **more}.values())) for more in [{}, *grid]]
+    away = residuals(costs)
+    starts.sort(key=lambda row: _square(away(row)))
     minima = [
-        least_squares(
-            residuals(costs), np.array(list(start.values())), first.low.numpy(),
-            first.high.numpy(), steps=STEPS, least=0.1,
-        )
-        for start in begin
-    ]  # fmt: skip
+        least_squares(away, row, first.low.numpy(), first.high.numpy(), steps=STEPS)
+        for row in starts[:BEST]
+    ]
     found = min(minima, key=lambda one: one.cost)
     first.fill_(system, torch.from_numpy(found.row))
     return {
         "row": dict(zip(names, found.row.tolist(), strict=True)),
         "train": found.cost,
         "starts": [one.cost for one in minima],
-        "evaluations": sum(one.evaluations for one in minima),
-        **_errors(simulated(system), chosen(folders, held, test=True)),
+        "evaluations": len(starts) + sum(one.evaluations for one in minima),
+        "errors": _of_runs(simulated(system), folders, held),
     }
 
 
-def baselines(folders: list[str], held: str) -> Result:
-    """Errors of predictions that need no calibration, by name."""
-    test = chosen(folders, held, test=True)
+def baselines(folders: list[str], held: list[str]) -> Result:
+    """Errors of predictions that need no calibration, by name and run."""
     return {
-        "constant_velocity": _errors(lambda batch: straight(batch, batch.v[0]), test),
-        "preferred": _errors(lambda batch: straight(batch, along_stream(batch)), test),
+        "constant_velocity": _of_runs(lambda b: straight(b, b.v[0]), folders, held),
+        "preferred": _of_runs(lambda b: straight(b, along_stream(b)), folders, held),
     }
+
+
+def _of_runs(x: Predict, folders: list[str], runs: list[str]) -> Result:
+    return {run: _errors(x, chosen(folders, [run], test=True)) for run in runs}
+
+
+def _square(values: Tensor | None) -> float:
+    return math.inf if values is None else float(values.square().sum())
 
 
 def residuals(costs: list[EnsembleCost]) -> Residuals:
@@ -87,7 +98,7 @@ def residuals(costs: list[EnsembleCost]) -> Residuals:
     return found
 
 
-def simulated(system: System) -> Any:
+def simulated(system: System) -> Predict:
     """A batch to positions ``(K, B, N, 2)``."""
 
     def x(batch: Batch) -> Tensor:
@@ -110,7 +121,7 @@ def straight(batch: Batch, velocity: Tensor) -> Tensor:
     return batch.x[:1] + time[:, None, None, None] * velocity
 
 
-def _errors(x: Any, batches: list[Batch]) -> Result:
+def _errors(x: Predict, batches: list[Batch]) -> Result:
     """Squared distances (m²), means over people: over a sequence and at its end."""
     whole, end = [], []
     for batch in batches:
@@ -120,9 +131,10 @@ def _errors(x: Any, batches: list[Batch]) -> Result:
         last = batch.valid.sum(0).clamp(min=1) - 1
         whole.append(((square[1:] * batch.valid[1:]).sum(0) / samples)[people])
         end.append(square.gather(0, last[None])[0][people])
-    count = sum(len(part) for part in whole)
+    if not whole:
+        return {"people": 0, "mean": 0.0, "end": 0.0}
     return {
-        "people": count,
+        "people": sum(len(part) for part in whole),
         "mean": float(torch.cat(whole).mean()),
         "end": float(torch.cat(end).mean()),
     }
