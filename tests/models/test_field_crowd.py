@@ -126,7 +126,7 @@ def test_the_power_law_is_the_gradient_of_its_energy() -> None:
 
     apart, h = one.x[0, 0] - one.x[0, 1], 1e-5
     wanted = [-(energy(apart + h * u) - energy(apart - h * u)) / (2 * h) for u in np.eye(2)]
-    found, v = force(model("ttc", k=k, t0=t0), one), one.v[0, 0] - one.v[0, 1]  # type: ignore[index]
+    found, v = force(model("ttc", k=k, t0=t0, r=R), one), one.v[0, 0] - one.v[0, 1]  # type: ignore[index]
     # the formula's own factor, which takes the infinite force from who would just touch
     inside = (apart @ v) ** 2 - v @ v * (apart @ apart - 4 * R**2)
     np.testing.assert_allclose(found[0] * (inside + 0.01) / inside, wanted, rtol=1e-5)
