@@ -15,6 +15,8 @@ from nnode.study.options import WalkingStudyOptions
 from nnode.study.statistics import Paired, paired
 from nnode.study.walking.laws import DESIRED, LABELS, LAWS, SIMPLE
 
+#: Of a test.
+LEVEL = 0.05
 #: What the wish is called.
 WISHES = {
     "direction": "the direction of the stream and the speed of the second before",
@@ -50,8 +52,8 @@ class Walking:
         """A comparison of two models on the same people; runs are what is drawn."""
         one, two = (self.errors(m, desired, horizon) for m in (model, other))
         number = [int(one[run]["people"]) for run in one]
-        values = [np.repeat([e[run]["mean"] for run in one], number) for e in (one, two)]
-        return paired(*values, np.repeat(np.arange(len(one)), number), self.options.seed)
+        first, second = (np.repeat([e[run]["mean"] for run in one], number) for e in (one, two))
+        return paired(first, second, np.repeat(np.arange(len(one)), number), self.options.seed)
 
 
 def blocks(study: Walking) -> list[Block]:
@@ -100,11 +102,10 @@ def _wish(study: Walking, desired: str) -> list[Block]:
             rows.append((LABELS[model], h, one.difference, one.low, one.high, one.p))
     names = ["model", "horizon (s)", "difference", "low", "high", "p"]
     table = pd.DataFrame(rows, columns=names).set_index("model")
-    low, high = (pd.DataFrame(np.full(mean.shape, np.nan), index, columns) for _ in range(2))
-    for label, h, _, least, most, _ in rows:
-        column = f"{h:g} s"
-        low.loc[label, column] = mean.loc[LABELS["alone"], column] + least
-        high.loc[label, column] = mean.loc[LABELS["alone"], column] + most
+    free = [study.error("alone", desired, h) for h in horizons]
+    ends = np.array([row[3:5] for row in rows]).reshape(len(models) - 1, len(horizons), 2)
+    ends = np.concatenate([np.full((1, len(horizons), 2), np.nan), ends + np.array(free)[:, None]])
+    low, high = (pd.DataFrame(ends[..., k], index, columns) for k in range(2))
     return [
         Heading(f"Where people want to go: {desired}"),
         Text(f"Everybody knows {WISHES[desired]}."),
@@ -149,11 +150,13 @@ def _summary(study: Walking) -> str:
             best = min(models, key=lambda m: study.error(m, desired, h))
             one = study.against(best, "alone", desired, h)
             base = study.error("alone", desired, h)
-            said = "better than" if one.high < 0 else "worse than" if one.low > 0 else "as good as"
+            told = one.p < LEVEL and not one.low <= 0 <= one.high
+            said = ("better" if one.high < 0 else "worse") + " than that"
             lines.append(
                 f"- *{desired}*, {h:g} s: {base:.4f} m² without interaction; the best law, "
-                f"{LABELS[best]}, is {said} that ({one.difference:+.4f} m², 95 % {one.low:+.4f} "
-                f"to {one.high:+.4f}; chosen on the same runs)."
+                f"{LABELS[best]}, {f'is {said}' if told else 'cannot be told from that'} "
+                f"({one.difference:+.4f} m², 95 % {one.low:+.4f} to {one.high:+.4f}, "
+                f"p = {one.p:.3f}; chosen on the same runs)."
             )
     return "\n".join(lines)
 
