@@ -6,14 +6,15 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
+from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Rule
 from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.base import Effect
 from nnode.models.field import FIELD, NEURONS
+from nnode.models.field_crowd import PEOPLE
 from nnode.models.formula import rule_of
-from nnode.models.own_law import FormulaLaw, law_from
+from nnode.models.own_law import FormulaForce, FormulaLaw, law_from
 from nnode.models.term import Interval, Term
 
 
@@ -36,6 +37,8 @@ def lines() -> Iterator[str]:
             yield "Forces on people"
             for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
                 yield from _of(force, "dv/dt = ")
+            for name, description in PEOPLE.items():
+                yield from _of(law_from(name, description), "")
         yield title
         for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
             yield from _of(effect(), "W becomes " if domain == "traffic" else "")
@@ -44,7 +47,11 @@ def lines() -> Iterator[str]:
 def _of(term: Term, left: str) -> Iterator[str]:
     rule = rule_of(term)
     networks = isinstance(term, NetworkSpeed | NetworkForce)
-    about = "" if isinstance(term, FormulaLaw) else (inspect.getdoc(term) or "").splitlines()[0]
+    about = (
+        ""
+        if isinstance(term, FormulaLaw | FormulaForce)
+        else (inspect.getdoc(term) or "").splitlines()[0]
+    )
     yield f"  {term.name}: {about}".rstrip()
     if networks or (rule is None and term.second is None):
         yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
@@ -72,10 +79,10 @@ def _ruled(
     told = told or Rule()
     if isinstance(rule, CrowdRule):
         for axis, text in zip("xy", rule.rate, strict=True):
-            yield f"    dv{axis}/dt: + {text}"
-        for over, what in ((OTHERS, "others"), (POINTS, "wall points"), (WALLS, "walls")):
+            yield f"    dv{axis}/dt: + {text}" if rule.order == 2 else f"    d{axis}/dt = {text}"
+        for over, what in _REDUCED.items():
             for name, (_, text) in getattr(rule, over).items():
-                yield f"    {name} = sum over {what} of {text}"
+                yield f"    {name} = {what} of {text}"
     else:
         yield f"    {left}{rule.rate}" if rule.rate else f"    a leader's W becomes {rule.leader}"
         for name, (text, _, delay) in rule.delayed.items():
@@ -93,6 +100,12 @@ def _ruled(
 
 def _new(parts: Mapping[str, Any], told: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return [(name, part) for name, part in parts.items() if told.get(name) != part]
+
+
+_REDUCED = {
+    "others": "sum over others", "points": "sum over wall points", "walls": "sum over walls",
+    "smallest": "smallest over others", "largest": "largest over others",
+}  # fmt: skip
 
 
 def _bounds(interval: Interval | None) -> str:

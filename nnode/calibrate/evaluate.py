@@ -13,7 +13,7 @@ from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs, squared_
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.laws.lane import Rule
-from nnode.models import FollowTheLeader, Relaxation, System, Traffic
+from nnode.models import Crowd, FollowTheLeader, Relaxation, System, Traffic
 from nnode.models.own_law import FormulaForce
 from nnode.models.term import Term
 from nnode.solvers.base import Solver, Trajectory
@@ -181,7 +181,8 @@ def no_interaction(system: System, solver: Solver, free_speed: float | None) -> 
     else:
         kept: list[Term] = [t for t in system.terms if isinstance(t, Relaxation)]
         kept += [t.alone() for t in system.terms if isinstance(t, FormulaForce)]
-        bare = type(system)(kept, system.wall_spacing)
+        assert isinstance(system, Crowd)
+        bare = Crowd(kept, system.wall_spacing, desired=system.desired)
     bare.to(next(system.parameters()))
     return lambda batch: solver(bare, batch)
 

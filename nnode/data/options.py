@@ -243,6 +243,9 @@ class JuelichOptions(DataOptions):
     # {name: {line: [x1, y1, x2, y2], direction: +x}}, m: destinations on exit lines, by where
     # people walk (+x | -x | +y | -y | [x, y]); null: their last position in the sequence
     exits: Any = None
+    # s before a sequence in which preferred velocities are measured, for model.desired=direction;
+    # 0 measures none. Who is not tracked so long before has the velocity of his first sample
+    history: float = 1.0
 
 
 @dataclass

@@ -12,9 +12,10 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
+from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Lane
 from nnode.models.formula import Law, begins, lane_of, rates_of, starts_of
-from nnode.models.scene import Scene
+from nnode.models.scene import DESIRED, Scene, wanted
 from nnode.models.term import Interval, State, Term, physical_parameters, short_names
 
 T = TypeVar("T", bound=Term)
@@ -228,9 +229,11 @@ class Traffic(System):
 
 
 class Crowd(System):
-    """Second order, two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms.
+    """Two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms; or dx_i/dt, of a law of
+    first order.
 
     Args:
+        desired: where people want to go, see :func:`nnode.models.scene.desired`.
         neighbours: ``simulated``: people react to each other's simulated states;
             ``measured``: each is simulated alone among the measured paths of the others.
     """
@@ -240,14 +243,29 @@ class Crowd(System):
     dim = 2
 
     def __init__(
-        self, terms: Iterable[Term], wall_spacing: float = 0.25, neighbours: str = "simulated"
+        self,
+        terms: Iterable[Term],
+        wall_spacing: float = 0.25,
+        neighbours: str = "simulated",
+        desired: str = "last",
     ) -> None:
         super().__init__(terms, wall_spacing)
+        if desired not in DESIRED:
+            raise ValueError(f"desired={desired} is unknown, expected {', '.join(DESIRED)}")
+        self.desired = desired
+        if any(isinstance(rule := term.rule, CrowdRule) and rule.order == 1 for term in terms):
+            self.order = 1
         if neighbours not in ("simulated", "measured"):
             raise ValueError(f"neighbours={neighbours} is unknown, expected simulated or measured")
         self.neighbours = neighbours
 
+    def scene(self, batch: Batch) -> Scene:
+        return wanted(super().scene(batch), batch, self.desired)
+
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
+        if self.order == 1:
+            seen = (scene.measured_at(t),) * 2 if self.neighbours == "measured" else None
+            return self._rates(State(t, y, None, scene, seen=seen), None)[0]
         x, v, memory = y[..., :2], y[..., 2:4], y[..., 4:]
         seen = None
         if self.neighbours == "measured":
