@@ -19,11 +19,11 @@ from nnode.app.cli.sweep import RESULT
 from nnode.app.cli.typed import shell_override
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.damped import GaussNewton
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.interrupt import Interrupted
 from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
+from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.calibrate.options import (
     FusedOptions,
     SolverOptions,

@@ -19,14 +19,14 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from nnode.calibrate.adadelta import NoisyAdadelta
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.cost import sequence_costs
-from nnode.calibrate.damped import GaussNewton
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import evaluate
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.calibrate.logbook import Logbook
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
+from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.calibrate.options import Monitor, TrainerOptions
 from nnode.calibrate.progress import Reporter
 from nnode.data.dataset import EpochSampler
@@ -226,7 +226,7 @@ class Trainer:
 
         if isinstance(self.optimizer, GaussNewton):
             if self.world.size > 1 or batch is None:
-                raise ConfigError("optimizer=gauss_newton works in one process; start only one")
+                raise ConfigError("optimizer=gauss_newton works in one process only")
             self.optimizer.attach(self.solver, batch, self.options.cost)
             self.sum += self.optimizer.step()
             self.model.project_()
@@ -364,9 +364,8 @@ class Trainer:
             self._draw(logbook)
 
     def _stalled(self) -> bool:
-        if isinstance(self.optimizer, GaussNewton) and self.optimizer.converged:
-            return True
-        return self.options.patience is not None and self.stale >= self.options.patience
+        done = isinstance(self.optimizer, GaussNewton) and self.optimizer.converged
+        return done or (self.options.patience is not None and self.stale >= self.options.patience)
 
     def _note(self) -> str:
         return f"epoch {self.epoch + 1}, best {self.options.monitor.value} cost {self.best:.4g}"

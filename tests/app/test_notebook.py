@@ -12,6 +12,8 @@ import pytest
 import nnode
 from nnode.app.python_inputs import named
 from nnode.errors import ConfigError, DataError
+from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
 from tests.discover.platoons import LENGTH, V0, platoons
 
 
@@ -44,7 +46,8 @@ def test_three_lines_find_the_law(table: pd.DataFrame, tmp_path: Path) -> None:
 
 def test_models_bear_the_names_of_the_configuration() -> None:
     files = {p.stem for p in (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")}
-    assert {"lin", "log", "n2", "n4", "n10", "idm", "formula", "sf", "nn"} == files
+    own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
+    assert own | set(FIELD) | set(PEOPLE) == files
     assert all(named(name)["name"] == name for name in files)
     with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of lin, log"):
         named("lwr")

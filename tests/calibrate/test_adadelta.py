@@ -12,7 +12,7 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
-from nnode.calibrate.adadelta import NoisyAdadelta
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 
 
 def parameter(*values: float) -> nn.Parameter:

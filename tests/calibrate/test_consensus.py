@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nnode.calibrate.consensus import ConsensusBased
+from nnode.calibrate.optimizers.consensus import ConsensusBased
 
 MINIMUM = torch.tensor([0.7, -0.4], dtype=torch.float64)
 BAD_START = (3.6, -3.5)

@@ -7,8 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from nnode.calibrate.adadelta import NoisyAdadelta
-from nnode.calibrate.consensus import ConsensusBased
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
@@ -19,6 +17,8 @@ from nnode.calibrate.optimizers import (
     build_optimizer,
     needs_full_batch,
 )
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
+from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models import Linear, Traffic

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.adadelta import NoisyAdadelta
-from nnode.calibrate.consensus import ConsensusBased
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.evaluate import best_common_speed, constant_velocity, no_interaction
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
+from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.quasi_newton import minimise, optimality_residual
 from nnode.data.sequence import Batch
 from nnode.solvers.fused.engine import FusedSolver

@@ -32,7 +32,7 @@ def _schemas() -> None:
         (["modle=lin"], "did you mean model"),
         (["trainr.max_epochs=3"], r"did you mean trainer\.max_epochs"),
         (["~trainer.patience"], "cannot be deleted"),
-        (["model=n5"], "expected one of formula, idm, lin, log, n2, n4, n10, nn, sf"),
+        (["model=n5"], "expected one of a2, a4, a10, cfsm, esf, formula, fvdm"),
         (["model=lin_schema"], "model=lin_schema is unknown"),
         (["model.hidden=3"], "option model.hidden is unknown"),
         (["model=n4", "model.hiden=3"], "did you mean model.hidden"),
@@ -87,7 +87,7 @@ def test_every_group_of_every_script_composes(name: str) -> None:
 def test_the_fused_solver_gets_its_options() -> None:
     solver = build_solver(FusedOptions(dt=0.01, threads=2, cutoff=2.5, cutoff_error=1e-6))
     assert isinstance(solver, FusedSolver)
-    given = {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6}
+    given = {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6, "method": None}
     assert vars(solver) == {**given, "uncompiled": ""}
     with pytest.raises(ConfigError, match=r"solver\.cutoff_error=2 must be"):
         build_solver(FusedOptions(cutoff_error=2))

@@ -66,8 +66,8 @@ WRONG = [
     # names
     ("train modle=lin", "did you mean model?"),
     ("train model=linn", "did you mean lin?"),
-    ("train model=null", "expected one of formula, idm, lin, log, n2, n4, n10, nn, sf"),
-    ("train optimizer=sgd", "expected one of adadelta, adam, cbo, lbfgs"),
+    ("train model=null", "expected one of a2, a4, a10, cfsm, esf, formula, fvdm"),
+    ("train optimizer=sgd", "expected one of adadelta, adam, cbo, gauss_newton, lbfgs"),
     ("train experiment=demo", "did you mean demo_crowd?"),
     ("train experiment=[demo_traffic,paper_traffic]", "expected one of demo_crowd"),
     (

@@ -10,9 +10,9 @@ import torch
 from omegaconf import MISSING
 from torch.optim import Optimizer
 
-from nnode.calibrate.adadelta import NoisyAdadelta
-from nnode.calibrate.consensus import ConsensusBased
-from nnode.calibrate.damped import GaussNewton
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
+from nnode.calibrate.optimizers.consensus import ConsensusBased
+from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.errors import ConfigError
 from nnode.models.system import System
 
