@@ -1,0 +1,155 @@
+"""Gauss and Newton's method on exact tangents, and costs of car following."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs
+from nnode.calibrate.gauss_newton import TangentCost, alone, pooled, sandwich
+from nnode.calibrate.intervals import intervals
+from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError
+from nnode.models import Crowd, Relaxation, System, build_model
+from nnode.models.field import FIELD
+from nnode.solvers import FusedSolver, TorchdiffeqSolver
+
+TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
+
+
+def model(**values: float) -> System:
+    system = build_model({"term": "formula", "name": "idm", "leader": "measured",
+                          "law": FIELD["idm"]})  # fmt: skip
+    with torch.no_grad():
+        for name, value in values.items():
+            getattr(system.terms[0], name).fill_(value)
+    return system
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Batch:
+    """Six pairs behind leaders that brake and stop, as the law with TRUE drives; 5 cm of noise."""
+    rng = np.random.default_rng(20261122)
+    found = []
+    for i in range(6):
+        time = 0.1 * np.arange(200 + 20 * i)
+        speed = np.clip(12 + 10 * np.sin(0.35 * time + i), 0, None)
+        lead = np.cumsum(speed) * 0.1
+        x = np.stack([lead - 20 - 2 * i, lead], 1)[..., None]
+        v = np.stack([np.full_like(speed, 10.0), speed], 1)[..., None]
+        found.append(Sequence(name=f"p{i}", recording="r", time=time, x=x, v=v,
+                              length=np.array([4.0, 5.0])))  # fmt: skip
+    batch = collate(found)
+    with torch.no_grad():
+        run = FusedSolver()(model(**TRUE), batch)
+    noise = 0.05 * torch.from_numpy(rng.standard_normal(run.x.shape))
+    noise[0] = 0
+    noise[:, :, 1] = 0
+    batch.x, batch.v = run.x + noise * batch.valid[..., None], run.v
+    return batch
+
+
+@pytest.mark.parametrize("kind", list(Convention))
+def test_costs_and_slopes_are_those_of_autograd(kind: Convention, pairs: Batch) -> None:
+    system = model(T=1.1)
+    cost = TangentCost(system, pairs, FusedSolver(), kind)
+    curved = cost(cost.start)
+    wanted = sequence_costs(TorchdiffeqSolver(None, "discrete")(system, pairs), pairs, kind)
+    np.testing.assert_allclose(curved.cost, wanted.detach().numpy(), rtol=1e-11)
+    np.testing.assert_allclose(cost.costs(cost.start), curved.cost, rtol=1e-11)
+    slopes = torch.autograd.grad(wanted.sum(), list(system.parameters()))
+    np.testing.assert_allclose(curved.gradient.sum(0), [float(s) for s in slopes], rtol=1e-9)
+
+
+def test_costs_are_what_their_names_say(pairs: Batch) -> None:
+    run = TorchdiffeqSolver(None, "discrete")(model(T=1.1), pairs)
+    found = {kind: sequence_costs(run, pairs, kind).detach().numpy() for kind in FOLLOWING}
+    for b in range(len(pairs)):
+        k = int(pairs.valid[:, b, 0].sum())
+        gap = (run.x[1:k, b, 1, 0] - run.x[1:k, b, 0, 0] - 5).detach().numpy()
+        seen = (pairs.x[1:k, b, 1, 0] - pairs.x[1:k, b, 0, 0] - 5).numpy()
+        rmse = np.sqrt(np.mean((gap - seen) ** 2))
+        assert found[Convention.spacing][b] == pytest.approx(rmse, rel=1e-12)
+        relative = np.mean(((gap - seen) / seen) ** 2)
+        assert found[Convention.relative_gap][b] == pytest.approx(relative, rel=1e-12)
+        logarithm = np.mean((np.log(gap) - np.log(seen)) ** 2)
+        assert found[Convention.log_gap][b] == pytest.approx(logarithm, rel=1e-12)
+
+
+def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) -> None:
+    cost = TangentCost(model(v0=30, T=1.0, s0=2, a=1.5, b=1.5), pairs, FusedSolver(),
+                       Convention.gap)  # fmt: skip
+    fit = pooled(cost)
+    assert np.abs(cost(fit.row).gradient.mean(0) * (1 + np.abs(fit.row))).max() < 1e-6
+    found = intervals(cost, fit.row, np.arange(6))
+    assert found["clusters"] == 6
+    inside = [
+        own["low"] < TRUE[name.split(".")[1]] < own["high"]
+        for name, own in found["parameters"].items()
+    ]
+    assert sum(inside) >= 4  # five intervals of 95 %
+    # weights choose sequences
+    one = pooled(cost, weights=np.eye(6)[2])
+    each = alone(cost, fit.row)
+    assert one.cost == pytest.approx(each.cost[2], rel=1e-6)
+    assert (each.cost <= cost.costs(fit.row) + 1e-12).all()
+
+
+def test_shrinkage_pulls_towards_the_pool(pairs: Batch) -> None:
+    cost = TangentCost(model(**TRUE), pairs, FusedSolver(), Convention.gap)
+    centre = np.array([TRUE[name.split("__")[1]] for name in cost.names])
+    free = alone(cost, centre)
+    tied = alone(cost, centre, pool=(centre, np.full(5, 1e6)))
+    assert np.abs(tied.row - centre).max() < 1e-3
+    assert np.abs(free.row - centre).max() > np.abs(tied.row - centre).max()
+
+
+def test_the_sandwich_is_that_of_linear_regression() -> None:
+    """With clusters of one sequence it is White's, which can be written down."""
+    from nnode.calibrate.gauss_newton import Curved
+
+    rng = np.random.default_rng(5)
+    x, e = rng.standard_normal((40, 2)), rng.standard_normal(40)
+    curved = Curved(e**2, -2 * e[:, None] * x, 2 * x[:, :, None] * x[:, None, :])
+    found = sandwich(curved, np.full(40, 1 / 40), np.arange(40), np.ones(2, dtype=bool))
+    bread = np.linalg.inv(x.T @ x)
+    wanted = bread @ (x.T * e**2 @ x) @ bread * 40 / 39
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+
+
+def test_parameters_at_a_bound_are_flagged(pairs: Batch) -> None:
+    cost = TangentCost(model(**{**TRUE, "b": 0.05}), pairs, FusedSolver(), Convention.gap)
+    own = intervals(cost, cost.start, np.arange(6))["parameters"]["idm.b"]
+    assert own["at_bound"] == "low"
+    assert own["low"] is None
+    assert not own["identified"]
+
+
+def test_the_optimiser_goes_on_as_if_it_had_not_stopped(pairs: Batch) -> None:
+    def run(steps: int, state: dict[str, object] | None, system: System) -> GaussNewton:
+        optimizer = GaussNewton(system)
+        if state is not None:
+            optimizer.load_state_dict(state)
+        optimizer.attach(FusedSolver(), pairs, Convention.gap)
+        for _ in range(steps):
+            optimizer.step()
+        return optimizer
+
+    whole, halves = model(T=1.0), model(T=1.0)
+    run(6, None, whole)
+    run(3, run(3, None, halves).state_dict(), halves)
+    for a, b in zip(whole.parameters(), halves.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_what_has_no_tangents_is_refused(pairs: Batch) -> None:
+    with pytest.raises(ConfigError, match="gauss_newton needs a model of a lane"):
+        TangentCost(Crowd([Relaxation()]), pairs, FusedSolver())
+    with pytest.raises(ConfigError, match="needs solver=fused"):
+        GaussNewton(model()).attach(TorchdiffeqSolver(), pairs, Convention.gap)
+    with pytest.raises(ConfigError, match="second order"):
+        lin = build_model({"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0,
+                           "L": 5.0, "L_min": 2.0})  # fmt: skip
+        sequence_costs(FusedSolver(0.1)(lin, pairs), pairs, Convention.speed)
