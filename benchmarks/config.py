@@ -14,13 +14,14 @@ from nnode.calibrate.options import Precision
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`benchmarks.speed.run`."""
 
-    # problems: paper | stress | effects | steps | crowd | crowd_effects | people | scale
+    # problems: paper | stress | effects | steps | tangents | crowd | crowd_effects | people | scale
     shapes: list[str] = field(
         default_factory=lambda: [
             "paper",
             "stress",
             "effects",
             "steps",
+            "tangents",
             "crowd",
             "crowd_effects",
             "people",

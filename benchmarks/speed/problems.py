@@ -48,12 +48,14 @@ _LAWS = ("lin", "log", "n4")
 SHAPES: dict[str, tuple[Shape, ...]] = {
     # the recordings of the paper: sampled at 5 frames/s, 1.2 s
     "paper": (Shape("traffic", _LAWS, 34, 4, 6, 100, 0.002),),
-    "stress": (Shape("traffic", ("n4",), 100, 10, 50, 100, 0.002),),
+    "stress": (Shape("traffic", ("n4", "idm"), 100, 10, 50, 100, 0.002),),
     "steps": tuple(
         Shape("traffic", ("n4",), 34, 4, samples, 100, 0.002) for samples in (1, 3, 10, 30, 100)
     ),
     # a law, the same with one and three effects, and a law of second order
     "effects": (Shape("traffic", ("lin", "lin+1", "lin+3", "idm"), 100, 10, 50, 100, 0.002),),
+    # eight parameters each; of the last one speeds depend on those ahead
+    "tangents": (Shape("traffic", ("lin_places", "idm_zone", "lin_ahead"), 100, 10, 50, 10, 0.02),),
     "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
     "crowd_effects": (Shape("crowd", ("sf", "sf+1", "sf+3"), 16, 44, 25, 1, 0.04),),
     # one hall: few enough people for every engine, then as many as cell lists allow
@@ -73,6 +75,17 @@ EFFECTS: dict[str, tuple[dict[str, Any], ...]] = {
         {"name": "alignment", "c": 0.2},
         {"name": "anticipation", "T_a": 0.2},
         {"name": "preferred_speed", "c": 0.5, "v_pref": 1.3},
+    ),
+}
+_ZONE = {"name": "speed_zone", "alpha": 0.8, "a": 100.0, "b": 300.0}
+#: Laws with effects that make eight parameters; no step of time meets a period's corner.
+EIGHT: dict[str, tuple[dict[str, Any], ...]] = {
+    "lin_places": (_ZONE, {"name": "speed_period", "alpha": 1.1, "a": 2.013, "b": 6.007}),
+    "idm_zone": (_ZONE,),
+    "lin_ahead": (
+        _ZONE,
+        {"name": "multi_anticipation", "c": 0.1},
+        {"name": "asymmetric_response", "kappa_open": 0.2, "kappa_close": 0.4},
     ),
 }
 #: The Intelligent Driver Model, gaps from front to front (Treiber, Hennecke & Helbing 2000).
@@ -148,8 +161,8 @@ def _people(shape: Shape, draw: np.random.Generator) -> list[Sequence]:
 
 def _system(model: str) -> System:
     name, _, number = model.partition("+")
-    system = _law(name)
-    add_effects(system, EFFECTS[system.domain][: int(number or 0)])
+    system = _law(name.partition("_")[0])
+    add_effects(system, EIGHT.get(name, EFFECTS[system.domain][: int(number or 0)]))
     return system
 
 

@@ -55,6 +55,33 @@ def print_problem(row: dict[str, Any]) -> None:
         console.print(line)
 
 
+def print_tangents(rows: list[dict[str, Any]]) -> None:
+    """What derivatives by all parameters cost beside the simulation alone."""
+    if not rows:
+        return
+    table = Table(title="states alone, and with their exact derivatives by all parameters")
+    heads = ("forward (ms)", "tangents (ms)", "times", "runs of quotients", "cold (s)", "warm (s)")
+    table.add_column("problem")
+    for head in heads:
+        table.add_column(head, justify="right")
+    for row in rows:
+        alone, both, starts = (*(row["engines"][k] for k in ("forward", "tangents")), row["starts"])
+        first = {
+            at: " / ".join(f"{starts[k][at]:.3g}" for k in ("forward", "tangents"))
+            for at in ("cold", "warm")
+        }
+        table.add_row(
+            row["problem"],
+            f"{1e3 * alone['median']:.4g}",
+            f"{1e3 * both['median']:.4g}",
+            f"{both['median'] / alone['median']:.3g}",
+            str(1 + row["parameters"]),
+            first["cold"],
+            first["warm"],
+        )
+    Console(width=WIDTH).print(table)
+
+
 def per_person(problems: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """How the cost of one person changes from the smallest to the largest crowd.
 

@@ -18,8 +18,9 @@ from benchmarks.speed.figure import performance_figure
 from benchmarks.speed.floor import evaluations, floor_call
 from benchmarks.speed.memory import peak_memory
 from benchmarks.speed.problems import SHAPES, Problem, pose
-from benchmarks.speed.report import per_person, print_per_person, print_problem
+from benchmarks.speed.report import per_person, print_per_person, print_problem, print_tangents
 from benchmarks.speed.start import warm_start
+from benchmarks.speed.tangents import calls, check, starts
 from nnode.calibrate.cost import squared_error
 from nnode.errors import ConfigError, SimulationError
 from nnode.files import write_json
@@ -77,6 +78,10 @@ def benchmark(config: DictConfig, folder: Path) -> None:
         for shape in SHAPES[name]:
             for model in shape.models:
                 problem = pose(shape, model, dtype)
+                if name == "tangents":
+                    found.append({"shape": name, **_tangents(problem, options.repeats)})
+                    write_json(folder / "benchmark.json", results)
+                    continue
                 chosen = {
                     key: engine
                     for key, engine in ENGINES.items()
@@ -92,6 +97,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                 print_problem(found[-1])
                 results["scale"] = per_person([r for r in found if r["shape"] == "scale"])
                 write_json(folder / "benchmark.json", results)
+    print_tangents([row for row in found if row["shape"] == "tangents"])
     print_per_person(results["scale"])
     print(f"results: {folder / 'benchmark.json'}")
     _draw(results, folder)
@@ -126,7 +132,9 @@ def _exact(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     other = pose(problem.shape, problem.model, torch.float64)
     step = problem.shape.step
     small = ENGINES["odeint"].covers(problem)
-    solver = TorchdiffeqSolver("euler", "discrete", step) if small else FusedSolver(step)
+    solver = (
+        TorchdiffeqSolver("euler", "discrete", step) if small else FusedSolver(step, method="euler")
+    )
     return torch_call(other, solver)()
 
 
@@ -204,6 +212,25 @@ def _measure(problem: Problem, engines: dict[str, Engine], repeats: int) -> dict
     if floor is not None:
         row["floor"] = {"evaluations": evaluations(problem), **taken[_FLOOR]}
     return row
+
+
+def _tangents(problem: Problem, repeats: int) -> dict[str, Any]:
+    """Tangents beside the simulation alone, in turn; and the first calls of new processes."""
+    agree = check(problem)
+    own = calls(problem)
+    for call in own.values():
+        call()  # compiles
+    return {
+        "problem": problem.label,
+        "model": problem.model,
+        "sequences": problem.shape.sequences,
+        "agents": problem.shape.agents,
+        "steps": problem.shape.steps,
+        "parameters": len(list(problem.system.parameters())),
+        "difference": agree,
+        "engines": _rounds(own, repeats),
+        "starts": starts(problem),
+    }
 
 
 def _ensemble(problem: Problem, restarts: int, repeats: int) -> dict[str, Any]:

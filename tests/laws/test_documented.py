@@ -33,7 +33,7 @@ def test_your_own_law_in_one_line() -> None:
 
 
 def test_laws_on_the_command_line() -> None:
-    laws = re.findall(r"'model\.law=(\{.*\})'", METHOD)
+    laws = re.findall(r"'model\.law=(\{parameters.*\})'", METHOD)
     assert len(laws) == 2
     lane, people = (
         build_model({"term": "formula", "name": "mine", "leader": "measured", "effects": [],
@@ -46,10 +46,9 @@ def test_laws_on_the_command_line() -> None:
 
 @pytest.mark.parametrize("name", FIELD)
 def test_the_field_s_laws_stand_in_the_page_with_their_parameters(name: str) -> None:
-    (row,) = [
-        line for line in METHOD.splitlines() if line.startswith("| `") and f"`{name}`" in line
-    ]
-    shown = row.split("|")[3].replace("κ", "kappa").replace("λ", "lam")
+    rows = [line.split("|") for line in METHOD.splitlines() if line.startswith("| `")]
+    (row,) = [row for row in rows if f"`{name}`" in row[1]]
+    shown = row[3].replace("κ", "kappa").replace("λ", "lam")
     names = {part.strip() for part in shown.split(",")}
     assert names == (set(FIELD[name]["parameters"]) or {"weights"})
     assert Path(f"conf/model/{name}.yaml").is_file()

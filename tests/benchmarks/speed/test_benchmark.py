@@ -227,3 +227,31 @@ def test_script_refuses_unknown_options(tmp_path) -> None:  # type: ignore[no-un
     )
     assert done.returncode == 2
     assert "did you mean benchmark.shapes" in done.stderr
+
+
+def test_tangents_of_eight_parameters_are_timed(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    (shape,) = SHAPES["tangents"]
+    for model in shape.models:
+        assert len(list(pose(shape, model, torch.float32).system.parameters())) == 8
+    tiny = replace(shape, models=("idm_zone",), sequences=2, agents=3, samples=3)
+    monkeypatch.setitem(SHAPES, "tangents", (tiny,))
+    monkeypatch.setattr("benchmarks.speed.run.starts", lambda _: {
+        k: {"cold": 9.0, "warm": 0.5} for k in ("forward", "tangents")
+    })  # fmt: skip
+    benchmark(options(shapes=["tangents"]), tmp_path)
+    (row,) = json.loads((tmp_path / "benchmark.json").read_text())["problems"]
+    assert row["difference"] < 1e-5
+    assert row["engines"]["tangents"]["median"] > 0
+    assert "idm_zone: 2 sequences, 3 cars" in capsys.readouterr().out
+
+
+def test_tangents_that_are_wrong_are_not_timed(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    from benchmarks.speed import tangents
+
+    slope = torch.ones(8, 3, 2, 3, dtype=torch.float64)
+    own = {"forward": lambda: torch.zeros(3, 2, 3, dtype=torch.float64), "tangents": lambda: slope}
+    monkeypatch.setattr(tangents, "calls", lambda _: own)
+    (shape,) = SHAPES["tangents"]
+    tiny = replace(shape, sequences=2, agents=3, samples=2)
+    with pytest.raises(SimulationError, match="differ from difference quotients"):
+        tangents.check(pose(tiny, "idm_zone", torch.float64))

@@ -1,0 +1,113 @@
+"""What exact derivatives by eight parameters cost beside the simulation alone, and to compile."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from os import environ
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.speed.problems import Problem, Shape, pose
+from nnode.errors import SimulationError
+from nnode.models import Traffic
+from nnode.simulate import lanes
+
+#: Where this package stands: it is not installed.
+_ROOT = Path(__file__).parents[2]
+#: Tangents are timed where difference quotients over this share of a parameter agree so well.
+_SHARE, _AGREE = 1e-6, 1e-5
+_SCRIPT = """
+import json, sys
+root, shape, model, what = sys.argv[1:]
+sys.path.insert(0, root)
+import torch
+torch.set_num_threads(1)
+from benchmarks.speed.tangents import first_call
+print(first_call(json.loads(shape), model, what))
+"""
+
+
+def calls(problem: Problem) -> dict[str, Callable[[], Tensor]]:
+    """``forward``: states alone; ``tangents``: with their derivatives by all parameters."""
+    system, batch, per = problem.system, problem.batch, problem.shape.per
+    assert isinstance(system, Traffic)
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    names = list(lane.owned)
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return lanes.simulate(system, lane, batch, per)[:, 0, ..., 0]
+
+    def tangents() -> Tensor:
+        return lanes.tangents(system, lane, batch, per, names)[1][..., 0]
+
+    return {"forward": forward, "tangents": tangents}
+
+
+def first_call(shape: dict[str, Any], model: str, what: str) -> float:
+    """Seconds of the first call in this process."""
+    problem = pose(Shape(**shape), model, torch.float32)
+    begin = time.perf_counter()
+    calls(problem)[what]()
+    return time.perf_counter() - begin
+
+
+def starts(problem: Problem) -> dict[str, dict[str, float]]:
+    """Seconds of the first call of a new process, ``cold`` with nothing compiled, then ``warm``."""
+    shape = json.dumps(asdict(problem.shape))
+    found: dict[str, dict[str, float]] = {}
+    for what in ("forward", "tangents"):
+        with tempfile.TemporaryDirectory() as empty:
+            found[what] = {
+                start: float(
+                    subprocess.run(
+                        [sys.executable, "-c", _SCRIPT, str(_ROOT), shape, problem.model, what],
+                        capture_output=True,
+                        text=True,
+                        check=True,
+                        env={**environ, "NNODE_CACHE": empty},
+                    ).stdout
+                )
+                for start in ("cold", "warm")
+            }
+    return found
+
+
+def check(problem: Problem) -> float:
+    """How far the tangents are from difference quotients in float64, relatively; at most.
+
+    Raises:
+        SimulationError: they disagree.
+    """
+    exact = pose(problem.shape, problem.model, torch.float64)
+    own = calls(exact)
+    found, worst = own["tangents"](), 0.0
+    follows = exact.batch.valid & exact.system.scene(exact.batch).follower
+    for slope, p in zip(found, exact.system.parameters(), strict=True):
+        value, step = float(p.detach()), _SHARE * max(abs(float(p.detach())), 1.0)
+        ends = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                p.fill_(value + sign * step)
+            ends.append(own["forward"]())
+        with torch.no_grad():
+            p.fill_(value)
+        quotient = (ends[0] - ends[1]) / (2 * step)
+        away = ((slope - quotient)[follows].norm() / quotient[follows].norm()).item()
+        worst = max(worst, away)
+    if not worst <= _AGREE:
+        raise SimulationError(
+            f"tangents of {problem.label} differ from difference quotients by {worst:.3g}, at most "
+            f"{_AGREE:g} is expected; this problem was not timed"
+        )
+    return worst
