@@ -48,3 +48,45 @@ KRAUSS_BALLISTIC: dict[str, Any] = {
     "step": "ballistic",
     "source": "SUMO's Krauss with --step-method.ballistic",
 }
+
+#: JuPedSim's social force, by mass: with a desired speed, and nobody farther away than 2.5 m. Its
+#: steps place people with their new velocity, Euler's here with the old one. A place that is meant
+#: one step earlier turns one into the other, if forces act from where people are a step later.
+SOCIAL_FORCE: dict[str, Any] = {
+    "parameters": {
+        "A": {"value": "2 m/s²", "low": "0 m/s²"},
+        "B": {"value": "0.3 m", "low": "0.01 m", "high": "2 m"},
+        "k": {"value": "100 1/s²", "low": "0 1/s²"},
+        "kappa": {"value": "30 1/(m*s)", "low": "0 1/(m*s)"},
+        "v0": {"value": "1.3 m/s", "low": "0.1 m/s", "high": "3 m/s"},
+        "tau": {"value": "0.5 s", "low": "0.05 s", "high": "5 s"},
+        "radius": "0.3 m",  # known, as are JuPedSim's reach and step
+        "reach": "2.5 m",
+        "step": "0 s",
+    },
+    "where": {
+        "to_x": "goal_x - x - step*vx",
+        "to_y": "goal_y - y - step*vy",
+        "way": "sqrt(to_x**2 + to_y**2)",
+        "then_x": "dx + step*dvx",
+        "then_y": "dy + step*dvy",
+        "far": "sqrt(then_x**2 + then_y**2)",
+        "contact": "max(2*radius - far, 0)",
+        "push": "choose(reach - far, A*exp((2*radius - far)/B) + k*contact, 0)/far",
+        "slide": "kappa*contact*(dvx*then_y - dvy*then_x)/far**2",
+    },
+    "others": {
+        "push_x": "push*then_x - slide*then_y",
+        "push_y": "push*then_y + slide*then_x",
+    },
+    "rate": {
+        "vx": "(v0*to_x/way - vx)/tau + push_x",
+        "vy": "(v0*to_y/way - vy)/tau + push_y",
+    },
+    "source": "JuPedSim's SocialForceModel: Helbing, Farkas & Vicsek 2000",
+}
+
+
+def stepping(law: dict[str, Any], step: float) -> dict[str, Any]:
+    """A law of people for steps of JuPedSim's, whose length is ``step`` s."""
+    return {**law, "parameters": {**law["parameters"], "step": f"{step} s"}}

@@ -23,7 +23,7 @@ from nnode.models.own_law import law_from
 from nnode.models.system import System
 from nnode.solvers.fused.engine import FusedSolver
 
-#: The search starts this share away from every parameter, up and down in turns.
+#: The searches start this share away from every parameter: up and down in turns, all up, all down.
 AWAY = 0.3
 #: Half an interval of 95 %, in standard errors.
 NORMAL = 1.96
@@ -112,9 +112,10 @@ def recover(
     exact = metres(truth)
     assert exact is not None, "the typed parameters cannot be simulated"
     moves = torch.from_numpy(_moving(cost))
-    turns = (-1.0) ** np.arange(len(truth))
-    # a bound on speed that is nowhere reached changes nothing: one of two starts lies below it
-    ends = [_best(cost, metres, truth * (1 + AWAY * sign * turns)) for sign in (1, -1)]
+    turns, one = (-1.0) ** np.arange(len(truth)), np.ones(len(truth))
+    # a limit on speed or acceleration that is nowhere reached changes nothing: of these starts
+    # some lie below each
+    ends = [_best(cost, metres, truth * (1 + AWAY * way)) for way in (turns, -turns, one, -one)]
     best = min(ends, key=lambda end: end.cost)
     noise = torch.from_numpy(error * np.random.default_rng(seed).standard_normal(len(exact)))
 

@@ -1,0 +1,90 @@
+"""Two groups that walk through each other in open space, by JuPedSim."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from nnode.data.options import WalkwayOptions
+from nnode.data.readers.jupedsim import read_walkway
+from nnode.data.sequence import Sequence
+
+#: JuPedSim's step, and that of what it writes, s; how long people are watched, s.
+STEP, SAMPLE, SECONDS = 0.01, 0.1, 8.0
+#: Half the side of the square room, and how far off its middle goals are, m: nobody is near walls.
+ROOM, GOAL = 60.0, 40.0
+#: People of a group, two groups walk against each other.
+GROUP = 4
+
+
+def groups(
+    jupedsim: ModuleType,
+    path: Path,
+    model: Any,
+    person: Callable[..., Any],
+    values: Mapping[str, float],
+    *,
+    seed: int,
+    dt: float = STEP,
+    before: bool = False,
+    apart: float = 0.9,
+) -> Sequence:
+    """Everybody's path, read from JuPedSim's file, with the goals that were set and from rest.
+
+    Args:
+        path: the file to write.
+        model: one of JuPedSim's models.
+        person: makes the parameters of an agent of it.
+        values: what it is given besides place and journey.
+        seed: of the places.
+        dt: JuPedSim's step, s.
+        before: places are those of one step earlier, see :data:`benchmarks.recovery.laws`.
+        apart: least distance of two at the start, m.
+    """
+    import shapely
+
+    every = round(SAMPLE / dt)
+    writer = jupedsim.SqliteTrajectoryWriter(output_file=path, every_nth_frame=1)
+    simulation = jupedsim.Simulation(
+        model=model, geometry=shapely.box(-ROOM, -ROOM, ROOM, ROOM), dt=dt, trajectory_writer=writer
+    )
+    stage = simulation.add_direct_steering_stage()
+    journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
+    start, goal = places(np.random.default_rng(seed), apart)
+    number = {}
+    for place, aim in zip(start, goal, strict=True):
+        own = simulation.add_agent(
+            person(position=tuple(place), journey_id=journey, stage_id=stage, **values)
+        )
+        simulation.agent(own).target = tuple(aim)
+        number[str(own)] = len(number)
+    for _ in range(round(SECONDS / dt) + 1):
+        simulation.iterate()
+    writer.close()
+    found = read_walkway(path, WalkwayOptions(path=str(path), t_seq=SECONDS))[0]
+    order = [number[agent] for agent in found.agents]
+    frames = every * np.arange(round(SECONDS / SAMPLE) + 1)
+    x = found.x[np.maximum(frames - 1, 0) if before else frames]
+    v = np.gradient(x, SAMPLE, axis=0)
+    v[0] = 0.0
+    return replace(
+        found, time=found.time[frames], x=x, v=v, walls=None, destination=goal[order]
+    )
+
+
+def places(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """``(2 GROUP, 2)`` starts, the groups 6 m apart, and goals far behind the other group."""
+    found: list[np.ndarray] = []
+    while len(found) < 2 * GROUP:
+        side = -1.0 if len(found) < GROUP else 1.0
+        place = np.array([side * rng.uniform(2.5, 5.0), rng.uniform(-1.2, 1.2)])
+        if all(np.linalg.norm(place - other) > apart for other in found):
+            found.append(place)
+    start = np.array(found)
+    goal = np.stack([-np.sign(start[:, 0]) * GOAL, start[:, 1]], 1)
+    return start, goal
