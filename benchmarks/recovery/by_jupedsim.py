@@ -56,7 +56,7 @@ def groups(
     stage = simulation.add_direct_steering_stage()
     journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
     start, goal = places(np.random.default_rng(seed), apart)
-    number = {}
+    number: dict[str, int] = {}
     for place, aim in zip(start, goal, strict=True):
         own = simulation.add_agent(
             person(position=tuple(place), journey_id=journey, stage_id=stage, **values)
@@ -72,9 +72,7 @@ def groups(
     x = found.x[np.maximum(frames - 1, 0) if before else frames]
     v = np.gradient(x, SAMPLE, axis=0)
     v[0] = 0.0
-    return replace(
-        found, time=found.time[frames], x=x, v=v, walls=None, destination=goal[order]
-    )
+    return replace(found, time=found.time[frames], x=x, v=v, walls=None, destination=goal[order])
 
 
 def places(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.ndarray]:
@@ -88,3 +86,17 @@ def places(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.ndarr
     start = np.array(found)
     goal = np.stack([-np.sign(start[:, 0]) * GOAL, start[:, 1]], 1)
     return start, goal
+
+
+def pieces(whole: Sequence, seconds: float) -> list[Sequence]:
+    """Sequences of so many seconds, one behind the other, each from its own start."""
+    n = round(seconds / SAMPLE)
+    parts = [(k, slice(k, k + n + 1)) for k in range(0, whole.n_samples - n, n)]
+    assert whole.v is not None
+    return [
+        replace(
+            whole, name=f"{whole.name}-{k}", time=whole.time[part], x=whole.x[part],
+            v=whole.v[part],
+        )
+        for k, part in parts
+    ]  # fmt: skip

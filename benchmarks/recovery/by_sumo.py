@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -57,7 +58,8 @@ def platoon(
         )
         place -= LENGTH + gap + i
     (folder / "a.rou.xml").write_text(
-        f'<routes><vType id="lead" length="{LENGTH}" maxSpeed="60" speedDev="0" sigma="0" apparentDecel="{values["decel"]:.17g}"/>'
+        f'<routes><vType id="lead" length="{LENGTH}" maxSpeed="60" speedDev="0" sigma="0" '
+        f'apparentDecel="{values["decel"]:.17g}"/>'
         f'<vType id="own" carFollowModel="{follow}" length="{LENGTH}" speedFactor="1" speedDev="0" '
         f'{attributes}/><route id="r" edges="e"/>{"".join(cars)}</routes>'
     )
@@ -83,7 +85,7 @@ def _led(command: list[str], home: Path, profile: np.ndarray, steps: int) -> Non
     """Run SUMO, the leader at the speed that the profile says at the end of each step."""
     sys.path.append(str(home / "tools"))
     try:
-        import traci
+        traci = import_module("traci")
     finally:
         sys.path.remove(str(home / "tools"))
     traci.start(command, stdout=subprocess.DEVNULL)

@@ -10,8 +10,8 @@ _IDM, _KRAUSS = FIELD["idm"], FIELD["krauss"]
 #: Gaps that SUMO counts as none, m, its slack in distances, m, and what stands for no speed, m/s.
 _SMALL = {"near": "0.01 m", "slack": "0.001 m", "still": "1e-9 m/s", "one": "1 s"}
 
-#: SUMO's IDM never asks for a negative speed: in a ballistic step that ends at rest a vehicle drives
-#: at the mean of its old speed and 0, however hard it wanted to brake.
+#: SUMO's IDM never asks for a negative speed: in a ballistic step that ends at rest a vehicle
+#: drives at the mean of its old speed and 0, however hard it wanted to brake.
 IDM: dict[str, Any] = {**_IDM, "rate": {"v": f"max({_IDM['rate']['v']}, -v/dt)"}}
 
 #: SUMO's KraussOrig1: behind a vehicle at rest the last b dt (s) metres are driven at b dt at most,

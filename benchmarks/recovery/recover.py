@@ -115,15 +115,16 @@ def recover(
     turns, one = (-1.0) ** np.arange(len(truth)), np.ones(len(truth))
     # a limit on speed or acceleration that is nowhere reached changes nothing: of these starts
     # some lie below each
-    ends = [_best(cost, metres, truth * (1 + AWAY * way)) for way in (turns, -turns, one, -one)]
-    best = min(ends, key=lambda end: end.cost)
+    starts = [truth * (1 + AWAY * way) for way in (turns, -turns, one, -one)]
+    ends = [_best(cost, metres, start) for start in starts]
+    first, best = min(enumerate(ends), key=lambda end: end[1].cost)
     noise = torch.from_numpy(error * np.random.default_rng(seed).standard_normal(len(exact)))
 
     def noisy(row: np.ndarray) -> Tensor | None:
         found = metres(row)
         return None if found is None else found + torch.where(moves, noise, 0.0)
 
-    again = _best(cost, noisy, best.row)
+    again = _best(cost, noisy, starts[first])
     count = int(moves.sum())
     unit, tied = _spread(_slopes(metres, again.row), names)
     return Recovered(
