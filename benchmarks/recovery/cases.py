@@ -102,8 +102,8 @@ def _collision_free() -> Case:
     typed = {"T": 1.0, "l": 0.4, "a": 8.0, "D": 0.1}
 
     def recovered(folder: Path) -> Recovered:
-        import jupedsim
-
+        law = import_module("nnode.models.field_crowd").PEOPLE["cfsm"]
+        jupedsim = import_module("jupedsim")
         model = jupedsim.CollisionFreeSpeedModel(
             strength_neighbor_repulsion=typed["a"], range_neighbor_repulsion=typed["D"]
         )
