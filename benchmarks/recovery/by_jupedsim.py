@@ -16,8 +16,8 @@ from nnode.data.sequence import Sequence
 
 #: JuPedSim's step, and that of what it writes, s; how long people are watched, s.
 STEP, SAMPLE, SECONDS = 0.01, 0.1, 8.0
-#: Half the side of the square room, and how far off its middle goals are, m: nobody is near walls.
-ROOM, GOAL = 60.0, 40.0
+#: How far off the middle of a square room goals are, m; its walls are half as far again.
+GOAL = 40.0
 #: People of a group, two groups walk against each other.
 GROUP = 4
 
@@ -27,12 +27,15 @@ def groups(
     path: Path,
     model: Any,
     person: Callable[..., Any],
-    values: Mapping[str, float],
+    values: Mapping[str, Any],
     *,
     seed: int,
     dt: float = STEP,
     before: bool = False,
     apart: float = 0.9,
+    speed: float = 0.0,
+    oriented: bool = False,
+    goal: float = GOAL,
 ) -> Sequence:
     """Everybody's path, read from JuPedSim's file, with the goals that were set and from rest.
 
@@ -45,21 +48,29 @@ def groups(
         dt: JuPedSim's step, s.
         before: places are those of one step earlier, see :data:`benchmarks.recovery.laws`.
         apart: least distance of two at the start, m.
+        speed: of everybody at the start, m/s, towards his goal; it is only given to agents that
+            are ``oriented``: those are told their direction as well.
+        goal: distance of the goals from the middle, m.
     """
     import shapely
 
     every = round(SAMPLE / dt)
     writer = jupedsim.SqliteTrajectoryWriter(output_file=path, every_nth_frame=1)
     simulation = jupedsim.Simulation(
-        model=model, geometry=shapely.box(-ROOM, -ROOM, ROOM, ROOM), dt=dt, trajectory_writer=writer
-    )
+        model=model, geometry=shapely.box(-1.5 * goal, -1.5 * goal, 1.5 * goal, 1.5 * goal), dt=dt,
+        trajectory_writer=writer,
+    )  # fmt: skip
     stage = simulation.add_direct_steering_stage()
     journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
-    start, goal = places(np.random.default_rng(seed), apart)
+    start, goals = places(np.random.default_rng(seed), apart, goal)
     number: dict[str, int] = {}
-    for place, aim in zip(start, goal, strict=True):
+    for place, aim in zip(start, goals, strict=True):
+        more = dict(values)
+        if oriented:
+            way = (float(np.sign(aim[0])), 0.0)
+            more |= {"speed": speed, "orientation": way, "desired_direction": way}
         own = simulation.add_agent(
-            person(position=tuple(place), journey_id=journey, stage_id=stage, **values)
+            person(position=tuple(place), journey_id=journey, stage_id=stage, **more)
         )
         simulation.agent(own).target = tuple(aim)
         number[str(own)] = len(number)
@@ -71,11 +82,13 @@ def groups(
     frames = every * np.arange(round(SECONDS / SAMPLE) + 1)
     x = found.x[np.maximum(frames - 1, 0) if before else frames]
     v = np.gradient(x, SAMPLE, axis=0)
-    v[0] = 0.0
-    return replace(found, time=found.time[frames], x=x, v=v, walls=None, destination=goal[order])
+    v[0] = speed * np.sign(goals[order]) * np.array([1.0, 0.0])
+    if before:
+        x[0] -= dt * v[0]
+    return replace(found, time=found.time[frames], x=x, v=v, walls=None, destination=goals[order])
 
 
-def places(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.ndarray]:
+def places(rng: np.random.Generator, apart: float, far: float) -> tuple[np.ndarray, np.ndarray]:
     """``(2 GROUP, 2)`` starts, the groups 6 m apart, and goals far behind the other group."""
     found: list[np.ndarray] = []
     while len(found) < 2 * GROUP:
@@ -84,7 +97,7 @@ def places(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.ndarr
         if all(np.linalg.norm(place - other) > apart for other in found):
             found.append(place)
     start = np.array(found)
-    goal = np.stack([-np.sign(start[:, 0]) * GOAL, start[:, 1]], 1)
+    goal = np.stack([-np.sign(start[:, 0]) * far, start[:, 1]], 1)
     return start, goal
 
 

@@ -98,6 +98,31 @@ def _social_force(program: str, name: str, typed: dict[str, float], *, own: bool
     return Case(f"JuPedSim, {program}", name, recovered)
 
 
+def _centrifugal() -> Case:
+    typed = {"eta": 0.3, "v0": _PACE, "tau": _TAU, "a_v": 0.5}
+
+    def recovered(folder: Path) -> Recovered:
+        jupedsim = import_module("jupedsim")
+        model = jupedsim.GeneralizedCentrifugalForceModel(strength_neighbor_repulsion=typed["eta"])
+        values = {
+            "mass": 1.0, "desired_speed": typed["v0"], "tau": typed["tau"], "a_v": typed["a_v"],
+            "a_min": 0.2, "b_min": 0.2, "b_max": 0.4,
+        }  # fmt: skip
+        # JuPedSim turns desired directions slowly: goals so far away that they do not turn
+        sequences = [
+            by_jupedsim.groups(
+                jupedsim, folder / f"{seed}.sqlite", model,
+                jupedsim.GeneralizedCentrifugalForceModelAgentParameters, values, seed=seed,
+                before=True, apart=1.2, speed=1.0, oriented=True, goal=9000.0,
+            )
+            for seed in range(2)
+        ]  # fmt: skip
+        law = laws.stepping(laws.CENTRIFUGAL, by_jupedsim.STEP)
+        return recover(law, typed, sequences, dt=by_jupedsim.STEP, error=ROOM)
+
+    return Case("JuPedSim, generalised centrifugal force", "its formula, its steps", recovered)
+
+
 def _collision_free() -> Case:
     typed = {"T": 1.0, "l": 0.4, "a": 8.0, "D": 0.1}
 
@@ -161,5 +186,6 @@ CASES: dict[str, Case] = {
         "social force, its defaults: nobody touches", "its formula, its steps",
         {"A": 25.0, "B": 0.08, "k": 1500.0, "kappa": 3000.0, "v0": _PACE, "tau": _TAU}, own=True,
     ),
+    "centrifugal": _centrifugal(),
     "collision_free": _collision_free(),
 }  # fmt: skip

@@ -135,7 +135,7 @@ def recover(
         half=NORMAL * np.sqrt(again.cost / (count - len(truth))) * unit,
         error=error,
         tied=tied,
-        forward=float(np.sqrt(exact.square().sum() / count)),
+        forward=float((exact.square().sum() / count) ** 0.5),
         worst=float(exact.abs().max()),
         path=float(np.sqrt(best.cost / count)),
         simulations=sum(end.evaluations for end in ends),
