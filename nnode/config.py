@@ -16,6 +16,7 @@ from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
     ConsensusOptions,
+    GaussNewtonOptions,
     LbfgsOptions,
 )
 from nnode.calibrate.options import (
@@ -38,6 +39,7 @@ from nnode.data.options import (
 )
 from nnode.discover.options import DiscoverOptions
 from nnode.models.field import FIELD, NEURONS
+from nnode.models.field_crowd import PEOPLE
 from nnode.models.options import (
     FormulaOptions,
     LawOptions,
@@ -45,7 +47,7 @@ from nnode.models.options import (
     NetworkSpeedOptions,
     SocialForceOptions,
 )
-from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
+from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions, WalkingStudyOptions
 
 
 @dataclass
@@ -134,6 +136,10 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
         )
         for name, law in FIELD.items()
     },
+    **{
+        ("model", f"{name}_schema"): FormulaOptions(term="formula", law=law)
+        for name, law in PEOPLE.items()
+    },
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),
     ("model", "network_force_schema"): NetworkForceOptions(term="network_force"),
@@ -153,8 +159,10 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "adam_schema"): AdamOptions,
     ("optimizer", "lbfgs_schema"): LbfgsOptions,
     ("optimizer", "cbo_schema"): ConsensusOptions,
+    ("optimizer", "gauss_newton_schema"): GaussNewtonOptions,
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
+    ("study", "walking_study_schema"): WalkingStudyOptions,
 }
 
 

@@ -10,6 +10,7 @@ Examples:
   python scripts/prepare_data.py data=table data.path=mine.csv data.domain=traffic
   python scripts/prepare_data.py data=vehicles data.path=FILE 'data.columns={vehicle: id, x: pos}'
   python scripts/prepare_data.py data=ngsim data.path=FILE
+  python scripts/prepare_data.py data=pairs data.path=FOLDER 'data.columns={time: t, spacing: gap}'
   python scripts/prepare_data.py data=sumo data.path=fcd.xml
 
 Results: the sequences, manifest.json, and pictures of those with faults. Train with

@@ -5,6 +5,8 @@ Examples:
   python scripts/train.py model=n4 data=esimas data.recording=1-1_1
   # compiled kernels and L-BFGS: a hundred times faster
   python scripts/train.py model=lin data=esimas solver=fused optimizer=lbfgs
+  # the field's laws, by Gauss and Newton's method on exact tangents
+  python scripts/train.py model=idm data=ngsim_pairs trainer.cost=spacing
   # your own table: columns sequence, time, agent, x; in SI units
   python scripts/train.py model=lin data=table data.path=mine.csv data.domain=traffic
   # sweeps: every model with every seed, one after the other, or on all cores
@@ -19,11 +21,9 @@ Results: result.json, checkpoints/best.pt and last.pt, and curves for TensorBoar
 with sweep.csv. Ctrl-C saves, and says how to go on.
 """
 
-from functools import partial
-
 from nnode.app.cli.run import run
-from nnode.app.cli.saved import saved_groups
+from nnode.app.cli.saved import train_groups
 from nnode.app.train import train
 
 if __name__ == "__main__":
-    run("train", train, partial(saved_groups, option="resume"), parallel=True)
+    run("train", train, train_groups, parallel=True)

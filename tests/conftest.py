@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -10,6 +11,12 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:
     # as many processes as cores: more threads would wait for each other, and burn time doing so
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_collection_finish() -> None:
+    """Take what is loaded out of Python's search for garbage, also that of forked children."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare
 from nnode.data.store import MANIFEST, Store
-from nnode.data.synthetic import demo_data
+from nnode.data.synthetic import traffic_recording
 from nnode.pages.page import Block, TableBlock
 from nnode.study.runner import Task, run_tasks
 from nnode.study.traffic.tasks import fit, scan
@@ -160,10 +160,10 @@ class Small:
 
 
 def jobs(raw: Path) -> list[Job]:
-    """All jobs; the demonstration's recordings are written to ``raw``."""
-    demo_data(raw)
+    """All jobs; the demonstration's traffic is written to ``raw``."""
+    recorded = traffic_recording(raw / "esimas" / "sequence_datademo.mat", seed=0)
     source, table = f"data.source={raw}", raw / "lane.csv"
-    _lane(raw, table)
+    _lane(recorded, table)
     return [
         Job("prepare_data", ["data=demo_traffic", source], _prepared,
             lambda folder: 1.0 if (folder / MANIFEST).exists() and len(Store(folder)) else 0.0,
@@ -219,11 +219,11 @@ def _small_diagnosis() -> None:
     vars(discover)["diagnose_table"] = small
 
 
-def _lane(raw: Path, table: Path) -> None:
+def _lane(recorded: Path, table: Path) -> None:
     """The demonstration's first sequences as a tidy table."""
     from nnode.data.readers.esimas import read_esimas
 
-    found = read_esimas(raw / "esimas" / "sequence_datademo.mat")[:12]
+    found = read_esimas(recorded)[:12]
     rows = [
         {"sequence": s.name.replace("/", "-"), "time": t, "agent": f"{s.name}-{n}",
          "x": s.x[k, n, 0]}

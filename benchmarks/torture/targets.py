@@ -19,9 +19,17 @@ from benchmarks.torture.gadgets import evil_checkpoint, strange_checkpoint
 from benchmarks.torture.inputs import damaged_bytes, damaged_formula, damaged_text
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
-from nnode.data.options import JuelichOptions, TableOptions, VehicleTableOptions
+from nnode.data.options import (
+    JuelichOptions,
+    OpenAccOptions,
+    PairOptions,
+    TableOptions,
+    VehicleTableOptions,
+)
 from nnode.data.readers.esimas import read_esimas
 from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.openacc import read_openacc
+from nnode.data.readers.pairs import read_pairs
 from nnode.data.readers.table import read_table
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
@@ -80,6 +88,23 @@ def _vehicles() -> pd.DataFrame:
         for n in range(4) for k in range(5)
     ]  # fmt: skip
     return pd.DataFrame(rows)
+
+
+def _pairs() -> pd.DataFrame:
+    rows = [
+        {"pair": n, "time": 0.2 * k, "x_follower": 3.0 * k, "v_follower": 15.0,
+         "x_leader": 20.0 + 3.0 * k, "v_leader": 15.0, "spacing": 15.5, "follower": n, "leader": 9,
+         "run": "a", "split": "train"}
+        for n in range(2) for k in range(6)
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def _platoon() -> bytes:
+    head = ["Date,8,10,2019", "Vehicle_order,A,B", "Number_of_vehicles,2", "ACC,1",
+            "Distance_setting,S", "Time,Speed1,E1,N1,Speed2,E2,N2,IVS1"]  # fmt: skip
+    rows = [f"{5 + 0.1 * k:.1f},10,{k},0,10.1,{k - 20},0,{15 - 0.01 * k:.2f}" for k in range(9)]
+    return ("\n".join([*head, *rows]) + "\n").encode()
 
 
 def _csv(frame: pd.DataFrame) -> bytes:
@@ -193,6 +218,10 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
         for options in (cars, windows):
             read_vehicles(path, options)
 
+    def pairs(path: Path) -> None:
+        for options in (PairOptions(), PairOptions(dt=0.4, window=0.8, min_samples=2)):
+            read_pairs({path.name: path}, options)
+
     return [
         Target("esimas", "sequence_datademo.mat", [_mat(packed=False), _mat(packed=True)],
                damaged_bytes, read_esimas),
@@ -205,6 +234,9 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
         Target("table Parquet", "table.parquet", [_parquet(traffic)], damaged_bytes,
                lambda path: read_table(path, of_traffic)),
         Target("vehicles CSV", "cars.csv", [_csv(_vehicles())], damaged_text, vehicles),
+        Target("pairs CSV", "pairs.csv", [_csv(_pairs())], damaged_text, pairs),
+        Target("OpenACC", "platoon.csv", [_platoon()], damaged_text,
+               lambda path: read_openacc({path.name: path}, OpenAccOptions(min_duration=0.3))),
         Target("walls CSV", "walls.csv", [walls], damaged_text,
                lambda path: read_table(scratch / "crowd.csv", of_crowd, path)),
         Target("checkpoint, bytes", "bytes.pt", [checkpoint], damaged_bytes, _open_checkpoint),

@@ -119,7 +119,9 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
             "data": data.name,
             "part": part,
             "trained_on": trained,
-            "unit": "m² s" if convention is Convention.integral else "m²",
+            "unit": convention.unit,
+            # the field's name for it
+            **({"spacing_rmse": found.objectives["spacing"]} if found.objectives else {}),
             "parameters": {k: float(v) for k, (v, _) in model.physical().items()},
             "free_speed": checkpoint.free_speed,
             "baselines": {key: metrics.plain() for key, metrics in others.items()},
@@ -131,7 +133,7 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
 
 def _print(rows: dict[str, Metrics], title: str, convention: Convention) -> None:
     table = Table(title=title)
-    unit = "m² s" if convention is Convention.integral else "m²"
+    unit = convention.unit
     heads = ("", f"J ({unit})", "RMSE (m)", "final displacement (m)", "collisions (%)")
     last = next(iter(rows.values())).horizons
     chosen = sorted({len(last) // 4, len(last) // 2, len(last) - 1} & set(range(len(last))))

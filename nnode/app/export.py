@@ -216,7 +216,7 @@ def _csv(job: _Export) -> _Written:
     convention = Convention(job.checkpoint.config["trainer"]["cost"])
     loader = straight_loader(job.sequences.store, list(job.sequences.indices), job.batch_size)
     metrics = evaluate(job.simulate, stream(loader, job.dtype, job.device), convention)
-    unit = "m² s" if convention is Convention.integral else "m²"
+    unit = convention.unit
     folder = job.folder / "csv"
     return write_results(folder, job.checkpoint, job.model, metrics, unit), Counterpart()
 

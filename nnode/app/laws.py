@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
-from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
+from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Rule
 from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.base import Effect
-from nnode.models.field import FIELD
+from nnode.models.field import FIELD, NEURONS
+from nnode.models.field_crowd import PEOPLE
 from nnode.models.formula import rule_of
-from nnode.models.own_law import FormulaLaw, law_from
+from nnode.models.own_law import FormulaForce, FormulaLaw, law_from
 from nnode.models.term import Interval, Term
 
 
@@ -27,7 +29,7 @@ def lines() -> Iterator[str]:
     for law in (Linear(), Logarithmic(), NetworkSpeed(4)):
         yield from _of(law, "dx/dt = ")
     for name, description in FIELD.items():
-        own = law_from(name, description)
+        own = law_from(name, description, network=NEURONS.get(name))
         yield from _of(own, "dx/dt = " if own.order == 1 else "dv/dt = ")
     for domain, title in (("traffic", "Effects in lanes; W is what law and effects before say"),
                           ("crowd", "Effects in crowds")):  # fmt: skip
@@ -35,6 +37,8 @@ def lines() -> Iterator[str]:
             yield "Forces on people"
             for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
                 yield from _of(force, "dv/dt = ")
+            for name, description in PEOPLE.items():
+                yield from _of(law_from(name, description), "")
         yield title
         for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
             yield from _of(effect(), "W becomes " if domain == "traffic" else "")
@@ -43,34 +47,65 @@ def lines() -> Iterator[str]:
 def _of(term: Term, left: str) -> Iterator[str]:
     rule = rule_of(term)
     networks = isinstance(term, NetworkSpeed | NetworkForce)
-    about = "" if isinstance(term, FormulaLaw) else (inspect.getdoc(term) or "").splitlines()[0]
+    about = (
+        ""
+        if isinstance(term, FormulaLaw | FormulaForce)
+        else (inspect.getdoc(term) or "").splitlines()[0]
+    )
     yield f"  {term.name}: {about}".rstrip()
-    if rule is None or networks:
+    if networks or (rule is None and term.second is None):
         yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
-    else:
+    elif rule is not None:
         yield from _ruled(rule, left)
+    if term.second is not None:
+        of = "of an acceleration, "
+        if rule is not None and rule == term.second:
+            yield f"    {of}the same"
+        else:
+            yield from _ruled(term.second, of + left, rule or Rule())
+    if isinstance(term, FormulaLaw) and term.network is not None:
+        yield f"    NN: {term.network.sizes[1]} neurons in one hidden layer, softplus"
     for name, unit in term.units.items():
         yield f"    {name}: {'a number' if unit == '1' else unit}{_bounds(term.bounds.get(name))}"
+    if isinstance(term, FormulaLaw) and term.step is not None:
+        yield f"    steps: {term.step}"
     yield f"    source: {term.source}"
 
 
-def _ruled(rule: Rule | CrowdRule, left: str) -> Iterator[str]:
+def _ruled(
+    rule: Rule | CrowdRule, left: str, told: Rule | CrowdRule | None = None
+) -> Iterator[str]:
+    """A rule, line by line; parts that are told already are left out."""
+    told = told or Rule()
     if isinstance(rule, CrowdRule):
         for axis, text in zip("xy", rule.rate, strict=True):
-            yield f"    dv{axis}/dt: + {text}"
-        for over, what in ((OTHERS, "others"), (POINTS, "wall points"), (WALLS, "walls")):
+            yield f"    dv{axis}/dt: + {text}" if rule.order == 2 else f"    d{axis}/dt = {text}"
+        for over, what in _REDUCED.items():
             for name, (_, text) in getattr(rule, over).items():
-                yield f"    {name} = sum over {what} of {text}"
+                yield f"    {name} = {what} of {text}"
     else:
         yield f"    {left}{rule.rate}" if rule.rate else f"    a leader's W becomes {rule.leader}"
-        for name, (_, rate) in rule.states.items():
-            yield f"    d{name}/dt = {rate}"
-    for name, text in rule.where.items():
+        for name, (text, _, delay) in rule.delayed.items():
+            yield f"    {name} = {text}, {delay} ago (at most {rule.remembered} steps)"
+        for name, (_, rate, *start) in rule.states.items():
+            begins = f", at the start {start[0]}" if start else ""
+            yield f"    d{name}/dt = {rate}{begins}"
+    for name, text in _new(rule.where, told.where):
         yield f"    {name} = {text}"
-    for name, (value, unit) in rule.constants.items():
+    for name, (value, unit) in _new(rule.constants, told.constants):
         yield f"    {name} = {value:g} {'' if unit == '1' else unit}".rstrip()
-    for name, unit in rule.inputs.items():
+    for name, unit in _new(rule.inputs, told.inputs):
         yield f"    {name}: of each agent, from the data{'' if unit == '1' else f' ({unit})'}"
+
+
+def _new(parts: Mapping[str, Any], told: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    return [(name, part) for name, part in parts.items() if told.get(name) != part]
+
+
+_REDUCED = {
+    "others": "sum over others", "points": "sum over wall points", "walls": "sum over walls",
+    "smallest": "smallest over others", "largest": "largest over others",
+}  # fmt: skip
 
 
 def _bounds(interval: Interval | None) -> str:

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from nnode.data.options import TableOptions
 from nnode.errors import ConfigError
 from nnode.models.field import FIELD, NEURONS
+from nnode.models.field_crowd import PEOPLE
 
 #: Models by the names that ``conf/model`` gives them.
 MODELS: dict[str, dict[str, Any]] = {
@@ -24,6 +25,7 @@ MODELS: dict[str, dict[str, Any]] = {
         name: {"term": "formula", "law": law, "network": NEURONS.get(name)}
         for name, law in FIELD.items()
     },
+    **{name: {"term": "formula", "law": law} for name, law in PEOPLE.items()},
     "formula": {"term": "formula"},
     "sf": {"term": "social_force"},
     "nn": {"term": "network_force"},

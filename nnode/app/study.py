@@ -20,7 +20,11 @@ from nnode.study.options import StudyOptions
 log = logging.getLogger(__name__)
 
 #: The module of each study; imported when it is asked for.
-STUDIES = {"traffic": "nnode.study.traffic.study", "crowd": "nnode.study.crowd.study"}
+STUDIES = {
+    "traffic": "nnode.study.traffic.study",
+    "crowd": "nnode.study.crowd.study",
+    "walking": "nnode.study.walking.study",
+}
 
 #: Folder of quick studies inside the study's own: they must not replace full results.
 QUICK = "quick"

@@ -18,6 +18,8 @@ from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
 from nnode.app.cli.sweep import RESULT
 from nnode.app.cli.typed import shell_override
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.damped import GaussNewton
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.interrupt import Interrupted
@@ -29,6 +31,7 @@ from nnode.calibrate.options import (
     TrainerOptions,
 )
 from nnode.calibrate.trainer import Provenance, Trainer
+from nnode.data.clusters import clusters
 from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import DataOptions, LoaderOptions
 from nnode.data.prepare import open_data
@@ -154,7 +157,7 @@ def train(config: DictConfig, folder: Path) -> None:
             stop.signal,
         ) from None
     if world.first:
-        _report(trainer, plain_config(config), folder, time.monotonic() - start)
+        _report(trainer, plain_config(config), folder, time.monotonic() - start, store)
 
 
 def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:
@@ -250,6 +253,22 @@ def _trainer(
     return trainer
 
 
+#: What is not known of a parameter without intervals.
+_UNKNOWN = {"low": None, "high": None}
+_BOUND = {"low": "lower", "high": "upper"}
+
+
+def _in_words(own: dict[str, Any]) -> str:
+    """A parameter with its interval, and what is wrong with it."""
+    text = f"{own['value']:.4g} {own['unit']}"
+    if own.get("at_bound"):
+        return f"{text}, at the {_BOUND[own['at_bound']]} bound of what is admissible"
+    if own["low"] is None:
+        return text
+    text += f"  [{own['low']:.4g}, {own['high']:.4g}]"
+    return text if own["identified"] else f"{text}, not identified by these data"
+
+
 _PARTS = ("train", "heldout", "dropped")
 
 
@@ -289,11 +308,31 @@ def _check_same_data(store: Store, checkpoint: Checkpoint | None) -> None:
         )
 
 
-def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: float) -> None:
+def _intervals(trainer: Trainer, store: Store) -> dict[str, Any]:
+    """Intervals of the best parameters, of models that have exact tangents; otherwise none."""
+    if not isinstance(trainer.optimizer, GaussNewton):
+        return {}
+    # compiled code takes a second to import
+    from nnode.calibrate.gauss_newton import TangentCost
+    from nnode.calibrate.intervals import intervals
+    from nnode.solvers.fused import FusedSolver
+
+    assert isinstance(trainer.solver, FusedSolver)
+    model = load_checkpoint(trainer.best_path).build().double()
+    places = {entry["name"]: i for i, entry in enumerate(store.index)}
+    indices = [places[name] for name in trainer.provenance.split["train"]]
+    (batch,) = stream(straight_loader(store, indices, 0))
+    cost = TangentCost(model, batch, trainer.solver, trainer.options.cost)
+    return intervals(cost, cost.row(model), clusters(store.index)[indices])
+
+
+def _report(
+    trainer: Trainer, config: dict[str, Any], folder: Path, seconds: float, store: Store
+) -> None:
     history = trainer.history
     first = history[0]
     best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
-    unit = "m² s" if config["trainer"]["cost"] == "integral" else "m²"
+    unit = Convention(config["trainer"]["cost"]).unit
     # an epoch of an older checkpoint that was resumed may know its parameters by other names
     physical = {
         name: (best[f"parameters/{name}"], unit)
@@ -321,7 +360,20 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
         "name": config["solver"]["name"],
         "uncompiled": getattr(trainer.solver, "uncompiled", "") or None,
     }
-    result = {"summary": summary, "solver": solver, "paths": paths, "history": history}
+    found = _intervals(trainer, store)
+    known = found.pop("parameters", {})
+    parameters = {
+        name: {**_UNKNOWN, "value": value, "unit": unit, **known.get(name, {})}
+        for name, (value, unit) in physical.items()
+    }
+    result = {
+        "summary": summary,
+        "parameters": parameters,
+        **found,
+        "solver": solver,
+        "paths": paths,
+        "history": history,
+    }
     write_json(folder / RESULT, result)
     print(
         f"cost of a training sequence: {first['cost/train']:.4g} -> {best['cost/train']:.4g} {unit}"
@@ -330,8 +382,8 @@ def _report(trainer: Trainer, config: dict[str, Any], folder: Path, seconds: flo
         before, after = first["cost/heldout"], best["cost/heldout"]
         print(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
     short = short_names(physical)
-    for name, (value, unit) in physical.items():
-        print(f"{short[name]} = {value:.4g} {unit}")
+    for name, own in parameters.items():
+        print(f"{short[name]} = {_in_words(own)}")
     for what, path in paths.items():
         if Path(path).exists():
             print(f"{what}: {path}")

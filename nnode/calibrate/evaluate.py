@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import Convention, sequence_costs, squared_error
+from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs, squared_error
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.laws.lane import Rule
-from nnode.models import FollowTheLeader, Relaxation, System, Traffic
+from nnode.models import Crowd, FollowTheLeader, Relaxation, System, Traffic
 from nnode.models.own_law import FormulaForce
 from nnode.models.term import Term
 from nnode.solvers.base import Solver, Trajectory
@@ -49,6 +49,8 @@ class Metrics:
             not positive; 0 for crowds.
         sequences: number of sequences.
         costs: cost of each sequence by name.
+        objectives: of vehicles, name of a cost to its mean over sequences, whichever one was
+            minimised; see :class:`nnode.calibrate.cost.Convention`. Empty for crowds.
     """
 
     J: float
@@ -58,6 +60,7 @@ class Metrics:
     collisions: float
     sequences: int
     costs: dict[str, float]
+    objectives: dict[str, float] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
         """As plain types, for JSON."""
@@ -77,6 +80,7 @@ def evaluate(
     total: dict[int, float] = {}
     number: dict[int, int] = {}
     final, agents, overlaps, followers = 0.0, 0, 0, 0
+    objectives: dict[str, float] = {}
     dt = 0.0
     for batch in batches:
         dt = batch.dt
@@ -93,6 +97,10 @@ def evaluate(
         final += float((distance * batch.agent).sum())
         agents += int(batch.agent.sum())
         if batch.x.shape[-1] == 1:
+            for kind in FOLLOWING:
+                if kind is not Convention.speed or trajectory.v is not None:
+                    total_of = float(sequence_costs(trajectory, batch, kind).sum())
+                    objectives[kind.value] = objectives.get(kind.value, 0.0) + total_of
             gap = trajectory.x[1:, :, 1:, 0] - trajectory.x[1:, :, :-1, 0]
             real = batch.valid[1:, :, 1:]
             overlaps += int(((gap <= 0) & real).sum())
@@ -111,6 +119,7 @@ def evaluate(
         collisions=overlaps / max(followers, 1),
         sequences=len(costs),
         costs=costs,
+        objectives={name: value / max(len(costs), 1) for name, value in objectives.items()},
     )
 
 
@@ -172,7 +181,8 @@ def no_interaction(system: System, solver: Solver, free_speed: float | None) -> 
     else:
         kept: list[Term] = [t for t in system.terms if isinstance(t, Relaxation)]
         kept += [t.alone() for t in system.terms if isinstance(t, FormulaForce)]
-        bare = type(system)(kept, system.wall_spacing)
+        assert isinstance(system, Crowd)
+        bare = Crowd(kept, system.wall_spacing, desired=system.desired)
     bare.to(next(system.parameters()))
     return lambda batch: solver(bare, batch)
 

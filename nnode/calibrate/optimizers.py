@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 
 from nnode.calibrate.adadelta import NoisyAdadelta
 from nnode.calibrate.consensus import ConsensusBased
+from nnode.calibrate.damped import GaussNewton
 from nnode.errors import ConfigError
 from nnode.models.system import System
 
@@ -69,6 +70,15 @@ class ConsensusOptions(OptimizerOptions):
     dt: float = 0.1  # of a step, no unit
 
 
+@dataclass
+class GaussNewtonOptions(OptimizerOptions):
+    """Damped Gauss-Newton on exact tangents; lanes with solver=fused, all sequences at once."""
+
+    name: str = "gauss_newton"
+    damping: float = 1e-3  # of the first step, relative to each parameter's curvature
+    tolerance: float = 1e-9  # ends when a step lowers the cost by less than this share
+
+
 def _trained(model: System) -> list[torch.nn.Parameter]:
     return [parameter for parameter in model.parameters() if parameter.requires_grad]
 
@@ -99,12 +109,17 @@ def _cbo(model: System, o: dict[str, Any], seed: int) -> Optimizer:
     return ConsensusBased(_trained(model), **o, project=model.project_, seed=seed)
 
 
+def _gauss_newton(model: System, o: dict[str, Any], seed: int) -> Optimizer:
+    return GaussNewton(model, **o)
+
+
 #: name: how to build it, and whether it compares costs of different steps
 OPTIMIZERS: dict[str, tuple[Callable[[System, dict[str, Any], int], Optimizer], bool]] = {
     "adadelta": (_adadelta, False),
     "adam": (_adam, False),
     "lbfgs": (_lbfgs, True),
     "cbo": (_cbo, True),
+    "gauss_newton": (_gauss_newton, True),
 }
 
 

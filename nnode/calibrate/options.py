@@ -44,9 +44,8 @@ class SolverOptions:
     """What all solvers share."""
 
     name: str = MISSING  # of the solver
-    dt: float | None = (
-        None  # s, step; null: 0.002 for speeds, 0.1 for accelerations in traffic, 0.0625 in crowds
-    )
+    # s, step; null: 0.002 for speeds and 0.1 for accelerations of vehicles, 0.0625 in crowds
+    dt: float | None = None
     # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: ballistic for
     # accelerations of vehicles, otherwise euler
     method: str | None = None

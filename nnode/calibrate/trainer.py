@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader
 from nnode.calibrate.adadelta import NoisyAdadelta
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.damped import GaussNewton
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import evaluate
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
@@ -30,7 +31,7 @@ from nnode.calibrate.options import Monitor, TrainerOptions
 from nnode.calibrate.progress import Reporter
 from nnode.data.dataset import EpochSampler
 from nnode.data.sequence import Batch
-from nnode.errors import CheckpointError, SimulationError
+from nnode.errors import CheckpointError, ConfigError, SimulationError
 from nnode.files import replacing
 from nnode.models import System
 from nnode.solvers.base import Solver
@@ -223,6 +224,13 @@ class Trainer:
                 self.optimizer.zero_grad()
                 return torch.tensor(1e3 * (1 + abs(costs[0])), dtype=self.dtype)
 
+        if isinstance(self.optimizer, GaussNewton):
+            if self.world.size > 1 or batch is None:
+                raise ConfigError("optimizer=gauss_newton works in one process; start only one")
+            self.optimizer.attach(self.solver, batch, self.options.cost)
+            self.sum += self.optimizer.step()
+            self.model.project_()
+            return
         loss = cast(Tensor, self.optimizer.step(cast(Any, closure)))
         self.model.project_()
         self.sum += float(loss.detach())
@@ -356,6 +364,8 @@ class Trainer:
             self._draw(logbook)
 
     def _stalled(self) -> bool:
+        if isinstance(self.optimizer, GaussNewton) and self.optimizer.converged:
+            return True
         return self.options.patience is not None and self.stale >= self.options.patience
 
     def _note(self) -> str:

@@ -20,8 +20,10 @@ def schema(dims: int) -> pa.Schema:
     axes = _AXES[:dims]
     units = {"time": "s"} | dict.fromkeys(axes, "m") | {f"v{a}": "m/s" for a in axes}
     units |= {"length": "m"} | {f"dest_{a}": "m" for a in axes}
+    units |= {f"preferred_{a}": "m/s" for a in axes}
     order = ["sequence", "recording", "time", "agent", *axes, *(f"v{a}" for a in axes)]
     order += ["length", "kind", "group", *(f"dest_{a}" for a in axes)]
+    order += [f"preferred_{a}" for a in axes if dims > 1]
     return pa.schema(
         [
             pa.field(name, pa.float64(), metadata={"unit": units[name]})
@@ -60,8 +62,8 @@ def to_table(item: Sequence) -> pa.Table:
     for d, axis in enumerate(_AXES[:dims]):
         columns[axis] = item.x[:, :, d].ravel()
         columns[f"v{axis}"] = None if item.v is None else item.v[:, :, d].ravel()
-        goal = item.destination
-        columns[f"dest_{axis}"] = None if goal is None else np.tile(goal[:, d], k)
+        for name, own in (("dest", item.destination), ("preferred", item.preferred)):
+            columns[f"{name}_{axis}"] = None if own is None else np.tile(own[:, d], k)
     fields = schema(dims)
     arrays = [
         pa.nulls(rows, field.type)
@@ -96,7 +98,7 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
         return np.array(column.to_numpy()).reshape(k, n)
 
     def vectors(prefix: str) -> np.ndarray | None:
-        columns = [numbers(prefix + axis) for axis in _AXES if axis in table.column_names]
+        columns = [numbers(prefix + a) for a in _AXES if prefix + a in table.column_names]
         found = [column for column in columns if column is not None]
         return np.stack(found, axis=-1) if found else None
 
@@ -107,7 +109,7 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
     time, x = numbers("time"), vectors("")
     if time is None or x is None:
         raise ValueError("the columns of times or positions are empty")
-    length, destination = numbers("length"), vectors("dest_")
+    length, destination, preferred = numbers("length"), vectors("dest_"), vectors("preferred_")
     return Sequence(
         name=entry["name"],
         recording=entry["recording"],
@@ -121,5 +123,6 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
         kind=names("kind"),
         group=names("group"),
         destination=None if destination is None else destination[0].copy(),
+        preferred=None if preferred is None else preferred[0].copy(),
         walls=walls,
     )

@@ -166,6 +166,9 @@ class PairOptions(DataOptions):
     # patterns of the files of a folder, of which the first that fits any is taken
     files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
     columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    # a table in that folder with a row per file: path, and meanings that the files have no columns
+    # of; where it is there, no other file is read
+    index: str | None = None
     # a regular expression, searched for in a file's path below the folder: its named groups are
     # meanings that the file has no column of
     pattern: str | None = None
@@ -240,6 +243,9 @@ class JuelichOptions(DataOptions):
     # {name: {line: [x1, y1, x2, y2], direction: +x}}, m: destinations on exit lines, by where
     # people walk (+x | -x | +y | -y | [x, y]); null: their last position in the sequence
     exits: Any = None
+    # s before a sequence in which preferred velocities are measured, for model.desired=direction;
+    # 0 measures none. Who is not tracked so long before has the velocity of his first sample
+    history: float = 1.0
 
 
 @dataclass

@@ -37,6 +37,8 @@ class Sequence:
         kind: N class names (``car``, ``truck``, ...), or None.
         group: N names of social groups (empty string: walks alone), or None.
         destination: ``(N, D)`` m, or None for the last position.
+        preferred: ``(N, D)`` m/s, mean velocity in the seconds before the sequence, NaN where
+            nothing was measured then; or None.
         walls: ``(W, 4)`` segments x1, y1, x2, y2 in m with the walkable side on their
             left, or None.
         split: the side of the published division that it is on, ``train`` or ``test``; empty: the
@@ -53,6 +55,7 @@ class Sequence:
     kind: tuple[str, ...] | None = None
     group: tuple[str, ...] | None = None
     destination: np.ndarray | None = None
+    preferred: np.ndarray | None = None
     walls: np.ndarray | None = None
     site: str = ""
     split: str = ""
@@ -71,6 +74,7 @@ class Sequence:
             ("v", x.shape),
             ("length", (n,)),
             ("destination", (n, d)),
+            ("preferred", (n, d)),
         ):
             value = getattr(self, field)
             if value is not None:
@@ -134,6 +138,7 @@ class Sequence:
             kind=names(self.kind),
             group=names(self.group),
             destination=None if self.destination is None else self.destination[index],
+            preferred=None if self.preferred is None else self.preferred[index],
         )
 
 
@@ -157,6 +162,8 @@ class Batch:
         walls: ``(B, W, 4)`` segments, m; NaN in the padding. W may be 0.
         names: names of the sequences.
         kind, group: per sequence the agents' class and group names, or None.
+        preferred: ``(B, N, D)`` mean velocities before the sequences, m/s, NaN where nothing was
+            measured then; None: nowhere.
     """
 
     dt: float
@@ -171,6 +178,7 @@ class Batch:
     names: tuple[str, ...]
     kind: tuple[tuple[str, ...] | None, ...] = ()
     group: tuple[tuple[str, ...] | None, ...] = ()
+    preferred: Tensor | None = None
 
     @property
     def n_samples(self) -> int:
@@ -233,6 +241,7 @@ def collate(sequences: Iterable[Sequence]) -> Batch:
     length = np.full((b, n), np.nan)
     walls = np.full((b, w, 4), np.nan)
     destination = np.empty((b, n, d))
+    preferred = np.full((b, n, d), np.nan)
     for i, item in enumerate(items):
         ki, ni = item.n_samples, item.n_agents
         x[:ki, i, :ni] = item.x
@@ -244,6 +253,8 @@ def collate(sequences: Iterable[Sequence]) -> Batch:
         destination[i] = x[-1, i]
         if item.destination is not None:
             destination[i, :ni] = item.destination
+        if item.preferred is not None:
+            preferred[i, :ni] = item.preferred
         if item.length is not None:
             length[i, :ni] = item.length
         if item.walls is not None:
@@ -261,4 +272,7 @@ def collate(sequences: Iterable[Sequence]) -> Batch:
         names=tuple(item.name for item in items),
         kind=tuple(item.kind for item in items),
         group=tuple(item.group for item in items),
+        preferred=None
+        if all(item.preferred is None for item in items)
+        else torch.from_numpy(preferred),
     )

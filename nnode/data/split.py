@@ -3,7 +3,9 @@
 Where clusters (:mod:`nnode.data.clusters`) are small, whole clusters are drawn at random. Where
 they are not - in a corridor everyone takes part in several successive sequences, which chains a
 whole recording together - one contiguous block of time is held out from each recording, and the
-sequences at its borders that share an agent with it are dropped from training.
+sequences at its borders that share an agent with it are dropped from training. Where more would be
+dropped than trained on, as in runs in which everybody is there throughout, whole clusters are held
+out all the same.
 
 Where the source publishes which sequences it trains on and which it tests on, that is taken, so
 that errors can be compared with those that others print.
@@ -87,8 +89,17 @@ def split(sequences: Store | Index, options: SplitOptions) -> Split:
     result = _by_component(index, share, gap, rng)
     target = share * len(index)
     near = abs(len(result.heldout) - target) <= max(1.0, TOLERANCE * target)
-    if mode is SplitMode.auto and not (near and result.heldout and result.train):
-        return _by_block(index, share, gap, rng)
+    sound = bool(result.heldout and result.train)
+    if mode is SplitMode.auto and not (near and sound):
+        try:
+            block = _by_block(index, share, gap, rng)
+        except DataError:
+            if not sound:
+                raise
+        else:
+            # runs in which everybody is there throughout lose all that stands beside a block
+            if not sound or len(block.dropped) <= len(block.train):
+                return block
     return _checked(result, share, "data.split.mode=block holds out a block of time instead")
 
 

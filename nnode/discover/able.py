@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from nnode.errors import ConfigError
+from nnode.laws.crowd import SMALLEST
+from nnode.models.crowd_formula import CrowdBase, crowd_of
 from nnode.models.effects import Effect, IndividualEffect
 from nnode.models.extend import effects_of
 from nnode.models.system import System
@@ -33,6 +35,13 @@ def check_model(system: System) -> None:
         raise ConfigError(
             "the diagnosis of lanes simulates laws of first order, and this one says an "
             "acceleration; it can be trained and evaluated, but not yet diagnosed"
+        )
+    law = crowd_of([t for t in system.terms if isinstance(t, CrowdBase)])
+    if system.domain == "crowd" and law is not None and (law.order == 1 or law.sums[SMALLEST]):
+        what = "of first order" if law.order == 1 else "with smallest values over others"
+        raise ConfigError(
+            f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "
+            "evaluated, but not yet diagnosed"
         )
     for term in system.terms if system.domain == "crowd" else ():
         if term.memory:

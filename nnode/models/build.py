@@ -18,6 +18,7 @@ from nnode.models.effects.own import VARIABLE, load_own
 from nnode.models.formula import rule_of
 from nnode.models.own_law import FormulaForce, law_from
 from nnode.models.system import Crowd, System, Traffic
+from nnode.models.term import Term
 from nnode.models.traffic import Linear, Logarithmic, NetworkSpeed
 
 Options = Mapping[str, Any]
@@ -49,7 +50,7 @@ def _formula(options: Options, generator: torch.Generator) -> System:
         generator=generator,
     )
     if isinstance(law, FormulaForce):
-        return Crowd([law])
+        return _crowd([law], options)
     leader = str(getattr(options["leader"], "value", options["leader"]))
     if leader == "constant" and law.order == 1 and "v0" not in law.scalars:
         raise ConfigError(
@@ -82,7 +83,7 @@ def _social_force(options: Options, generator: torch.Generator) -> System:
         walls=options["walls"],
         opposing_wall_friction=options["opposing_wall_friction"],
     )
-    return Crowd([Relaxation(options["tau"]), term], options["wall_spacing"])
+    return _crowd([_drive(options), term], options)
 
 
 def _network_force(options: Options, generator: torch.Generator) -> System:
@@ -95,7 +96,22 @@ def _network_force(options: Options, generator: torch.Generator) -> System:
         self_interaction=options.get("self_interaction", False),
         generator=generator,
     )
-    return Crowd([Relaxation(options["tau"]), term], options["wall_spacing"])
+    return _crowd([_drive(options), term], options)
+
+
+def _desired(options: Options) -> str:
+    # checkpoints from before there was this option do not name it
+    found = options.get("desired", "last")
+    return str(getattr(found, "value", found))
+
+
+def _drive(options: Options) -> Relaxation:
+    """Towards the destination: at the present speed, as the paper's, or at the preferred one."""
+    return Relaxation(options["tau"], preferred=_desired(options) != "last")
+
+
+def _crowd(terms: list[Term], options: Options) -> Crowd:
+    return Crowd(terms, options.get("wall_spacing", 0.25), desired=_desired(options))
 
 
 #: Every calibrated term, by the name that ``model.term`` gives it.
@@ -138,7 +154,7 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
     """Give a model effects of the catalogue, each in its place in the sum.
 
     Args:
-        chosen: per effect its ``name`` and any of its parameters.
+        chosen: per effect its ``name`` and any of its parameters, or the name alone.
 
     Raises:
         ConfigError: an effect that the catalogue or the model's domain does not have, or a
@@ -146,15 +162,14 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
     """
     if chosen:
         load_own()
+    if chosen and model.domain == "crowd" and model.order == 1:
+        raise ConfigError(
+            "model.effects change accelerations of people, and this law is of first order: it "
+            "says their velocity; leave them out"
+        )
     added = []
     for entry in chosen:
-        if not isinstance(entry, Mapping) or "name" not in entry:
-            raise ConfigError(
-                f"model.effects has the entry {entry!r}, expected a name and parameters such as "
-                "{name: relative_speed, kappa: 0.3}"
-            )
-        values = {str(key): value for key, value in entry.items() if key != "name"}
-        name = str(entry["name"])
+        name, values = _entry(entry)
         known = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain))]
         if name not in known:
             near = get_close_matches(name, known, n=1)
@@ -175,6 +190,22 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
                 model.lane  # noqa: B018 - says what the law does not have
             except ConfigError as error:
                 raise ConfigError(f"model.effects: {effect.name} cannot act: {error}") from error
+
+
+def _entry(entry: Any) -> tuple[str, dict[str, Any]]:
+    """An effect's name and parameters, in any of the ways to write them."""
+    if isinstance(entry, str):
+        return entry, {}
+    if isinstance(entry, Mapping) and "name" in entry:
+        return str(entry["name"]), {str(k): v for k, v in entry.items() if k != "name"}
+    if isinstance(entry, Mapping) and len(entry) == 1:
+        ((name, values),) = entry.items()
+        if isinstance(values, Mapping):
+            return str(name), {str(k): v for k, v in values.items()}
+    raise ConfigError(
+        f"model.effects has the entry {entry!r}, expected a name, a name and its parameters as "
+        "{relative_speed: {kappa: 0.3}}, or {name: relative_speed, kappa: 0.3}"
+    )
 
 
 def _check_order(model: System, effect: Effect) -> None:

@@ -49,6 +49,10 @@ class Relaxation(CrowdBase):
     """Relaxation towards the destination at the present speed.
 
     (v_des - v) / tau with v_des = |v| (x_D - x) / |x_D - x|; tau (s) is fixed.
+
+    Args:
+        tau: s.
+        preferred: at everybody's preferred speed in place of the present one.
     """
 
     name = "relaxation"
@@ -60,10 +64,18 @@ class Relaxation(CrowdBase):
         drive=True,
     )
 
-    def __init__(self, tau: float = 0.5) -> None:
+    def __init__(self, tau: float = 0.5, preferred: bool = False) -> None:
         super().__init__()
         _positive(tau=tau)
-        self.tau = tau
+        self.tau, self.preferred = tau, preferred
+        if preferred:
+            self.rule = replace(
+                Relaxation.rule, rate=("(pace*way_x - vx)/tau", "(pace*way_y - vy)/tau")
+            )
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        return (*super().shape, self.preferred)
 
 
 class InteractionForce(CrowdBase):

@@ -10,7 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdLaw, CrowdRule, with_rule
+from nnode.laws.crowd import (
+    NOBODY,
+    OTHERS,
+    POINTS,
+    SMALLEST,
+    WALLS,
+    CrowdLaw,
+    CrowdRule,
+    with_rule,
+)  # fmt: skip
 from nnode.laws.expression import const
 from nnode.laws.tensors import Code, computed
 from nnode.models.formula import own_values, owners, parameters_of, rule_of, values_of
@@ -106,16 +115,18 @@ def people_of(terms: Sequence[Any], law: CrowdLaw, scene: Scene) -> dict[str, Te
     """Symbol to ``(B, N)`` or ``(B, 1)`` values of what people have from the data."""
     found = {name: terms[i].inputs(scene)[part] for name, (i, part) in law.inputs.items()}
     found["people"], found["points"] = scene.count[:, 0], scene.wall_count[:, 0]
-    found["start"] = scene.start[:, None]
+    found["start"], found["pace"] = scene.start[:, None], scene.pace
     return {name: value.to(scene.destination.dtype) for name, value in found.items()}
 
 
 def rates_of(
     terms: Sequence[Term], law: CrowdLaw, state: State, code: Mapping[str, Code] | None = None
 ) -> Tensor:
-    """``(B, N, 2)`` m/s² of a crowd's formula."""
+    """``(B, N, 2)`` m/s² of a crowd's formula, m/s where it is of first order."""
     x, scene = state.x, state.scene
-    v = state.others[1] if state.v is None else state.v
+    v = state.v
+    if v is None:
+        v = torch.zeros_like(x) if law.order == 1 else state.others[1]
     given: dict[str, Tensor] = {"t": state.t.to(x.dtype)}
     given |= dict(zip(law.owned, values_of(law, own_values(terms, law)), strict=True))
     given |= {name: x.new_tensor(value) for name, value in settings_of(terms, law).items()}
@@ -127,16 +138,31 @@ def rates_of(
         if not found:
             continue
         seen, real = _SEEN[over](state, x, v)
-        if over == OTHERS:
+        if over in (OTHERS, SMALLEST):
             seen |= {f"{name}_j": own[name][:, None] for name in law.inputs}
-        values = given | {name: value[:, :, None] for name, value in own.items()} | seen
+        known = own | sums if over == SMALLEST else own
+        values = given | {name: value[:, :, None] for name, value in known.items()} | seen
         each = computed(list(found.values()), values, code=code)
+        reduced = _least if over == SMALLEST else _sum
         sums |= {
-            name: (value * real).sum(2).expand(x.shape[:2])
+            name: reduced(value, real).expand(x.shape[:2])
             for name, value in zip(found, each, strict=True)
         }
     rate = computed(law.rate, given | own | sums, code=code)
     return torch.stack([part.expand(x.shape[:2]) for part in rate], -1)
+
+
+def _sum(value: Tensor, real: Tensor) -> Tensor:
+    """Over the third axis, of what exists."""
+    return (value * real).sum(2)
+
+
+def _least(value: Tensor, real: Tensor) -> Tensor:
+    """The smallest over the third axis, of what exists; the slope is that of the first of them."""
+    value = torch.where(real > 0, value, NOBODY)
+    nobody = value.new_full((*value.shape[:2], 1), NOBODY)
+    value = torch.cat([value, nobody], 2)
+    return value.gather(2, value.detach().argmin(2, keepdim=True))[..., 0]
 
 
 _Seen = tuple[dict[str, Tensor], Tensor]
@@ -144,7 +170,7 @@ _Seen = tuple[dict[str, Tensor], Tensor]
 
 def _others(state: State, x: Tensor, v: Tensor) -> _Seen:
     """What everybody (second axis) sees of the others (third), and 1 where they are others."""
-    other, speed = state.others
+    other, speed = state.seen or (x, v)
     dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
     apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
     seen = {"dx": dx[..., 0], "dy": dx[..., 1], "dvx": dv[..., 0], "dvy": dv[..., 1]}
@@ -173,4 +199,4 @@ def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
     return torch.cat([ends[..., :2], ends[..., 2:] - ends[..., :2]], -1), real
 
 
-_SEEN = {OTHERS: _others, POINTS: _points, WALLS: _walls}
+_SEEN = {OTHERS: _others, POINTS: _points, WALLS: _walls, SMALLEST: _others}

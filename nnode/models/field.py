@@ -129,11 +129,15 @@ FIELD: dict[str, dict[str, Any]] = {
             "T": _quantity(1, 0, 3, "s"),
             "d": _quantity(6, 0, 40, "m"),
         },
-        # the leader's path, T later and d further back, and no step faster than v0
-        "delayed": {"late": ["v_1", "m/s", "T"]},
+        # the leader's path, T later and d further back, and no step faster than v0; what is
+        # remembered is how far the leader is from where its first speed would have brought it
+        "states": {"begun": ["m/s", "0", "v_1"]},
+        "delayed": {"off": ["x_1 - t*begun", "m", "max(T - dt, 0)"]},
         "remembered": 30,
-        "states": {"driven": ["m", "v_1 - late", "T*v_1"]},
-        "where": {"next": "(gap - length_1 - d - driven)/dt + late"},
+        "where": {
+            "ahead": "off + (t - max(T - dt, 0))*begun + max(dt - T, 0)*v_1",
+            "next": "(ahead - length_1 - d - x)/dt",
+        },
         "rate": {"v": "(clip(next, 0, v0) - v)/dt"},
         "step": "semi_implicit",
         "source": "Newell 2002",

@@ -53,8 +53,14 @@ class Law(Term):
         lane = lane_of([self])
         assert lane is not None, "a law without a formula defines its speed"
         assert lane.law is not None
+        return self.computed([substitute(lane.law, lane.fixed)], values)[0]
+
+    def computed(self, formulas: Sequence[Expr], values: Mapping[str, Tensor]) -> list[Tensor]:
+        """Formulas of its parameters and of other quantities."""
+        lane = lane_of([self])
+        assert lane is not None
         own = dict(zip(lane.owned, values_of(lane, own_values([self], lane)), strict=True))
-        return computed([substitute(lane.law, lane.fixed)], {**own, **values})[0]
+        return computed(formulas, {**own, **values})
 
 
 def rule_of(term: Term) -> Any:
@@ -251,6 +257,7 @@ def starts_of(
         values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
     values |= inputs_of(terms, lane, scene)
     values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
+    values["dt"] = y.new_tensor(scene.step)
     found = _starts(lane)(y, values, scene.follower, scene.leader, None)
     return {name: found[..., i] for i, name in enumerate(lane.rates) if name in lane.starts}
 

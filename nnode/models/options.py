@@ -16,6 +16,20 @@ class Leader(str, Enum):
     measured = "measured"
 
 
+class Desired(str, Enum):
+    """Where people want to go, and how fast.
+
+    ``last`` is the paper's: to where each was last measured, at his present speed. This hands the
+    model the end of what it predicts. ``exit``: to the destinations that the data give;
+    ``direction``: along their stream; both at the preferred speed, which is measured in the
+    seconds before the sequence (``data.history``), else at its first sample.
+    """
+
+    last = "last"
+    exit = "exit"
+    direction = "direction"
+
+
 @dataclass
 class ModelOptions:
     """What all models share."""
@@ -46,6 +60,9 @@ class FormulaOptions(ModelOptions):
     # neurons of a network NN that the law's rate calls, or that stands beside it; null: none
     network: int | None = None
     box: float | None = None  # its weights stay in [-box, box]; null leaves them free
+    # of people: last (hands them the end of what is predicted) | exit | direction
+    desired: Desired = Desired.last
+    wall_spacing: float = 0.25  # m between the points that stand for a wall, of people
 
 
 @dataclass
@@ -66,6 +83,8 @@ class CrowdOptions(ModelOptions):
     mass: float = 1.0  # kg, of a person
     walls: bool = True  # whether walls push, where the data have some
     wall_spacing: float = 0.25  # m between the points that stand for a wall
+    # last (the paper's: hands people the end of what is predicted) | exit | direction
+    desired: Desired = Desired.last
 
 
 @dataclass

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nnode.errors import ConfigError
-from nnode.laws.crowd import OTHERS, POINTS, WALLS, CrowdRule
+from nnode.laws.crowd import OTHERS, POINTS, SMALLEST, WALLS, CrowdRule
 from nnode.laws.expression import Expr, const, symbol
 from nnode.laws.lane import Lane, Rule, of_rule
 from nnode.laws.parse import parse
@@ -41,10 +41,14 @@ _KEYS = (
     "rate",
     "source",
 )
+_CROWD_KEYS = ("parameters", "constants", "where", "rate", "source")
 _SUMS = (OTHERS, POINTS, WALLS)
 #: A network beside a law, by its order: what is named is brought to the size of one, SI units.
 _BESIDE = {1: "NN(gap/20)", 2: "NN(gap/20, v/10, dv/2)"}
 _CALLS = re.compile(r"\bNN\s*\(")
+_LARGEST = "largest"
+#: Entries that are reduced over others or walls.
+_REDUCED = (*_SUMS, SMALLEST, _LARGEST)
 _PARAMETER = ("value", "low", "high")
 
 
@@ -139,13 +143,20 @@ class FormulaLaw(_Own, Law):
         if not isinstance(rate, Mapping) or list(rate) not in (["x"], ["v"]):
             raise ConfigError(
                 f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
-                "or v: a formula of an acceleration (second order); or vx and vy, of a crowd"
+                "or v: a formula of an acceleration (second order); or vx and vy, of a crowd, or "
+                "x and y, of a crowd of first order"
             )
         ((state, text),) = rate.items()
         self.order = 1 if state == "x" else 2
         parts = {str(k): str(v) for k, v in (where or {}).items()}
         text, beside = str(text), False
-        if network is not None and not any(_CALLS.search(t) for t in (text, *parts.values())):
+        calls = any(_CALLS.search(t) for t in (text, *parts.values()))
+        if calls and network is None:
+            raise ConfigError(
+                f"model.law of {self.name} calls NN, a network: say how many neurons its hidden "
+                "layer has, as model.network=4"
+            )
+        if network is not None and not calls:
             text, beside = f"{text} + {_BESIDE[self.order]}", True
         self.formula = text  # type: ignore[misc]
         self.rule = Rule(
@@ -213,20 +224,24 @@ class FormulaLaw(_Own, Law):
         """W at a gap (m) where everybody drives at one speed, m/s; the least such speed of an
         acceleration that is not negative at rest, up to 100 m/s."""
         zero = torch.zeros_like(gap)
-        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "dt": zero + _STEP}
-        known |= dict.fromkeys(self.lane(self.name).starts, zero)
+        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
+        lane = self.lane(self.name).flat()
+
+        def says(v: Tensor) -> Tensor:
+            """The formula where everybody has driven at v for long."""
+            values = {**known, "v": v, "v_1": v, "dx_1": v, **dict.fromkeys(lane.starts, zero)}
+            begun = self.computed(list(lane.starts.values()), values)
+            values |= dict(zip(lane.starts, begun, strict=True))
+            return self.evaluated(values).expand_as(gap)
+
         if self.order == 1:
-            return self.evaluated(known).expand_as(gap)
-
-        def wants(v: Tensor) -> Tensor:
-            return self.evaluated({**known, "v": v, "v_1": v, "dx_1": v}).expand_as(gap)
-
+            return says(zero)
         low, high = zero, torch.full_like(gap, FASTEST)
         for _ in range(60):
             half = (low + high) / 2
-            faster = wants(half) > 0
+            faster = says(half) > 0
             low, high = torch.where(faster, half, low), torch.where(faster, high, half)
-        return torch.where(wants(zero) > 0, low, zero)
+        return torch.where(says(zero) > 0, low, zero)
 
     def forward(self, state: State) -> Tensor:
         raise ConfigError(
@@ -235,13 +250,15 @@ class FormulaLaw(_Own, Law):
 
 
 class FormulaForce(_Own, CrowdBase):
-    """A law of people, written as formulas of both components of their acceleration.
+    """A law of people, written as formulas of both components of their acceleration, or velocity.
 
     Args:
         name, parameters, where, source: as of :class:`FormulaLaw`.
-        rate: ``{vx: formula, vy: formula}``, m/s²; what they may name stands in
-            :mod:`nnode.laws.crowd`.
+        rate: ``{vx: formula, vy: formula}``, m/s², or ``{x: formula, y: formula}``, m/s, of a law
+            of first order; what they may name stands in :mod:`nnode.laws.crowd`.
+        constants: name to a quantity that is not calibrated.
         others, points, walls: name to summand of sums over the others, wall points, walls.
+        smallest, largest: name to formula of smallest and largest values over the others.
 
     Raises:
         ConfigError: what is missing, cannot be read, or has the wrong unit.
@@ -254,27 +271,32 @@ class FormulaForce(_Own, CrowdBase):
         rate: Mapping[str, str],
         where: Mapping[str, str] | None = None,
         source: str = "",
+        constants: Mapping[str, str] | None = None,
         **sums: Mapping[str, str],
     ) -> None:
         super().__init__()
         self.name, self.source = str(name), str(source)  # type: ignore[misc]
-        if set(rate) != {"vx", "vy"}:
+        axes = ("x", "y") if set(rate) == {"x", "y"} else ("vx", "vy")
+        if set(rate) != set(axes):
             raise ConfigError(
                 f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
-                "components of a person's acceleration"
+                "components of a person's acceleration; or x and y: of his velocity"
             )
-        self.formula = f"{rate['vx']}, {rate['vy']}"  # type: ignore[misc]
+        self.order = 1 if axes == ("x", "y") else 2
+        first, second = (str(rate[axis]) for axis in axes)
+        self.formula = f"{first}, {second}"  # type: ignore[misc]
         over = {
             kind: {str(part): ("", str(text)) for part, text in (found or {}).items()}
             for kind, found in sums.items()
         }
         parts = {str(k): str(v) for k, v in (where or {}).items()}
+        reduced: dict[str, Any] = {kind: over.get(kind, {}) for kind in _REDUCED}
         self.rule = CrowdRule(
-            rate=(str(rate["vx"]), str(rate["vy"])),
-            others=over.get(OTHERS, {}),
-            points=over.get(POINTS, {}),
-            walls=over.get(WALLS, {}),
+            rate=(first, second),
+            **reduced,
             where=parts,
+            constants={str(k): in_si(str(v)) for k, v in (constants or {}).items()},
+            order=self.order,
         )
         for own, value in parameters.items():
             self._declare(str(own), value)
@@ -285,10 +307,14 @@ class FormulaForce(_Own, CrowdBase):
         law, found = formula_of(self), copy.copy(self)
         assert isinstance(self.rule, CrowdRule)
 
-        def none(over: str) -> dict[str, tuple[str, str]]:
-            return {n: (law.units[f"{self.name}__{n}"], "0") for n in getattr(self.rule, over)}
+        value = {SMALLEST: "nobody", _LARGEST: "-nobody"}
 
-        found.rule = replace(self.rule, others=none(OTHERS), points=none(POINTS), walls=none(WALLS))
+        def none(over: str) -> dict[str, tuple[str, str]]:
+            text = value.get(over, "0")
+            return {n: (law.units[f"{self.name}__{n}"], text) for n in getattr(self.rule, over)}
+
+        bare: dict[str, Any] = {over: none(over) for over in _REDUCED}
+        found.rule = replace(self.rule, **bare)
         return found
 
 
@@ -304,8 +330,8 @@ def law_from(name: str, description: Any, **network: Any) -> FormulaLaw | Formul
             "rate: {x: v0*(1 - L/gap)}}"
         )
     rate = description["rate"]
-    people = isinstance(rate, Mapping) and not {"vx", "vy"}.isdisjoint(rate)
-    keys = (*_KEYS, *(_SUMS if people else ()))
+    people = isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
+    keys = (*_CROWD_KEYS, *_REDUCED) if people else _KEYS
     unknown = sorted(set(map(str, description)) - set(keys))
     if unknown:
         raise ConfigError(

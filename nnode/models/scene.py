@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
+from nnode.errors import DataError
 
 
 @dataclass
@@ -33,6 +34,8 @@ class Scene:
         segment: ``(B, W, 4)`` walls x1, y1, x2, y2, m; NaN in the padding.
         start: ``(B,)`` clock time of the first sample, s.
         step: s, of the solver; method: what becomes of a law in it, see :mod:`nnode.laws.steps`.
+        preferred: ``(B, N, D)`` velocities before the sequence, m/s; the first measured ones where
+            nothing was measured before.
         names: of the sequences.
         kind, group: per sequence the agents' class and group names, or None.
     """
@@ -52,6 +55,7 @@ class Scene:
     wall_count: Tensor
     segment: Tensor
     start: Tensor
+    preferred: Tensor
     step: float = 0.1
     method: str = "euler"
     names: tuple[str, ...] = ()
@@ -82,6 +86,7 @@ class Scene:
             wall_count=real.sum(1).clamp(min=1).to(batch.x.dtype)[:, None, None],
             segment=batch.walls,
             start=batch.start,
+            preferred=_preferred(batch),
             names=batch.names,
             kind=batch.kind,
             group=batch.group,
@@ -107,6 +112,11 @@ class Scene:
         # an index that stays a tensor lets the equations be recorded and run in batches
         before, after = samples.index_select(0, torch.stack([k, k + 1]))
         return torch.lerp(before, after, (position - k).clamp(0, 1).to(before.dtype))
+
+    @cached_property
+    def pace(self) -> Tensor:
+        """``(B, N)`` preferred speeds, m/s."""
+        return torch.linalg.vector_norm(self.preferred.detach(), dim=-1)
 
     @cached_property
     def mean_length(self) -> Tensor:
@@ -137,6 +147,54 @@ class Scene:
                 if name:
                     masks[name][b, i] = True
         return {name: mask.to(self.agent.device) for name, mask in masks.items()}
+
+
+#: Where people want to go: to the end of the sequence; to destinations from the data; along
+#: their stream.
+DESIRED = ("last", "exit", "direction")
+#: So far away (m) lies the destination of who wants to walk in a direction.
+FAR = 1e4
+
+
+def wanted(scene: Scene, batch: Batch, desired: str) -> Scene:
+    """The scene with the destinations that a model is to know.
+
+    Args:
+        desired: ``last``: those of the batch, by default everybody's last measured position, which
+            hands the model the end of what it predicts; ``exit``: those of the batch, which must
+            be others; ``direction``: far ahead in the direction of a person's stream. That is
+            the mean preferred velocity of everybody in the sequence whose own is within a right
+            angle of his, measured before the sequence, or at its first sample where nothing was.
+
+    Raises:
+        DataError: ``exit``, and the data tell no destinations.
+    """
+    if desired == "last":
+        return scene
+    if desired == "exit":
+        last = batch.valid.sum(0).clamp(min=1) - 1
+        end = batch.x.gather(0, last[None, ..., None].expand(1, *batch.x.shape[1:]))[0]
+        if bool((batch.destination == end)[batch.agent].all()):
+            raise DataError(
+                "model.desired=exit needs destinations from the data, and these are the last "
+                "measured positions; name data.exits, give a table with dest_x and dest_y, or take "
+                "model.desired=direction"
+            )
+        return scene
+    # constants: nothing is differentiated by what people want
+    own = scene.preferred.detach() * scene.agent[..., None]
+    with_him = (own @ own.mT > 0).to(own.dtype)
+    stream = with_him @ own
+    length = torch.linalg.vector_norm(stream, dim=-1, keepdim=True)
+    # who stood has no direction: he wants to stay
+    ahead = scene.measured[0].detach() + FAR * stream / length.clamp(min=1e-9)
+    return replace(scene, destination=torch.where(scene.agent[..., None], ahead, batch.destination))
+
+
+def _preferred(batch: Batch) -> Tensor:
+    if batch.preferred is None:
+        return batch.v[0]
+    return torch.where(batch.preferred.isfinite(), batch.preferred, batch.v[0])
 
 
 def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:

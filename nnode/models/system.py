@@ -12,9 +12,10 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
+from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Lane
 from nnode.models.formula import Law, begins, lane_of, rates_of, starts_of
-from nnode.models.scene import Scene
+from nnode.models.scene import DESIRED, Scene, wanted
 from nnode.models.term import Interval, State, Term, physical_parameters, short_names
 
 T = TypeVar("T", bound=Term)
@@ -65,12 +66,16 @@ class System(nn.Module):
             )
         return Scene.of(batch, self.wall_spacing)
 
-    def initial(self, batch: Batch) -> Tensor:
-        """``(B, N, order * D)``: the measured state at the first sample."""
-        start = [batch.x[0], batch.v[0]][: self.order]
-        return torch.cat([*start, *self._memories(batch)], -1)
+    def initial(self, batch: Batch, step: float | None = None) -> Tensor:
+        """``(B, N, order * D)``: the measured state at the first sample.
 
-    def _memories(self, batch: Batch) -> list[Tensor]:
+        Args:
+            step: s, of the solver, for laws whose formula names it.
+        """
+        start = [batch.x[0], batch.v[0]][: self.order]
+        return torch.cat([*start, *self._memories(batch, step)], -1)
+
+    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
         """``(B, N, M)`` additional states at the start, term by term."""
         x, v = batch.x[0], batch.v[0]
         return [term.remember(x, v, self) for term in self._terms() if term.memory]
@@ -166,12 +171,13 @@ class Traffic(System):
         """The model's formula; None where a term is code without one."""
         return lane_of(self._terms())
 
-    def _memories(self, batch: Batch) -> list[Tensor]:
+    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
         lane = self.lane
         if lane is None or not lane.starts:
-            return super()._memories(batch)
-        x, v, terms = batch.x[0], batch.v[0], self._terms()
-        known = starts_of(terms, lane, x, v, self.scene(batch))
+            return super()._memories(batch, step)
+        x, v, terms, scene = batch.x[0], batch.v[0], self._terms(), self.scene(batch)
+        scene = scene if step is None else replace(scene, step=step)
+        known = starts_of(terms, lane, x, v, scene)
         told = [t.remember(x, v, self) for t in terms if t.memory and not begins(t, self.order)]
         others = iter(torch.cat(told, -1).unbind(-1) if told else ())
         added = list(lane.rates)[self.order :]
@@ -223,9 +229,11 @@ class Traffic(System):
 
 
 class Crowd(System):
-    """Second order, two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms.
+    """Two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms; or dx_i/dt, of a law of
+    first order.
 
     Args:
+        desired: where people want to go, see :func:`nnode.models.scene.desired`.
         neighbours: ``simulated``: people react to each other's simulated states;
             ``measured``: each is simulated alone among the measured paths of the others.
     """
@@ -235,14 +243,29 @@ class Crowd(System):
     dim = 2
 
     def __init__(
-        self, terms: Iterable[Term], wall_spacing: float = 0.25, neighbours: str = "simulated"
+        self,
+        terms: Iterable[Term],
+        wall_spacing: float = 0.25,
+        neighbours: str = "simulated",
+        desired: str = "last",
     ) -> None:
         super().__init__(terms, wall_spacing)
+        if desired not in DESIRED:
+            raise ValueError(f"desired={desired} is unknown, expected {', '.join(DESIRED)}")
+        self.desired = desired
+        if any(isinstance(rule := term.rule, CrowdRule) and rule.order == 1 for term in terms):
+            self.order = 1
         if neighbours not in ("simulated", "measured"):
             raise ValueError(f"neighbours={neighbours} is unknown, expected simulated or measured")
         self.neighbours = neighbours
 
+    def scene(self, batch: Batch) -> Scene:
+        return wanted(super().scene(batch), batch, self.desired)
+
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
+        if self.order == 1:
+            seen = (scene.measured_at(t),) * 2 if self.neighbours == "measured" else None
+            return self._rates(State(t, y, None, scene, seen=seen), None)[0]
         x, v, memory = y[..., :2], y[..., 2:4], y[..., 4:]
         seen = None
         if self.neighbours == "measured":
@@ -258,12 +281,14 @@ class _Initial(nn.Module):
         super().__init__()
         self.system = system
 
-    def forward(self, batch: Batch) -> Tensor:
-        return self.system.initial(batch)
+    def forward(self, batch: Batch, step: float | None) -> Tensor:
+        return self.system.initial(batch, step)
 
 
-def initial_with(system: System, parameters: Mapping[str, Tensor], batch: Batch) -> Tensor:
+def initial_with(
+    system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
+) -> Tensor:
     """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
     own = {f"system.{name}": value for name, value in parameters.items()}
-    found: Tensor = functional_call(_Initial(system), own, (batch,))
+    found: Tensor = functional_call(_Initial(system), own, (batch, step))
     return found

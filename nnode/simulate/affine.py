@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from nnode.laws.crowd import OTHERS, POINTS, CrowdLaw
+from nnode.laws.crowd import OTHERS, POINTS, SMALLEST, CrowdLaw
 from nnode.laws.expression import UNARY, Expr, apply, const, substitute, symbol, symbols
 
 #: What a difference is made of: the receiver's part and the source's, of which one may be missing.
@@ -47,6 +47,8 @@ def split(law: CrowdLaw, uniform: Sequence[str]) -> tuple[CrowdLaw, dict[str, di
         return known.issuperset(symbols([node]))
 
     features: dict[str, dict[str, Feature]] = {}
+    if law.sums[SMALLEST]:
+        return law, features  # they may name the sums
     for over, parts in _PARTS.items():
         found = law.sums[over]
         outer = {name: _weights(summand, same) for name, summand in found.items()}

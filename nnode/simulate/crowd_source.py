@@ -12,20 +12,22 @@ from functools import cached_property
 
 import torch
 
-from nnode.laws.crowd import OTHERS, POINTS, SEEN, WALLS, CrowdLaw
+from nnode.laws.crowd import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdLaw
 from nnode.laws.expression import Expr, below, symbol, symbols
 from nnode.laws.tensors import computed
 from nnode.laws.text import plain
 from nnode.simulate.affine import Feature, split
 from nnode.simulate.crowd_rows import SIZE
 from nnode.simulate.crowd_templates import DENSE, HEAD, KNOW, MEET, OWN, SPARSE, SPARSE_MEET
+from nnode.simulate.least import LEAST
 from nnode.simulate.loops import Loop
 
 _STATE = ("x", "y", "vx", "vy")
 _POINT = ("x", "y", "normal_x", "normal_y")
-_FIELDS = ("goal_x", "goal_y", "people", "points", "start")
+_FIELDS = ("goal_x", "goal_y", "pace", "people", "points", "start")
 #: Places of what is seen of others in the rows of states, and in the tables of walls.
-_RELATIVE = {OTHERS: ("dx", "dy", "dvx", "dvy"), POINTS: ("dx", "dy"), WALLS: ("dx", "dy")}
+_APART = ("dx", "dy", "dvx", "dvy")
+_RELATIVE = {OTHERS: _APART, POINTS: ("dx", "dy"), WALLS: ("dx", "dy"), SMALLEST: _APART}
 _COUNT = {POINTS: "points", WALLS: "walls"}
 
 
@@ -35,7 +37,7 @@ class CrowdSource:
 
     Attributes:
         law: flat.
-        near: whether people meet their neighbours only.
+        near: whether people meet their neighbours only; not with smallest values over others.
     """
 
     law: CrowdLaw
@@ -76,6 +78,11 @@ class CrowdSource:
     def sums(self) -> list[str]:
         return [name for found in self.over.values() for name in found]
 
+    @property
+    def rows_of_sums(self) -> list[str]:
+        """These, and who attains smallest values."""
+        return [*self.sums, *(f"who_{name}" for name in self.over.get(SMALLEST, ()))]
+
     @cached_property
     def mutual(self) -> bool:
         """Whether partners do the opposite to each other, so that one of both tells it all."""
@@ -88,8 +95,13 @@ class CrowdSource:
     def kept(self) -> list[str]:
         """Sums on which the gradient depends by itself."""
         stored, ends = self.loop.adjoints(_seeds(self._rate), self._slopes_own)
-        inner = set(symbols([*stored.values(), *ends.values()]))
-        return [name for name in self.sums if name in inner]
+        needed = [*stored.values(), *ends.values()]
+        if SMALLEST in self.over:
+            least = self.over[SMALLEST]
+            stored, ends = self.loop.adjoints(_seeds(least), self._slopes(SMALLEST))
+            needed += [*stored.values(), *ends.values()]
+        inner = {*symbols(needed), *self.rows_of_sums[len(self.sums) :]}
+        return [name for name in self.rows_of_sums if name in inner]
 
     # -- functions of rows -----------------------------------------------------------------------
 
@@ -125,13 +137,14 @@ class CrowdSource:
     def text(self) -> str:
         """The module's source."""
         law = self.law
-        lines = [f"dvx/dt = {plain(law.rate[0])}", f"dvy/dt = {plain(law.rate[1])}"]
+        state = "v" if law.order == 2 else ""
+        lines = [f"d{state}{a}/dt = {plain(r)}" for a, r in zip("xy", law.rate, strict=True)]
         for over, found in self.over.items():
-            lines += [
-                f"{plain(symbol(n))} = sum over {over} of {plain(s)}" for n, s in found.items()
-            ]
+            what = "smallest over others of" if over == SMALLEST else f"sum over {over} of"
+            lines += [f"{plain(symbol(n))} = {what} {plain(s)}" for n, s in found.items()]
         places = "".join(f"_{row} = np.uint64({self.at(row)})\n" for row in self.rows)
-        places += self._table("KEPT", {name: self.sums.index(name) for name in self.kept})
+        kept = [[0, self.rows_of_sums.index(name)] for name in self.kept]
+        places += f"KEPT = np.array({kept}, np.int64).reshape(-1, 2)\n"
         text = HEAD.format(formula="\n".join(lines), rows=len(self.rows), places=places)
         for over, found in self.over.items():
             text += self._tables(over)
@@ -139,6 +152,9 @@ class CrowdSource:
             text += self.loop.pulled(f"law_{over}_pull", _seeds(found), self._slopes(over), [])
             if over in self.features:
                 text += self._known(over)
+            if over == SMALLEST:
+                text += LEAST.format(over=over, nobody=NOBODY)
+                continue
             opposite, moving = self.mutual and over == OTHERS, over == OTHERS
             template = SPARSE_MEET if self.near else MEET
             moving = moving or over in self.features
@@ -184,6 +200,7 @@ class CrowdSource:
             return {f"D_{z}": z for z in self.features[over]}
         used = set(symbols(self.over[over].values()))
         names = [n for n in (*_RELATIVE[over], *_STATE) if n in used]
+        names += [n for n in self.sums if n in used]
         return {f"D_{name}": name for name in names}
 
     def _table(self, name: str, places: dict[str, int]) -> str:
@@ -206,6 +223,12 @@ class CrowdSource:
             "TO_BOTH": {f"D_{n}": place for n, place in apart.items()},
             "TO_OWN": {f"D_{n}": c for c, n in enumerate(_STATE) if n in used},
         }  # fmt: skip
+        if over == SMALLEST:
+            rows = self.rows_of_sums
+            found["FROM"] = {n: i for i, n in enumerate(self.sums) if n in used}
+            found["TO_FROM"] = {f"D_{n}": i for n, i in found["FROM"].items()}
+            found["WHO"] = {n: rows.index(f"who_{n}") for n in self.over[over]}
+            found["WEIGHTS"] = {f"W_{n}": i for n, i in sums.items()}
         return "\n\n" + "".join(self._table(f"{k}_{over}", v) for k, v in found.items())
 
     def _own_tables(self) -> str:
@@ -228,6 +251,8 @@ class CrowdSource:
         pulls: list[str] = []
         barriers: list[str] = []
         for over in self.over:
+            if over == SMALLEST:
+                continue
             calls, pull = f"meet_{over}(room, ", f"meet_{over}_pull(room, "
             rest, back = "q, time, dt, total, sums", "q, time, dt, total, weighed, to_own"
             if self.near:
@@ -264,10 +289,28 @@ class CrowdSource:
             if over in self.features:
                 pulls += self._given_back(over)
         return {
-            "width": len(self.own), "sums": len(self.sums), "mutual": self.mutual,
+            **self._moving(),
+            "width": len(self.own), "sums": len(self.rows_of_sums), "mutual": self.mutual,
             "kept_width": 4 + len(self.kept), "meets": _lines(3, meets),
             "pulls": _lines(3, pulls), "barriers": _lines(2, barriers),
         }  # fmt: skip
+
+    def _moving(self) -> dict[str, str]:
+        """How states move, and how their adjoints go back; smallest values."""
+        second, least = self.law.order == 2, SMALLEST in self.over
+        place = ("y[c, t] += move[t] * y[2 + c, t]", "y[i, c] += dt * y[i, 2 + c]")
+        placed = ("adjoint[2 + c, t] += move[t] * adjoint[c, t]",
+                  "adjoint[i, 2 + c] += dt * adjoint[i, c]")  # fmt: skip
+        names = ("place", "place_near", "placed", "placed_near")
+        found = dict(zip(names, (*place, *placed) if second else ("pass",) * 4, strict=True))
+        call = f"least_{SMALLEST}(room, y, length, exists, width, q, time, dt, total, sums)"
+        back = (
+            f"least_{SMALLEST}_pull(room, y, length, width, q, time, dt, total, sums, weighed, "
+            "to_own, to_other)"
+        )
+        found |= {"leasts": _lines(3, [call] if least else [])}
+        found |= {"least_pulls": _lines(3, [back] if least else [])}
+        return found | {"moved": "2 + c" if second else "c"}
 
     def _spaces(self, over: str) -> list[str]:
         """Places for features, and for their gradients."""

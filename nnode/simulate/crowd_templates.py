@@ -18,6 +18,9 @@ from nnode.simulate.crowd_rows import (
     subtract_pairs, subtract_product, take, weigh, weigh_less, who,
 )
 from nnode.simulate.lane_rows import add
+from nnode.simulate.least import (
+    bring_those, decrease_those, least, nobody_yet, subtract_those, weigh_one,
+)
 from nnode.simulate.neighbours import (
     both_ways, grid, people_near, points_near, sort, with_oneself,
 )
@@ -211,14 +214,14 @@ def forward(
             clear(reaction)
 {meets}            if {mutual}:
                 fold(sums, reaction, length)
-            if states.shape[0] > 0:
+{leasts}            if states.shape[0] > 0:
                 keep(states, place + step * {kept_width} * length, y, sums, KEPT)
             accelerate(room, y, sums, q, time, dt, total, rate)
             periods(move, exists, members, end, step, dt)
             for c in range(2):
                 for t in range(length):
-                    y[c, t] += move[t] * y[2 + c, t]
-                    y[2 + c, t] += move[t] * rate[c, t]
+                    {place}
+                    y[{moved}, t] += move[t] * rate[c, t]
         store(y, out[steps // per], members, people)
 
 
@@ -250,15 +253,15 @@ def backward(
             periods(move, exists, members, end, step, dt)
             for c in range(2):
                 for t in range(length):
-                    weight[c, t] = move[t] * adjoint[2 + c, t]
+                    weight[c, t] = move[t] * adjoint[{moved}, t]
             clear(to_own)
             clear(to_other)
             accelerate_pull(room, y, sums, weight, q, time, dt, total, to_own, weighed)
-            repeat(weighed, {sums}, length)
+{least_pulls}            repeat(weighed, {sums}, length)
 {pulls}            fold(to_own, to_other, length)
             for c in range(2):
                 for t in range(length):
-                    adjoint[2 + c, t] += move[t] * adjoint[c, t]
+                    {placed}
             for c in range(4):
                 for t in range(length):
                     adjoint[c, t] += to_own[c, t]
@@ -340,8 +343,8 @@ def forward(
             for k in range(number):
                 i = sequel[k]
                 for c in range(2):
-                    y[i, c] += dt * y[i, 2 + c]
-                    y[i, 2 + c] += dt * rate[k, c]
+                    {place_near}
+                    y[i, {moved}] += dt * rate[k, c]
         put(y, out[steps // per, b], here)
 
 
@@ -377,12 +380,12 @@ def backward(
             sequel, pairs, meetings = people(y, own, cutoff, first, pairs)
             for k in range(number):
                 for c in range(2):
-                    weight[k, c] = dt * adjoint[sequel[k], 2 + c]
+                    weight[k, c] = dt * adjoint[sequel[k], {moved}]
             clear(to_own)
             accelerate_pull(room, own, sums, weight, q, time, dt, total, to_own, weighed)
 {pulls}            for i in range(number):
                 for c in range(2):
-                    adjoint[i, 2 + c] += dt * adjoint[i, c]
+                    {placed_near}
             for k in range(number):
                 for c in range(4):
                     adjoint[sequel[k], c] += to_own[k, c]

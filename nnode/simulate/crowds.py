@@ -13,14 +13,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
-from nnode.laws.crowd import OTHERS, WALLS, CrowdLaw
+from nnode.errors import ConfigError
+from nnode.laws.crowd import OTHERS, SMALLEST, WALLS, CrowdLaw
 from nnode.models.crowd import InteractionForce, NetworkForce, SocialForce
 from nnode.models.crowd_formula import crowd_of, people_of, settings_of, walls_of
 from nnode.models.formula import own_values, values_of
 from nnode.models.scene import Scene
 from nnode.models.system import Crowd, System
 from nnode.models.term import Term
-from nnode.simulate import _math, _polynomials, crowd_rows, lane_rows, neighbours
+from nnode.simulate import _math, _polynomials, crowd_rows, lane_rows, least, neighbours
 from nnode.simulate._cache import digest, keep
 from nnode.simulate.crowd_rows import LANES, SIZE
 from nnode.simulate.crowd_source import CrowdSource
@@ -31,7 +32,7 @@ from nnode.simulate.threads import run_all
 #: crowds, and so most recordings, are exact to rounding instead.
 LISTS_FROM = 200
 #: Compiled into every module besides its own text.
-_COMPILED_IN = (crowd_rows, lane_rows, neighbours, _math, _polynomials)
+_COMPILED_IN = (crowd_rows, lane_rows, least, neighbours, _math, _polynomials)
 
 
 @cache
@@ -58,7 +59,7 @@ def supports(system: System, batch: Batch | None = None) -> CrowdLaw | None:
         return None
     terms = cast(list[Term], list(system.terms))
     law = crowd_of(terms)
-    if law is None or not law.sums[OTHERS]:
+    if law is None or not (law.sums[OTHERS] or law.sums[SMALLEST]):
         return None  # nobody meets anybody: cheap in PyTorch
     force = system.find(NetworkForce)
     # only the sums of the force are over oneself as well
@@ -71,7 +72,7 @@ def without_partners(system: System) -> bool:
     if not isinstance(system, Crowd):
         return False
     law = crowd_of(cast(list[Term], list(system.terms)))
-    return law is not None and not law.sums[OTHERS]
+    return law is not None and not (law.sums[OTHERS] or law.sums[SMALLEST])
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ def simulate(
     threads: int = 1,
     cutoff: float | None = None,
     cutoff_error: float = 1e-10,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor | None]:
     """Simulate a crowd model with the formula ``law`` (see :func:`supports`), by Euler's method.
 
     The gradient with respect to the parameters and the initial state is that of the discrete
@@ -211,14 +212,17 @@ def simulate(
             everybody meet everybody.
 
     Returns:
-        x and v at the samples, ``(K, B, N, 2)`` m and m/s. Padding people stand still.
+        x and v at the samples, ``(K, B, N, 2)`` m and m/s; None for v of a law of first order.
+        Padding people stand still.
 
     Raises:
-        ConfigError: a cutoff that is not positive or leaves out contacts, or an error outside
-            [0, 1).
+        ConfigError: a cutoff that is not positive or leaves out contacts, or of a law with
+            smallest values over others, or an error outside [0, 1).
     """
     terms, scene = cast(list[Term], list(system.terms)), system.scene(batch)
     y0 = system.initial(batch)
+    if law.order == 1:
+        y0 = torch.cat([y0, torch.zeros_like(y0)], -1)  # rows of velocities stay empty
     kind, simulations = y0.dtype, len(y0)
     walls, wall_there = walls_of(scene)
     people = _last(scene.agent)
@@ -253,7 +257,7 @@ def simulate(
     fixed = [number(value) for value in settings_of(terms, law).values()]
     q = torch.stack([*values_of(law, own_values(terms, law)), *fixed]).to(kind)
     y: Tensor = _Simulate.apply(plan, y0, q)
-    return y[..., :2], y[..., 2:]
+    return y[..., :2], y[..., 2:] if law.order == 2 else None
 
 
 def _fields(terms: list[Term], source: CrowdSource, scene: Scene, kind: torch.dtype) -> np.ndarray:
@@ -287,9 +291,14 @@ def _distances(
     social = system.find(SocialForce)
     check_cutoff(cutoff, cutoff_error, 2 * social.r if social else 0.0)
     if cutoff is not None:
+        if law.sums[SMALLEST]:
+            raise ConfigError(
+                f"solver.cutoff={cutoff:g} m: this law has smallest values over the others, and "
+                "whoever attains one may stand farther away; set it to null"
+            )
         return cutoff, cutoff
     # nobody knows how far other sums reach
-    others = len(law.sums[OTHERS]) > 2
+    others = len(law.sums[OTHERS]) > 2 or bool(law.sums[SMALLEST])
     if social is None or others or cutoff_error == 0 or people < LISTS_FROM:
         return ()
     reaches = (2 * social.r, social.r)

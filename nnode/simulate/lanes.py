@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from types import ModuleType
 from typing import Any, cast
@@ -157,7 +157,7 @@ def simulate(
         parameters = {name: p[None] for name, p in system.named_parameters()}
     q = _row(lane, parameters).to(dtype)
     runs = len(q)
-    y0 = starts(system, lane, batch, parameters)
+    y0 = starts(system, lane, batch, parameters, batch.dt / substeps)
     simulations, agents = y0.shape[2:4]
     own = runs > 1 and (agents - 1) * simulations < _ENOUGH
     lanes = runs * simulations
@@ -178,12 +178,15 @@ def tangents(
     threads: int = 1,
     each: Tensor | None = None,
     method: str | None = None,
+    given: Sequence[str] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Simulate a lane, and the derivatives of its states by parameters, exact for the method.
 
     Args:
         names: P symbols among ``lane.owned``.
-        each: ``(B, P)`` values of these parameters for every sequence; None: the system's.
+        each: ``(B, G)`` values of parameters for every sequence, ``(1, G)`` for all; None: the
+            system's own.
+        given: symbols of the parameters in ``each``; None: those of ``names``.
 
     Returns:
         ``(K, B, N, M)`` states and ``(P, K, B, N, M)`` their derivatives. A measured leader's
@@ -200,18 +203,19 @@ def tangents(
     q = _row(lane, own).to(x.dtype)
     every = with_tangents(stepped(lane, method or system.step), tuple(names))
     if each is not None:
-        q = q.repeat(len(batch), 1)
-        q[:, [list(lane.owned).index(name) for name in names]] = each.to(x.dtype)
+        q = q.repeat(len(each), 1)
+        q[:, [list(lane.owned).index(s) for s in given or names]] = each.to(x.dtype)
     known = {}
     if every.starts:
-        values = dict(zip(lane.owned, q.T[..., None] if each is not None else q[0], strict=True))
-        known = starts_of(terms, every, x[0], batch.v[0], system.scene(batch), values)
+        scene = replace(system.scene(batch), step=batch.dt / substeps)
+        values = dict(zip(lane.owned, q.T[..., None], strict=True))
+        known = starts_of(terms, every, x[0], batch.v[0], scene, values)
     zero = torch.zeros_like(x[0, ..., 0])
     known = {"x": x[0, ..., 0], "v": batch.v[0, ..., 0], **known}
     y0 = torch.stack([known.get(state, zero) for state in every.rates])
     plan = planned(
         system, lane, batch, substeps, threads, 1,
-        own=each is not None, method=method, tangents=tuple(names),
+        own=len(q) > 1, method=method, tangents=tuple(names),
     )  # fmt: skip
     with torch.no_grad():
         out: Tensor = _Simulate.apply(plan, y0, q)
@@ -234,14 +238,16 @@ def _row(lane: Lane, parameters: Mapping[str, Tensor]) -> Tensor:
     return flat if places == list(range(total)) else flat[..., places]
 
 
-def starts(system: System, lane: Lane, batch: Batch, parameters: Mapping[str, Tensor]) -> Tensor:
+def starts(
+    system: System, lane: Lane, batch: Batch, parameters: Mapping[str, Tensor], step: float
+) -> Tensor:
     """``(M, R, B, N)`` states at the start; a leader that is measured carries no gradient."""
     runs = len(next(iter(parameters.values())))
     if len(lane.rates) == lane.order:
         y = system.initial(batch)[None].expand(runs, -1, -1, -1)
     else:
         every = [{name: value[r] for name, value in parameters.items()} for r in range(runs)]
-        y = torch.stack([initial_with(system, own, batch) for own in every])
+        y = torch.stack([initial_with(system, own, batch, step) for own in every])
     y = y.to(batch.x.dtype).permute(3, 0, 1, 2)
     if isinstance(system, Traffic) and system.leader == "measured":
         last = torch.arange(y.shape[-1]) == (batch.agent.sum(1) - 1)[:, None]

@@ -113,7 +113,8 @@ class WalkSource:
     @cached_property
     def fields(self) -> list[str]:
         """What people have."""
-        return [n for n in ("goal_x", "goal_y", "people", "points") if n in self.law.symbols]
+        names = ("goal_x", "goal_y", "pace", "people", "points")
+        return [n for n in names if n in self.law.symbols]
 
     def text(self) -> str:
         """The module's source."""

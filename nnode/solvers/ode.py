@@ -91,7 +91,7 @@ class TorchdiffeqSolver:
         n = substeps(batch.dt, self.dt, system)
         method = self.method or system.step
         rates = Rates(system, batch, n, method if method in METHODS else "euler")
-        y0 = system.initial(batch)
+        y0 = system.initial(batch, batch.dt / n)
         t = n * torch.arange(batch.n_samples, dtype=y0.dtype, device=y0.device)
         method = STAGES.get(method, method)
         options = {"grid_constructor": _whole_steps} if method in FIXED_STEP else {}

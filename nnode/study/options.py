@@ -49,3 +49,12 @@ class CrowdStudyOptions(StudyOptions):
     steps: int = 4  # of the networks by Levenberg and Marquardt's method, at each length
     bootstrap: int = 100  # resamples of stretches of time
     cuts: int = 25  # first frames, within a second, from which open conventions cut sequences
+
+
+@dataclass
+class WalkingStudyOptions(StudyOptions):
+    """Laws of people that the field uses, on two-way flows of other runs."""
+
+    name: str = "walking"
+    horizons: list[float] = field(default_factory=lambda: [1.0, 2.0, 3.0, 4.0, 5.0])  # s
+    folds: int = 2  # groups of runs, each held out once

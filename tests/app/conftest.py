@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -26,15 +27,24 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def examples(words: str) -> list[str]:
+    """The command lines in a script's words, continued lines joined."""
+    joined = words.replace("\\\n", " ")
+    lines = [line.strip() for line in joined.splitlines() if "scripts/" in line]
+    commands = [line for line in lines if re.match(r"(python|torchrun) ", line)]
+    return [re.sub(r"\s+", " ", line) for line in commands]
+
+
 def environment() -> dict[str, str]:
     """The process's own, with one torch thread and without a data folder."""
     return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
 
 
 def start_script(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """What :func:`started` gives."""
+    """What :func:`started` gives; in place of a script's name may stand code, of several lines."""
+    what = ["-c", name] if "\n" in name else [f"scripts/{name}.py"]
     return subprocess.run(
-        [sys.executable, f"scripts/{name}.py", *overrides],
+        [sys.executable, *what, *overrides],
         cwd=ROOT,
         env={**environment(), **env},
         capture_output=True,
@@ -51,11 +61,14 @@ def started() -> Script:
 
 
 @pytest.fixture(scope="session")
-def script() -> Iterator[Script]:
-    """The same in a process that is forked, where the system can: without seconds of imports."""
-    if not hasattr(os, "fork"):
-        yield start_script
-        return
-    forks = Forks(environment())
-    yield forks.run
-    forks.close()
+def forks() -> Iterator[Forks]:
+    """What runs scripts without seconds of imports."""
+    found = Forks(environment())
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="session")
+def script(forks: Forks) -> Script:
+    """The same as ``started`` in a process that is forked, where the system can."""
+    return forks.run if hasattr(os, "fork") else start_script

@@ -1,18 +1,23 @@
 """Scripts in processes forked from one that has loaded the libraries: no seconds of imports each.
 
 This file is also the program of that process: it is asked on its standard input, a line of JSON
-for every script, and answers with the exit status. It is started afresh and never works itself,
-so that no thread, no compiled code and no random state is inherited but what imports leave.
+for scripts to start at a time or for ones to wait for, and answers with their numbers or their exit
+statuses. It is started afresh and never works itself, so that no thread, no compiled code and no
+random state is inherited.
 """
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +34,31 @@ LOADED = (
 )
 
 
+class Forked:
+    """A process, with what is needed of ``subprocess.Popen``."""
+
+    def __init__(self, forks: Forks, pid: int, order: dict[str, Any]) -> None:
+        self.pid, self.returncode = pid, None
+        self._forks, self._order = forks, order
+
+    def poll(self, seconds: float = 0.0) -> int | None:
+        """Its exit status; None where it still works after ``seconds``."""
+        if self.returncode is None:
+            self.returncode = self._forks.ask({"pid": self.pid, "seconds": seconds})
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def communicate(self, timeout: float = 600.0) -> tuple[str, str]:
+        """What it printed, at its end; one that works for longer is ended."""
+        if self.poll(timeout) is None:
+            self.send_signal(signal.SIGKILL)
+            self.poll(60.0)
+        out, errors = (Path(self._order[name]).read_text() for name in ("out", "errors"))
+        return out, errors
+
+
 class Forks:
     """Runs ``scripts/<name>.py``; the process it forks from is started with the first of them.
 
@@ -39,31 +69,51 @@ class Forks:
     def __init__(self, environment: dict[str, str]) -> None:
         self._environment = environment
         self._server: subprocess.Popen[str] | None = None
+        self._folder = tempfile.TemporaryDirectory(prefix="forked-")
+        self._number = 0
 
     def run(self, name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
         """As ``subprocess.run`` with captured text."""
+        return self.together(name, overrides, [env])[0]
+
+    def together(
+        self, name: str, overrides: Sequence[str], envs: list[dict[str, str]]
+    ) -> list[subprocess.CompletedProcess[str]]:
+        """One script in several processes at a time, each with variables of its own."""
+        started = [self.start(name, *overrides, **env) for env in envs]
+        said = [process.communicate() for process in started]
+        return [
+            subprocess.CompletedProcess([name, *overrides], process.returncode or 0, *words)
+            for process, words in zip(started, said, strict=True)
+        ]
+
+    def start(self, name: str, *overrides: str, **env: str) -> Forked:
+        """As ``subprocess.Popen``; in place of a script's name may stand code, of several lines."""
+        self._number += 1
+        order = {
+            "name": name, "overrides": overrides, "env": {**self._environment, **env},
+            **{kind: f"{self._folder.name}/{self._number}.{kind}" for kind in ("out", "errors")},
+        }  # fmt: skip
+        return Forked(self, self.ask(order), order)
+
+    def ask(self, order: dict[str, Any]) -> Any:
+        """What the process that is forked from answers."""
         if self._server is None:
             self._server = subprocess.Popen(
                 [sys.executable, "-m", "tests.app.forked"],
                 cwd=ROOT, env=self._environment, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             )  # fmt: skip
-        asked, answers = self._server.stdin, self._server.stdout
-        assert asked is not None
-        assert answers is not None
-        with tempfile.TemporaryDirectory() as folder:
-            out, errors = Path(folder) / "out", Path(folder) / "errors"
-            order = {"name": name, "overrides": overrides, "env": {**self._environment, **env}}
-            print(json.dumps({**order, "out": str(out), "errors": str(errors)}), file=asked)
-            asked.flush()
-            status = int(answers.readline())
-            words = [path.read_text() for path in (out, errors)]
-        return subprocess.CompletedProcess([name, *overrides], status, *words)
+        assert self._server.stdin is not None
+        assert self._server.stdout is not None
+        print(json.dumps(order), file=self._server.stdin, flush=True)
+        return json.loads(self._server.stdout.readline())
 
     def close(self) -> None:
         """End the process that was forked from."""
         if self._server is not None:
             self._server.communicate()
+        self._folder.cleanup()
 
 
 def typed(order: dict[str, Any]) -> None:
@@ -74,7 +124,13 @@ def typed(order: dict[str, Any]) -> None:
     os.dup2(descriptor, 2)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w"), open(2, "w")  # noqa: SIM115
-    script(ROOT, order["name"], list(order["overrides"]))
+    name, overrides = order["name"], list(order["overrides"])
+    if "\n" in name:
+        os.chdir(ROOT)
+        sys.argv = ["-c", *overrides]
+        exec(name, {"__name__": "__main__"})
+    else:
+        script(ROOT, name, overrides)
 
 
 def main() -> None:
@@ -85,12 +141,19 @@ def main() -> None:
 
     register()
     check_overrides([], ROOT / "conf", "train")  # the children share what Hydra looks up once
+    gc.collect()
+    gc.freeze()
+    children: dict[int, Child] = {}
     for line in sys.stdin:
         order = json.loads(line)
-        child = Child(lambda order=order: typed(order), Path(order["out"]))
-        status = child.status(600)
-        child.kill()
-        print("-9" if status is None else status, flush=True)
+        if "pid" in order:
+            answer = children[order["pid"]].status(order["seconds"])
+        else:
+            child = Child(partial(typed, order), Path(order["out"]))
+            answer, children[child.pid] = child.pid, child
+        print(json.dumps(answer), flush=True)
+    for child in children.values():
+        child.kill()  # one that nobody waited for
 
 
 if __name__ == "__main__":

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,8 @@ from nnode.data.options import EsimasOptions, TableOptions
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report import page
 from nnode.errors import ConfigError
-from tests.app.conftest import ROOT, Script, environment
+from tests.app.conftest import ROOT, Script
+from tests.app.forked import Forks
 from tests.discover import stand_in
 from tests.discover.recorded import ALPHA, ZONE, corridor, lane
 
@@ -38,17 +38,6 @@ if __name__ == "__main__":
     discover.diagnose = stand_in.diagnose
     run("discover", discover.discover)
 """
-
-
-def start(*overrides: str, **env: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", CODE, *overrides],
-        cwd=ROOT,
-        env={**environment(), **env},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 def overrides(table: Path, folder: Path) -> list[str]:
@@ -78,7 +67,7 @@ if __name__ == "__main__":
     run("discover", discover.discover)
     checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
     print("== evaluate")
-    script("evaluate", checkpoint, "solver=fused", f"hydra.run.dir={folder}/evaluate")
+    script("evaluate", checkpoint, "solver.dt=0.02", f"hydra.run.dir={folder}/evaluate")
     print("== plot_forces")
     script("plot_forces", checkpoint, f"hydra.run.dir={folder}/forces")
     print("== train")
@@ -86,7 +75,7 @@ if __name__ == "__main__":
         shutil.copytree(name, f"{folder}/{name}")
     shutil.copy(f"{folder}/run/model.yaml", f"{folder}/conf/model/lin_with_speed_zone.yaml")
     script(
-        "train", "model=lin_with_speed_zone", "solver=fused", "solver.dt=0.02", "data=table",
+        "train", "model=lin_with_speed_zone", "solver.dt=0.02", "data=table",
         f"data.path={folder}/lane.csv", "data.domain=traffic", "trainer.max_epochs=1",
         f"hydra.run.dir={folder}/train", root=folder,
     )
@@ -94,7 +83,7 @@ if __name__ == "__main__":
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished diagnosis on a table in which one sequence is faulty, and what takes its model."""
     folder = tmp_path_factory.mktemp("discover")
     table = lane(folder / "lane.csv", sequences=6, seconds=4.0, cars=3)
@@ -102,10 +91,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
     frame.to_csv(table, index=False)
     given = [*overrides(table, folder / "run"), "discover.animation=false"]
-    done = subprocess.run(
-        [sys.executable, "-c", CHAIN, str(folder), *given],
-        cwd=ROOT, env=environment(), capture_output=True, text=True, check=False, timeout=240,
-    )  # fmt: skip
+    done = script(CHAIN, str(folder), *given)
     assert done.returncode == 0, done.stdout + done.stderr
     (folder / "run" / "shown.txt").write_text(done.stdout.partition("== evaluate")[0])
     return folder / "run"
@@ -187,11 +173,11 @@ def test_training_goes_on_with_the_open_sequences(
     assert after.history[0]["parameters/speed_zone.alpha"] == pytest.approx(0.65)
 
 
-def test_a_signal_leaves_no_half_report(run: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
+def test_a_signal_leaves_no_half_report(forks: Forks, run: Path, tmp_path: Path) -> None:
     sign = tmp_path / "sign"
-    process = start(
-        *overrides(run.parent / "lane.csv", tmp_path / "run"), **{stand_in.WAIT: str(sign)}
-    )
+    given = overrides(run.parent / "lane.csv", tmp_path / "run")
+    process = forks.start(CODE, *given, **{stand_in.WAIT: str(sign)})
     while process.poll() is None and not sign.exists():
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)

@@ -47,8 +47,8 @@ def crowd(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -
     return trained(script, raw, tmp_path_factory.mktemp("runs") / "crowd", "crowd", "sf")
 
 
-def test_traffic_with_all_that_fits(started: Script, traffic: Path, tmp_path: Path) -> None:
-    done = started("export", f"run={traffic}", f"hydra.run.dir={tmp_path}")
+def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Path) -> None:
+    done = script("export", f"run={traffic}", f"hydra.run.dir={tmp_path}")
     assert done.returncode == 0, done.stderr
     account = json.loads((tmp_path / "export.json").read_text())
     assert list(account["written"]) == ["sumo", "parquet", "csv"]

@@ -6,13 +6,14 @@ import subprocess
 import sys
 
 from nnode.models.effects import CATALOGUE
+from nnode.models.field import FIELD
 
 
 def test_the_catalogue_is_printed_whole() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "nnode.laws"], capture_output=True, text=True, check=True
     )
-    for name in ("lin", "log", "network_speed", "idm", "social_force", "network_force"):
+    for name in ("lin", "log", "network_speed", *FIELD, "social_force", "network_force"):
         assert f"\n  {name}:" in done.stdout
     for domain in ("traffic", "crowd"):
         for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
@@ -23,4 +24,13 @@ def test_the_catalogue_is_printed_whole() -> None:
     assert "W becomes W + kappa*(dx_1 - W)" in done.stdout
     assert "dx/dt = v0 - v0*L/gap" in done.stdout
     assert "dv/dt = a*(1 - (v/v0)**4 - (wish/net)**2)" in done.stdout
+    assert "dv/dt = NN(gap/20, v/10, dv/2)\n    NN: 4 neurons" in done.stdout
+    for acceleration in (
+        "of an acceleration, W becomes W - kappa*dv/per",
+        "of an acceleration, W becomes late\n    late = W, T ago (at most 15 steps)",
+        "dq/dt = (T - q)/tau_m, at the start clip(",
+        "of an acceleration, the same",
+    ):
+        assert acceleration in done.stdout
+    assert done.stdout.count("edge = 12 m") == 1
     assert "\\" not in done.stdout

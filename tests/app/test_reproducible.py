@@ -8,7 +8,7 @@ import pytest
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.synthetic import demo_data
-from tests.app.conftest import Script, script  # noqa: F401
+from tests.app.conftest import Script, forks, script  # noqa: F401
 
 #: Relative difference of parameters that sums in another order may make in three epochs.
 ROUNDING = 1e-9

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,7 +17,8 @@ from nnode.app.cli.run import check_overrides
 from nnode.config import register
 from nnode.errors import ConfigError
 from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
-from tests.app.conftest import ROOT, environment
+from tests.app.conftest import ROOT
+from tests.app.forked import Forks
 
 CONF = ROOT / "conf"
 
@@ -32,17 +32,6 @@ if __name__ == "__main__":
     study.STUDIES["traffic"] = "tests.study.tiny"
     run("study", study.study)
 """
-
-
-def start(*overrides: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", CODE, *overrides],
-        cwd=ROOT,
-        env=environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 @pytest.mark.parametrize(
@@ -85,9 +74,10 @@ def test_what_no_study_can_work_with_is_refused(tmp_path: Path) -> None:
             study.study(OmegaConf.create({"study": options}), tmp_path)
 
 
-def test_interrupted_and_asked_for_again(tmp_path: Path) -> None:
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
+def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
     command = ["study=traffic", "study.workers=1", f"hydra.run.dir={tmp_path}"]
-    process = start(*command)
+    process = forks.start(CODE, *command)
     sign = tmp_path / "sign-a"
     while process.poll() is None and not sign.exists():
         time.sleep(0.02)
@@ -97,7 +87,7 @@ def test_interrupted_and_asked_for_again(tmp_path: Path) -> None:
     assert "stopped by SIGINT: 2 of 4 tasks are kept" in errors
     assert "Traceback" not in errors
     (tmp_path / "awake").write_text("")
-    process = start(*command)
+    process = forks.start(CODE, *command)
     shown, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert (tmp_path / "calls").read_text().split() == ["1", "2"]

@@ -16,10 +16,10 @@ from nnode.models.system import System
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 
 DT = 0.02
-N2 = {
-    "name": "n2",
+N4 = {
+    "name": "n4",
     "term": "network_speed",
-    "hidden": 2,
+    "hidden": 4,  # as elsewhere: each number of neurons is compiled for
     "v0": 20.0,
     "leader": "constant",
     "box": 0.9,
@@ -47,7 +47,7 @@ def one_by_one(system: System, batch: Batch) -> tuple[torch.Tensor, torch.Tensor
     return found.detach(), torch.cat(grads)
 
 
-@pytest.mark.parametrize("options", [N2, LIN], ids=["n2", "lin"])
+@pytest.mark.parametrize("options", [N4, LIN], ids=["n4", "lin"])
 def test_as_single_runs(options: dict, batch: Batch) -> None:  # type: ignore[type-arg]
     cost = EnsembleCost(build_model(options), batch, FusedSolver(DT))
     draw = torch.Generator().manual_seed(1)
@@ -90,8 +90,8 @@ def test_the_admissible_set_comes_from_the_model(batch: Batch) -> None:
     )
     assert limits["terms.0.L"] == (2.0, math.inf)
     assert limits["terms.0.v0"] == (-math.inf, math.inf)
-    net = EnsembleCost(build_model(N2), batch, FusedSolver(DT))
-    assert len(net.low) == 1 + 2 + 2 + 2 + 1
+    net = EnsembleCost(build_model(N4), batch, FusedSolver(DT))
+    assert len(net.low) == 1 + 4 + 4 + 4 + 1
     assert sorted(set(net.high.tolist())) == [0.9, math.inf]
 
 
@@ -112,7 +112,7 @@ def test_a_sequence_without_weight_cannot_spoil_a_gradient(
     single = batch.to(dtype=torch.float32)
     wild = single.select([0, 1])
     wild.x[0, 1, 0] = -3.4e38  # a gap that the network makes infinite
-    system = build_model(N2, dtype=torch.float32)
+    system = build_model(N4, dtype=torch.float32)
     spoiled = EnsembleCost(system, wild, FusedSolver(DT))
     called = []
     honest = EnsembleCost._without_the_rest

@@ -22,11 +22,11 @@ from nnode.calibrate.optimizers import (
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models import Linear, Traffic
-from nnode.solvers import TorchdiffeqSolver
+from nnode.solvers import FusedSolver
 
 #: v0 (m/s) and L (m) that the data are made with.
 TRUTH = (24.0, 6.0)
-SOLVER = TorchdiffeqSolver("euler", "discrete", 0.1)
+SOLVER = FusedSolver(0.1)
 
 
 def made_with_lin() -> Batch:

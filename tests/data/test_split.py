@@ -239,3 +239,17 @@ def test_real_corridor_is_held_out_as_a_block(real_data: Path) -> None:
     assert result.mode == "block"
     assert len(result.heldout) == round(0.2 * len(index))
     assert 0 < len(result.dropped) < 0.3 * len(index)
+
+
+def test_runs_that_everybody_drives_through_are_held_out_whole() -> None:
+    # three windows of each of four runs: no block of a run is left without dropping the rest
+    index = [
+        entry(10.0 * k, 10.0 * k + 10, ["a", "b"], f"run{r}") for r in range(4) for k in range(3)
+    ]
+    for seed in range(5):
+        result = split(index, SplitOptions(heldout=0.4, seed=seed))
+        assert result.mode == "random"
+        assert not result.dropped
+        sides = [{index[i]["recording"] for i in side} for side in (result.train, result.heldout)]
+        assert not sides[0] & sides[1]
+        assert all(sides)

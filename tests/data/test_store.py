@@ -105,6 +105,7 @@ def test_any_float_and_any_name_survives(
 def test_the_table_is_tidy_and_has_one_row_group_per_sequence(folder: Path) -> None:
     table = pd.read_parquet(folder / TABLE)
     columns = "sequence, recording, time, agent, x, y, vx, vy, length, kind, group, dest_x, dest_y"
+    columns += ", preferred_x, preferred_y"
     assert ", ".join(table.columns) == columns
     assert len(table) == 5 * 3 + 7 * 4
     rows = table[(table.sequence == "corridor/2") & (table.agent == "p3")]

@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks.config import register
 from nnode.app.cli.flags import read_command_line
-from nnode.app.cli.help import examples
 from nnode.app.cli.run import check_overrides
+from tests.app.conftest import examples
 from tests.discover.platoons import platoons
 from tests.docs.test_tutorials import ROOT, blocks
 

@@ -23,7 +23,7 @@ from nnode.exchange.sumo import equilibrium_gap, sumo_type
 from nnode.exchange.trajectories import write_pedpy
 from nnode.models import Crowd, Linear, Relaxation, SocialForce, Traffic
 from nnode.models.term import State
-from tests.app.conftest import Script, script  # noqa: F401
+from tests.app.conftest import Script, forks, script  # noqa: F401
 from tests.exchange.by_sumo import call
 
 ROOM = [(0, 0), (12, 0), (12, 4), (0, 4)]

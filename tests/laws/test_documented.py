@@ -11,6 +11,8 @@ import yaml
 
 from nnode.laws import arrays, differentiate, expression, parse, tensors
 from nnode.models import build_model
+from nnode.models.effects import CATALOGUE
+from nnode.models.field import FIELD
 from nnode.simulate import loops, source
 
 METHOD = (
@@ -28,6 +30,37 @@ def test_your_own_law_in_one_line() -> None:
     speed = model.terms[0].speed(gap).detach()  # type: ignore[union-attr, operator]
     torch.testing.assert_close(speed, 30 * (1 - torch.exp(-gap / 12)), rtol=1e-14, atol=0)
     assert "saturation.reach" in source(model)  # type: ignore[arg-type]
+
+
+def test_laws_on_the_command_line() -> None:
+    laws = re.findall(r"'model\.law=(\{.*\})'", METHOD)
+    assert len(laws) == 2
+    lane, people = (
+        build_model({"term": "formula", "name": "mine", "leader": "measured", "effects": [],
+                     "law": yaml.safe_load(text)}) for text in laws
+    )  # fmt: skip
+    assert (lane.domain, people.domain) == ("traffic", "crowd")
+    assert list(lane.physical()) == ["mine.v0", "mine.L"]
+    assert list(people.physical()) == ["mine.A", "mine.B", "mine.tau"]
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_the_field_s_laws_stand_in_the_page_with_their_parameters(name: str) -> None:
+    (row,) = [
+        line for line in METHOD.splitlines() if line.startswith("| `") and f"`{name}`" in line
+    ]
+    shown = row.split("|")[3].replace("κ", "kappa").replace("λ", "lam")
+    names = {part.strip() for part in shown.split(",")}
+    assert names == (set(FIELD[name]["parameters"]) or {"weights"})
+    assert Path(f"conf/model/{name}.yaml").is_file()
+    assert f"`{name}`" in Path("README.md").read_text("utf-8")
+
+
+def test_effects_on_accelerations_stand_in_the_page() -> None:
+    table = METHOD.split("what becomes of an acceleration W")[1].split("\n\n")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert names == {e.name for e in CATALOGUE.of("traffic") if e.second is not None}
 
 
 def test_every_function_is_known_everywhere() -> None:

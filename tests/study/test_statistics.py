@@ -33,10 +33,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
         values, group = clustered(rng)
         low, high = average_interval([values], [group], seed)
         inside += low <= 0 <= high
-        low, high = average_interval([values], [np.arange(len(values))], seed)
-        naive += low <= 0 <= high
+        if seed < 80:
+            low, high = average_interval([values], [np.arange(len(values))], seed)
+            naive += low <= 0 <= high
     assert 0.89 <= inside / 200 <= 0.99
-    assert naive / 200 < 0.8  # what ignoring the groups would do
+    assert naive / 80 < 0.8  # what ignoring the groups would do
 
 
 def test_paired_differences() -> None:

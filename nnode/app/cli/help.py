@@ -77,14 +77,6 @@ def script_words(path: Path) -> str:
     return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
 
 
-def examples(words: str) -> list[str]:
-    """The command lines in a script's words, continued lines joined."""
-    joined = words.replace("\\\n", " ")
-    lines = [line.strip() for line in joined.splitlines() if "scripts/" in line]
-    commands = [line for line in lines if re.match(r"(python|torchrun) ", line)]
-    return [re.sub(r"\s+", " ", line) for line in commands]
-
-
 def _run_folder(folder: Path, name: str) -> tuple[str, str]:
     """Where a script writes, in words."""
     config = OmegaConf.load(folder / f"{name}.yaml")

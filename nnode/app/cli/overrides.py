@@ -70,11 +70,14 @@ def check_overrides(
     _check_twice(parsed)
     try:
         loader = _loader(folder, extra)
-        groups = [o for o in parsed if _is_group(o, loader)]
+        # asked once for each: Hydra takes a while to answer
+        names = {o.key_or_group for o in parsed if "." not in o.key_or_group}
+        known = {name: loader.get_group_options(name) for name in names}
+        groups = [o for o in parsed if known.get(o.key_or_group)]
         for override in parsed:
             _check_values(override, sweep, override in groups)
         for override in groups:
-            _check_group(override, loader, own_groups(folder, name))
+            _check_group(override, known[override.key_or_group], own_groups(folder, name))
         config = composed(name, [f"{o.get_key_element()}={_first(o)}" for o in groups])
         free = [
             text
@@ -181,10 +184,6 @@ def _check_twice(parsed: list[Override]) -> None:
         seen[key] = text
 
 
-def _is_group(override: Override, loader: ConfigLoader) -> bool:
-    return bool(loader.get_group_options(override.key_or_group))
-
-
 def _values(override: Override) -> Iterator[Any]:
     if override.is_sweep_override():
         yield from override.sweep_iterator()
@@ -215,7 +214,7 @@ def _near(word: str, valid: list[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _check_group(override: Override, loader: ConfigLoader, own: list[str]) -> None:
+def _check_group(override: Override, known: list[str], own: list[str]) -> None:
     group = override.key_or_group
     if not group.startswith("hydra/") and group not in own:
         raise ConfigError(
@@ -226,8 +225,7 @@ def _check_group(override: Override, loader: ConfigLoader, own: list[str]) -> No
         raise ConfigError(
             f"{override.input_line}: choices are neither added nor deleted; write {group}=NAME"
         )
-    known = [o for o in loader.get_group_options(group) if not o.endswith("_schema")]
-    options = sorted(known, key=natural)
+    options = sorted((o for o in known if not o.endswith("_schema")), key=natural)
     allowed = [*options, "null"] if group == "experiment" else options
     for value in _values(override):
         if str(value) not in allowed:

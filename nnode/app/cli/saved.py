@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.errors import CheckpointError, ConfigError
+from nnode.models.field import FIELD
 
 GROUPS = ("model", "data", "optimizer", "solver")
 
@@ -66,6 +67,23 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
     chosen = [g for g in groups if g in saved and g not in given]
     _chosen.update(chosen)
     return [f"{group}={saved[group]}" for group in chosen]
+
+
+def field_groups(overrides: list[str]) -> list[str]:
+    """Overrides that choose compiled code and Gauss and Newton's method for the field's laws where
+    the user chooses nothing else; the paper's models keep the paper's."""
+    pairs = (override.partition("=") for override in overrides)
+    chosen = {key.lstrip("+"): value for key, _, value in pairs}
+    laws = chosen.get("model", "").split(",")
+    if not set(laws) <= set(FIELD) or "experiment" in chosen:
+        return []
+    wanted = {"solver": "fused", "optimizer": "gauss_newton"}
+    return [f"{group}={choice}" for group, choice in wanted.items() if group not in chosen]
+
+
+def train_groups(overrides: list[str]) -> list[str]:
+    """What ``scripts/train.py`` chooses for the user, from a checkpoint or for a law."""
+    return saved_groups(overrides, option="resume") or field_groups(overrides)
 
 
 def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, ...]) -> DictConfig:

@@ -82,7 +82,7 @@ def cut_people(
         path: the file they come from; its stem names the recording.
         table: rows id, frame (whole numbers), x, y (m).
         rate: frames per second.
-        options: duration, walking axis, walls, view and velocities.
+        options: duration, history, walking axis, walls, view and velocities.
         walls: ``(W, 4)`` m, in place of ``options.walls``.
 
     Raises:
@@ -96,6 +96,8 @@ def cut_people(
             f"{path}: a frame rate of {rate:g} frames/s; expected a positive number of at most "
             f"{FASTEST:g}: correct it in the file"
         )
+    if not 0 <= options.history < math.inf:
+        raise ConfigError(f"data.history={options.history}: expected a number of seconds, or 0")
     steps = positive("t_seq", options.t_seq) * rate
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
         nearest = max(round(steps), 1) / rate
@@ -121,6 +123,7 @@ def cut_people(
         if len(people) < max(options.min_agents, 1):
             continue
         positions = x[rows][:, people]
+        before = first - round(options.history * rate)
         found.append(
             Sequence(
                 name=f"{path.stem}/{len(found):03d}",
@@ -132,6 +135,9 @@ def cut_people(
                 destination=destinations([exits[i] for i in people], positions[0])
                 if exits
                 else positions[-1],
+                preferred=_before(x[[before, first]][:, people], rate / (first - before))
+                if 0 <= before < first
+                else None,
                 walls=walls,
             )
         )
@@ -283,6 +289,12 @@ def _velocity(x: np.ndarray, rate: float, scheme: Velocity) -> np.ndarray | None
         return one_sided
     central = (ahead + behind) / 2
     return np.where(np.isnan(central), one_sided, central)
+
+
+def _before(x: np.ndarray, rate: float) -> np.ndarray | None:
+    """Mean velocities (m/s) between two moments, ``rate`` (1/s) apart, of those who were there."""
+    found: np.ndarray = (x[1] - x[0]) * rate
+    return found if np.isfinite(found).any() else None
 
 
 def _walls(

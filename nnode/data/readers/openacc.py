@@ -33,6 +33,9 @@ from nnode.errors import ConfigError, DataError
 #: The five lines above the columns.
 HEAD = ("Date", "Vehicle_order", "Number_of_vehicles", "ACC", "Distance_setting")
 
+#: Times of a run, with those that no row stands for.
+MOST_TIMES = 10**6
+
 _FLAT = ("run", "position", "t", "v", "gap")
 
 
@@ -195,6 +198,11 @@ def _gridded(
         i = int(np.argmin(step)) if len(step) else 0
         raise DataError(f"{path}: times do not grow from {time[i]:g} s on; expected rows in order")
     dt = float(np.median(step))
+    if not (time[-1] - time[0]) / dt < MOST_TIMES:
+        raise DataError(
+            f"{path}: times go from {time[0]:g} to {time[-1]:g} s in steps of {dt:g} s; expected "
+            f"at most {MOST_TIMES:.0e} steps: look for a time that is wrong"
+        )
     at = (time - time[0]) / dt
     k = np.round(at).astype(int)
     odd = np.flatnonzero(np.abs(at - k) > 0.1)

@@ -17,7 +17,14 @@ import numpy as np
 
 from nnode.data.options import Gaps, PairOptions
 from nnode.data.readers.columns import Table
-from nnode.data.readers.recordings import check_known, one_of, positive, tables_below, wanted
+from nnode.data.readers.recordings import (
+    check_known,
+    one_of,
+    place_below,
+    positive,
+    tables_below,
+    wanted,
+)
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
@@ -27,6 +34,9 @@ _METRES = ("leader_length", "follower_length", "spacing")
 _SPEEDS = ("v_follower", "v_leader")
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
+
+#: Key of the table that lists the files.
+INDEX = "index"
 
 #: m by which a length that follows from spacings may vary within a pair: the error that a single
 #: position may have without being a fault (:mod:`nnode.data.quality`).
@@ -53,13 +63,24 @@ class _Pair:
 
 
 def pair_files(options: PairOptions) -> dict[str, Path]:
-    """The tables by their path below the folder; a single file by its name.
+    """The tables by their path below the folder; a single file by its name; and the index.
 
     Raises:
         ConfigError: no path, or ``data.source`` is an address.
-        DataError: no such file or folder, or one without a table.
+        DataError: no such file or folder, one without a table, or an index that names a file that
+            is not there.
     """
-    return tables_below(options, options.path, options.files)
+    place = place_below(options, options.path)
+    listed = place / options.index if options.index is not None and place.is_dir() else None
+    if listed is None or not listed.is_file():
+        return tables_below(options, options.path, options.files)
+    table = Table(listed)
+    files = {INDEX: listed}
+    for i, name in enumerate(table.names(table.choose(("path",))["path"])):
+        files[name] = place / name
+        if not files[name].is_file():
+            raise DataError(f"{listed}, {table.row(i)}: there is no file {files[name]}")
+    return files
 
 
 def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
@@ -83,7 +104,13 @@ def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
     """
     _check(options)
     asked = wanted(options.recording)
-    pairs = [pair for key, path in files.items() for pair in _pairs(key, Table(path), options)]
+    listed = _listed(files.get(INDEX))
+    pairs = [
+        pair
+        for key, path in files.items()
+        if key != INDEX
+        for pair in _pairs(key, Table(path), options, listed.get(key, {}))
+    ]
     if asked is not None:
         check_known(asked, [pair.words["run"] for pair in pairs])
     lanes = _lanes(options, pairs)
@@ -105,7 +132,7 @@ def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
             found.append(_sequence(name, number, len(pieces), pair, time, x, v, options))
     if not found:
         raise DataError(
-            f"{next(iter(files.values()))}: no sequence; none of {len(pairs)} pairs has "
+            f"{options.path}: no sequence; none of {len(pairs)} pairs has "
             f"{options.min_samples} equally spaced times"
             + (f" or lasts for {options.window:g} s" if options.window else "")
             + "; lower data.min_samples or data.window"
@@ -148,7 +175,21 @@ def _unit(option: str, value: Any, path: Path, units: dict[str, float]) -> float
     raise ConfigError(f"data.{option}={value}: no pattern fits {path.name}")
 
 
-def _pairs(key: str, table: Table, options: PairOptions) -> Iterator[_Pair]:
+def _listed(path: Path | None) -> dict[str, dict[str, str]]:
+    """What an index tells of every file, by the file's path."""
+    if path is None:
+        return {}
+    table = Table(path)
+    names = table.choose(("path",), _WORDS)
+    cells = {name: table.names(column, empty=True) for name, column in names.items()}
+    files = cells.pop("path")
+    return {
+        str(file): {name: str(own[i]) for name, own in cells.items() if own[i]}
+        for i, file in enumerate(files)
+    }
+
+
+def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[_Pair]:
     names = table.choose(_REQUIRED, (*_METRES, *_SPEEDS, *_WORDS), options.columns)
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
@@ -159,7 +200,7 @@ def _pairs(key: str, table: Table, options: PairOptions) -> Iterator[_Pair]:
         v = np.stack([table.numbers(names[name]) for name in _SPEEDS], -1) * speeds
     own = {n: table.numbers(names[n], empty=True) * metres for n in _METRES if n in names}
     words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
-    everywhere = _everywhere(key, table.path, options, set(words))
+    everywhere = _everywhere(key, table.path, options, listed, set(words))
     label = np.array(["\0".join(cells) for cells in zip(*_keys(words), strict=True)], dtype=object)
     codes = np.unique(label, return_inverse=True)[1] if len(label) else np.zeros(len(table), int)
     first = [int(np.flatnonzero(codes == code)[0]) for code in range(codes.max() + 1)]
@@ -190,10 +231,13 @@ def _keys(words: dict[str, np.ndarray]) -> list[np.ndarray]:
     return [words[n] for n in ("run", "follower", "leader") if n in words]
 
 
-def _everywhere(key: str, path: Path, options: PairOptions, held: set[str]) -> dict[str, str]:
-    """What is the same in all rows of a file: from its path, or set by hand."""
+def _everywhere(
+    key: str, path: Path, options: PairOptions, listed: dict[str, str], held: set[str]
+) -> dict[str, str]:
+    """What is the same in all rows of a file: set by hand, from the index, from its path."""
     said = {"run": options.name, "pair": path.stem}
     said |= {str(name): str(value) for name, value in options.constant.items()}
+    said |= listed
     if options.pattern is not None:
         groups = re.compile(options.pattern).groupindex
         match = re.search(options.pattern, key)
@@ -228,6 +272,8 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
     if "spacing" not in own:
         return float("nan")
     length = x[rows, 1] - x[rows, 0] - own["spacing"][rows]
+    if np.isnan(length).all():
+        return float("nan")
     usual = float(np.nanmedian(length))
     off = np.abs(length - usual)
     if np.nanmax(off) > UNSTEADY:
@@ -276,6 +322,11 @@ def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
         dt = usual
         if options.dt is not None:
             dt = options.dt
+            if dt < usual * (1 - UNEVEN):
+                raise ConfigError(
+                    f"data.dt={dt:g} s is finer than the {usual:g} s of {pair.called}; expected no "
+                    "more times than were measured"
+                )
             first, last = np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6)
             grid = np.arange(first, last + 1) * dt
             x = _at(grid, time, x)

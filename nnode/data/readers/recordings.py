@@ -134,17 +134,12 @@ def table_path(options: DataOptions, option: str, path: str) -> Path:
     return place
 
 
-def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> dict[str, Path]:
-    """A file, or the files of a folder, by their path below it; a single file by its name.
-
-    Args:
-        options: ``name`` and ``source`` are read.
-        path: as ``data.path`` gives it, or else below ``data.source``.
-        patterns: of the files of a folder, of which the first that fits any is taken.
+def place_below(options: DataOptions, path: str) -> Path:
+    """A file or a folder: as ``data.path`` gives it, or else below ``data.source``.
 
     Raises:
         ConfigError: no path, or ``data.source`` is an address.
-        DataError: no such file or folder, or one without such a file.
+        DataError: there is no such thing.
     """
     if not path or path == "???":
         raise ConfigError("data.path is not set; expected a table, or a folder of tables")
@@ -155,13 +150,28 @@ def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> di
                 f"data.source={options.source}: tables are read from a folder, not an address"
             )
         place = Path(options.source).expanduser() / place
-    if place.is_file():
-        return {place.name: place}
-    if not place.is_dir():
+    if not place.exists():
         raise DataError(
             f"data.path: {place} is not there; expected a table or a folder of tables"
             f"{_published(options.name)}"
         )
+    return place
+
+
+def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> dict[str, Path]:
+    """A file, or the files of a folder, by their path below it; a single file by its name.
+
+    Args:
+        options: ``name`` and ``source`` are read.
+        path: see :func:`place_below`.
+        patterns: of the files of a folder, of which the first that fits any is taken.
+
+    Raises:
+        ConfigError, DataError: see :func:`place_below`; or a folder without such a file.
+    """
+    place = place_below(options, path)
+    if place.is_file():
+        return {place.name: place}
     for pattern in patterns:
         found = sorted(path for path in place.glob(pattern) if path.is_file())
         if found:

@@ -78,7 +78,8 @@ def check_laps(run: Run) -> None:
     if not len(known):
         return
     i = int(known[0])
-    laps = find_laps(_driven(run.v[:, i], run.dt), run.place[:, i])
+    with np.errstate(over="ignore", invalid="ignore"):  # of coordinates that are none
+        laps = find_laps(_driven(run.v[:, i], run.dt), run.place[:, i])
     if not len(laps.driven):
         return
     text = (

@@ -71,6 +71,7 @@ class Tables:
         has = {
             "goal_x": goal[:, 0],
             "goal_y": goal[:, 1],
+            "pace": scene.pace.numpy()[which, who],
             "people": scene.count.numpy()[which, 0, 0],
             "points": scene.wall_count.numpy()[which, 0, 0],
         }

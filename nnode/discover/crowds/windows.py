@@ -180,6 +180,7 @@ def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Se
         kind=item.kind,
         group=item.group,
         destination=destination,
+        preferred=item.preferred,
         walls=item.walls,
     )
 

@@ -99,6 +99,7 @@ class Effect(Term):
             fixed within every recording, recordings are what tells of it.
         individual: every agent has a strength of its own, with mean zero over the agents; the
             reported strength is their standard deviation.
+        sought: whether a diagnosis looks for it.
     """
 
     domain: ClassVar[Domain]
@@ -111,6 +112,7 @@ class Effect(Term):
     consecutive: ClassVar[bool] = False
     covariate: ClassVar[str | None] = None
     individual: ClassVar[bool] = False
+    sought: ClassVar[bool] = True
 
     def __init__(self, **values: float) -> None:
         super().__init__()

@@ -139,14 +139,11 @@ class Inertia(Effect):
 
 
 class _SecondOrder(Effect):
-    """An effect on accelerations; speeds have others like it, and it is not looked for."""
+    """An effect on accelerations, which are not diagnosed."""
 
     domain = "traffic"
     strengths = {}
-
-    @classmethod
-    def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        return []
+    sought = False
 
 
 @CATALOGUE.add

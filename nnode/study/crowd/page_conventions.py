@@ -149,9 +149,7 @@ def _networks(study: Crowd) -> pd.DataFrame:
                 "NN, least": min(found), "NN, greatest": max(found), "SF calibrated": scan["sf"],
                 "relaxation alone": scan["relaxation"],
             }  # fmt: skip
-    table = pd.DataFrame(rows).T
-    table.index.names = [*_LEVELS, "sum over"]
-    return table
+    return pd.DataFrame(rows).T.rename_axis([*_LEVELS, "sum over"])
 
 
 def _nearest(table: pd.DataFrame) -> str:

@@ -53,9 +53,7 @@ class Starts:
                 row[f"size, {part}"] = forces.size(parts[part])
                 row[f"likeness, {part}"] = forces.likeness(parts[part], self.parts[0][part])
             rows[(LABELS[self.kind], one.seed)] = row
-        found = pd.DataFrame(rows).T
-        found.index.names = ["model", "start"]
-        return found
+        return pd.DataFrame(rows).T.rename_axis(["model", "start"])
 
     def near(self) -> int:
         """Starts that end within NEAR of the least cost."""
@@ -280,8 +278,7 @@ def _settings_along(study: Crowd) -> list[Block]:
                 for c, letter in enumerate("xy")
                 for part, frame in parts.items()
             }
-    forces_along = pd.DataFrame(rows).T
-    forces_along.index.names = ["setting", "person"]
+    forces_along = pd.DataFrame(rows).T.rename_axis(["setting", "person"])
     return [
         Heading(f"{name}: six settings along the corridor", 3),
         FigureBlock(

@@ -55,7 +55,6 @@ def settings(model: str, table: pd.DataFrame) -> pd.DataFrame:
                 "F_y": force[1],
                 "F_y printed": told[1],
             }
-    found = pd.DataFrame(rows).T
-    found.index.names = ["setting", "person"]
+    found = pd.DataFrame(rows).T.rename_axis(["setting", "person"])
     forces = [name for name in map(str, found) if name.startswith("F_")]
     return found.astype(dict.fromkeys(forces, float))

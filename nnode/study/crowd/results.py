@@ -219,8 +219,7 @@ class Crowd:
                     **{LABELS[m]: float(held[m].mean()) for m in MODELS},
                     LABELS["relaxation"]: float(simple.mean()),
                 }
-        table = pd.DataFrame(rows).T
-        table.index.names = ["horizon", "block"]
+        table = pd.DataFrame(rows).T.rename_axis(["horizon", "block"])
         return table.astype({"sequences": int})
 
     def other_runs(self) -> pd.DataFrame:
@@ -238,8 +237,7 @@ class Crowd:
                         for m in (*MODELS, *SIMPLE[:3])
                     },
                 }
-        table = pd.DataFrame(rows).T
-        table.index.names = ["horizon", "run"]
+        table = pd.DataFrame(rows).T.rename_axis(["horizon", "run"])
         return table.astype({"sequences": int})
 
     def every_parameter(self) -> pd.DataFrame:

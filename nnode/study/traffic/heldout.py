@@ -26,8 +26,7 @@ def heldout_blocks(study: Study) -> list[Block]:
                 "90 % quantile": np.quantile(values, 0.9),
                 "sequences": len(values),
             }
-    table = pd.DataFrame(rows).T
-    table.index.names = ["faults", "model"]
+    table = pd.DataFrame(rows).T.rename_axis(["faults", "model"])
     wild = [
         m
         for m in NETWORKS

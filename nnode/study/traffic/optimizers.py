@@ -111,8 +111,7 @@ def _steps(study: Study) -> list[Block]:
         own = {h: float(np.median([one["steps"][f"{h:g}"] / one["cost"] for one in found])) - 1
                for h in steps}  # fmt: skip
         rows[model] = {f"{h:g} s": 100 * own[h] for h in sorted(steps, reverse=True)}
-    table = pd.DataFrame(rows).T
-    table.index.name = "model"
+    table = pd.DataFrame(rows).T.rename_axis("model")
     return [
         Heading("The step of Euler's method"),
         TableBlock(

@@ -65,9 +65,7 @@ def _both(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
         rows[(model, "here")] = ours.loc[model]
         rows[(model, "printed")] = theirs.loc[model]
         rows[(model, "difference")] = ours.loc[model] - theirs.loc[model]
-    table = pd.DataFrame(rows).T
-    table.index.names = ["model", ""]
-    return table
+    return pd.DataFrame(rows).T.rename_axis(["model", ""])
 
 
 def _summary(study: Study) -> list[Block]:
@@ -91,8 +89,7 @@ def _summary(study: Study) -> list[Block]:
             "weights in box": box.get(model, np.nan),
             "faults dropped": cell(study.costs(policy="drop"), model, AVERAGE),
         }
-    table = pd.DataFrame(rows).T
-    table.index.name = "model"
+    table = pd.DataFrame(rows).T.rename_axis("model")
     best = str(table["here"].idxmin())
     below = [m for m in ORDER if cell(table, m, "here") < cell(table, m, "printed")]
     said = "all five models" if len(below) == len(ORDER) else ", ".join(below) or "no model"
@@ -132,8 +129,7 @@ def _data(study: Study) -> list[Block]:
             "vehicles": sum(s.n_agents for s in sequences),
             "longest (s)": max(s.time[-1] - s.time[0] for s in sequences),
         }
-    table = pd.DataFrame(rows).T
-    table.index.name = "number"
+    table = pd.DataFrame(rows).T.rename_axis("number")
     return [
         Heading("Data"),
         TableBlock(

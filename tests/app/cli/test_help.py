@@ -15,10 +15,10 @@ from hydra.core.global_hydra import GlobalHydra
 from benchmarks import config as benchmark_config
 from nnode.app.cli.choices import choices, own_groups
 from nnode.app.cli.flags import read_command_line
-from nnode.app.cli.help import examples, help_text, remarks, script_words
+from nnode.app.cli.help import help_text, remarks, script_words
 from nnode.app.cli.run import check_overrides
 from nnode.config import SCHEMAS
-from tests.app.conftest import ROOT, environment
+from tests.app.conftest import ROOT, Script, environment, examples
 
 CONF = ROOT / "conf"
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
@@ -100,14 +100,8 @@ def test_choices_of_one_s_own_are_shown_and_taken(tmp_path: Path) -> None:
     assert "  model.v0=12.0 " in text
 
 
-def test_a_script_prints_its_help() -> None:
-    done = subprocess.run(
-        [sys.executable, "scripts/discover.py", "--help", "model=sf"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_a_script_prints_its_help(script: Script) -> None:
+    done = script("discover", "--help", "model=sf")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("Find what a model lacks: ")
     assert "  model.kappa=null " in done.stdout

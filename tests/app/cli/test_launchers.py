@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,6 +22,7 @@ from nnode.app.cli.run import check_overrides
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.errors import ConfigError
 from tests.app.conftest import ROOT, environment
+from tests.app.forked import Forks
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -32,14 +35,15 @@ PROBLEM = (
     "data.loader.batch_size=7",
     "trainer.max_epochs=4",
     "trainer.figure_every=0",
+    "solver.dt=0.1",
 )
 
 
 @pytest.fixture(scope="module")
-def prepared(started: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+def prepared(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The override that takes prepared traffic."""
     folder = tmp_path_factory.mktemp("prepared")
-    done = started(
+    done = script(
         "prepare_data", "data=demo_traffic", f"data.source={raw}", f"hydra.run.dir={folder}"
     )
     assert done.returncode == 0, done.stderr
@@ -117,23 +121,27 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        pytest.param(  # before the work starts
-            "model=n5", "error: model=n5 is unknown", marks=pytest.mark.thorough
-        ),
+        ("model=n5", "error: model=n5 is unknown"),  # before the work starts
         ("solver.dt=0.03", "error: solver.dt=0.03 s does not divide"),  # with the data
     ],
 )
-def test_an_error_is_said_once(prepared: str, tmp_path: Path, override: str, message: str) -> None:
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
+def test_an_error_is_said_once(
+    forks: Forks, prepared: str, tmp_path: Path, override: str, message: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    # what torchrun tells its processes
+    place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
+    places = [{**place, "RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    process = start(*problem(override), prepared, run, temporary=tmp_path / "tmp")
-    _, errors = process.communicate(timeout=200)
-    assert process.returncode != 0
-    assert errors.count(message) == 1
+    first, second = forks.together("train", [*problem(override), prepared, run], places)
+    assert first.returncode == second.returncode == 2
+    assert (first.stderr + second.stderr).count(message) == 1
 
 
-@pytest.mark.parametrize(
-    "launcher", ["cores", pytest.param("submitit_local", marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough  # every process loads all libraries
+@pytest.mark.parametrize("launcher", ["cores", "submitit_local"])
 def test_runs_of_a_sweep_in_other_processes(
     script: Script, prepared: str, tmp_path: Path, launcher: str
 ) -> None:

@@ -69,16 +69,17 @@ def series(monkeypatch) -> None:  # type: ignore[no-untyped-def]
         monkeypatch.setitem(SHAPES, name, shapes)
 
 
-def test_a_series_is_drawn(series, tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
-    chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", "fused_1"]}
+@pytest.mark.parametrize("engine", ["loop", pytest.param("fused_1", marks=pytest.mark.thorough)])
+def test_a_series_is_drawn(engine, series, tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
+    chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", engine]}
     benchmark(options(**chosen), tmp_path)
     found = json.loads((tmp_path / "benchmark.json").read_text())
-    scale = found["scale"]["fused_1"]
+    scale = found["scale"][engine]
     assert scale["people"] == [50, 100]
-    medians = [row["engines"]["fused_1"]["median"] for row in found["problems"][2:]]
+    medians = [row["engines"][engine]["median"] for row in found["problems"][2:]]
     np.testing.assert_allclose(scale["seconds"], [medians[0] / 1250, medians[1] / 2500])
     assert scale["ratio"] == max(scale["seconds"]) / min(scale["seconds"])
-    assert "fused_1: one step of one person takes" in capsys.readouterr().out
+    assert f"{engine}: one step of one person takes" in capsys.readouterr().out
     drawn = (tmp_path / "benchmark.png").read_bytes()
     again = tmp_path / "again"
     benchmark(options(redraw=str(tmp_path / "benchmark.json")), again)

@@ -190,3 +190,21 @@ def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
 def test_too_few_people(corridor: Path) -> None:
     with pytest.raises(DataError, match="nowhere are 3 people present for 1 s"):
         read_juelich(corridor, JuelichOptions(min_agents=3))
+
+
+def test_preferred_velocities_are_those_before_a_sequence(tmp_path: Path) -> None:
+    # 1 turns round at frame 25; 2 comes at frame 15, half a second before the second sequence
+    there = lines(0, 24, 1) + "".join(
+        f"1 {f} {-200 + 4 * (50 - f):.1f} 100 176\n" for f in range(25, 51)
+    )
+    path = write(tmp_path / "turn.txt", HEADER + there + lines(15, 50, 2, y=200))
+    first, second = read_juelich(path, JuelichOptions())
+    assert first.preferred is None
+    assert second.preferred is not None
+    np.testing.assert_allclose(second.preferred, [[1.0, 0.0], [np.nan, np.nan]], atol=1e-9)
+    np.testing.assert_allclose(second.velocity()[:, 0], [[-1.0, 0.0]] * 26, atol=1e-9)
+    half = read_juelich(path, JuelichOptions(history=0.4))[1].preferred
+    np.testing.assert_allclose(half, [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
+    assert read_juelich(path, JuelichOptions(history=0.0))[1].preferred is None
+    with pytest.raises(ConfigError, match="history"):
+        read_juelich(path, JuelichOptions(history=-1.0))

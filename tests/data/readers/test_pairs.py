@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +102,10 @@ def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_coarser_grid(tmp_path: Path) -> None:
-    (s,) = read(save(tmp_path / "one.csv", drive(3, 50)), dt=0.4)
+    path = save(tmp_path / "one.csv", drive(3, 50))
+    with pytest.raises(ConfigError, match=r"dt=0\.05 s is finer than the 0\.1 s"):
+        read(path, dt=0.05)
+    (s,) = read(path, dt=0.4)
     np.testing.assert_allclose(s.time, 0.4 * np.arange(1, 13))
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
 
@@ -147,14 +151,31 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
     start = "ngsim_final_I80_trajectories-0400pm-0415pm_runfinal_I80_trajectories-0400pm-0415pm"
     save(tmp_path / "train" / f"{start}_f13_l15_00035.csv", table)
     save(tmp_path / "test" / f"{start}_f254_l253_00014.csv", table)
-    save(tmp_path / "manifest.csv", pd.DataFrame({"dataset": ["ngsim"]}))
+    # of an earlier extraction, which the list does not name
+    save(tmp_path / "train" / f"{start}_f254_l253_00002.csv", table)
+    listed = {
+        "path": [f"train/{start}_f13_l15_00035.csv", f"test/{start}_f254_l253_00014.csv"],
+        "split": ["train", "test"],
+        "follower": [13, 254],
+        "leader": [15, 253],
+        "lane": [4.0, 2.0],
+        "run": f"{start[6:]}",
+    }
+    save(tmp_path / "manifest.csv", pd.DataFrame(listed))
     options = configured("ngsim_pairs", tmp_path)
-    one, two = read_pairs(pair_files(options), options)
+    two, one = read_pairs(pair_files(options), options)
+    assert {s.recording for s in (one, two)} == {"0400pm-0415pm"}
+    options.lane = 2
+    assert [s.agents for s in read_pairs(pair_files(options), options)] == [("254", "253")]
     assert (one.name, one.split) == ("0400pm-0415pm/f254_l253_00014", "test")
     assert (two.agents, two.split) == (("13", "15"), "train")
     np.testing.assert_allclose(two.x[-1, :, 0], [50.0, 79.0])
     assert two.length is not None
     np.testing.assert_allclose(two.length[1], 4.0)
+
+    (tmp_path / listed["path"][0]).unlink()
+    with pytest.raises(DataError, match=r"manifest\.csv, line 2: there is no file"):
+        pair_files(options)
 
     names = {"time": "timestamp"} | {
         f"{q}_{who.lower()}": f"{q}{who}Real" for q in "xv" for who in ("Leader", "Follower")
@@ -227,3 +248,39 @@ def test_pairs_of_tgsim(real_data: Path) -> None:
     # the spacings were made with vehicles of 5 m
     assert all(s.length is not None and abs(s.length[1] - 5.0) < 1e-9 for s in found)
     assert clusters(index_of(found)).max() + 1 == len({s.recording for s in found}) == 10
+
+
+def _gap_error(s: Sequence, p: dict[str, float], dt: float = 0.1) -> float:
+    """Root mean square error of the gap (m) of a follower by the IDM behind its measured leader, as
+    ``published.json`` says: acceleration held during a step, bounded, an exact stop."""
+    assert s.length is not None
+    assert s.v is not None
+    rear, ahead = s.x[:, 1, 0] - s.length[1], s.v[:, 1, 0]
+    x, v = s.x[0, 0, 0], s.v[0, 0, 0]
+    errors = []
+    for k in range(s.n_samples):
+        errors.append(s.x[k, 0, 0] - x)
+        if k + 1 == s.n_samples:
+            break
+        wanted = p["s0"] + max(
+            0.0, v * p["T"] + v * (v - ahead[k]) / (2 * np.sqrt(p["a"] * p["b"]))
+        )
+        a = p["a"] * (1 - (v / p["v0"]) ** 4 - (wanted / max(rear[k] - x, 0.1)) ** 2)
+        a = min(max(a, -9.0), 6.0)
+        stops = v + a * dt < 0
+        x += v**2 / (-2 * a) if stops else v * dt + a * dt**2 / 2
+        v = 0.0 if stops else v + a * dt
+        if rear[k + 1] - x < 0.1:
+            x, v = rear[k + 1] - 0.1, min(v, ahead[k + 1])
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("how", ["segment", "spacing", "speed"])
+def test_published_parameters_give_the_published_errors(real_data: Path, how: str) -> None:
+    published = json.loads((real_data / "ngsim_pairs" / "published.json").read_text())["idm"][how]
+    options = configured("ngsim_pairs", "ngsim_pairs", real_data)
+    held = [s for s in read_pairs(pair_files(options), options) if s.split == "test"]
+    error = np.mean([_gap_error(s, published) for s in held])
+    # positions are kept in single precision, to 1.5e-5 m at 500 m
+    assert error == pytest.approx(published["rmse"], abs=2e-5)

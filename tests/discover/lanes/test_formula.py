@@ -157,7 +157,9 @@ def test_a_model_with_a_memory_starts_where_it_is(sequences: list[Sequence]) -> 
     assert row_of(found).tolist() == row_of(system).tolist()
 
 
-@pytest.mark.parametrize("leader", ["measured", "constant"])
+@pytest.mark.parametrize(
+    "leader", ["measured", pytest.param("constant", marks=pytest.mark.thorough)]
+)
 def test_curves(sequences: list[Sequence], leader: str) -> None:
     system = model(LIN, leader, ("relative_speed",))
     for variable in TrafficEngine(sequences).variables():

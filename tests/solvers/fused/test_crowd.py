@@ -44,7 +44,8 @@ MODELS = {
 }
 #: Every model but those of which another one tells as much; each is compiled for seconds.
 COMPILED = [
-    pytest.param(name, marks=pytest.mark.thorough if name == "nn_open" else ()) for name in MODELS
+    pytest.param(name, marks=() if name in ("sf", "nn", "nn_self") else pytest.mark.thorough)
+    for name in MODELS
 ]
 
 
@@ -313,22 +314,34 @@ EFFECTS = {
 }
 
 
+def with_effects(base: str, *chosen: str) -> Crowd:
+    """A model, and the effects of some of the parts."""
+    effects = {name: values for part in chosen for name, values in EFFECTS[part].items()}
+    return Crowd([*MODELS[base](), *(CATALOGUE.effects[n](**v) for n, v in effects.items())])
+
+
+def in_groups(people: list[Sequence]) -> list[Sequence]:
+    names = ("g", "", "h", "g", "h", "g", "i", "h")
+    return [replace(item, group=names[: item.x.shape[1]]) for item in people]
+
+
 @pytest.mark.parametrize(
     ("base", "chosen"),
     [
-        ("nn", "force"),
-        ("sf", "sums"),
-        pytest.param("sf", "walls", marks=pytest.mark.thorough),  # they are below, among neighbours
+        ("sf", ("sums", "force")),
+        pytest.param("nn", ("force",), marks=pytest.mark.thorough),
+        pytest.param("sf", ("walls",), marks=pytest.mark.thorough),  # below, among neighbours
     ],
+    ids=str,
 )
-def test_effects(base: str, chosen: str, people: list[Sequence]) -> None:
-    names = ("g", "", "h", "g", "h", "g", "i", "h")
-    people = [replace(item, group=names[: item.x.shape[1]]) for item in people]
-    effects = [CATALOGUE.effects[name](**values) for name, values in EFFECTS[chosen].items()]
-    model = Crowd([*MODELS[base](), *effects])
-    check(model, single(people), FusedSolver(DT, 2))
+def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> None:
+    check(with_effects(base, *chosen), single(in_groups(people)), FusedSolver(DT, 2))
 
 
 def test_effects_among_neighbours(people: list[Sequence]) -> None:
-    effects = [CATALOGUE.effects[name](**v) for name, v in EFFECTS["walls"].items()]
-    check(Crowd([*MODELS["sf"](), *effects]), single(people), FusedSolver(DT, cutoff=50.0))
+    model, batch = with_effects("sf", "walls"), single(in_groups(people))
+    check(model, batch, FusedSolver(DT, cutoff=50.0))
+    # one that leaves people out is another model
+    with torch.no_grad():
+        whole, near = (FusedSolver(DT, cutoff=c)(model, batch).x[-1] for c in (50.0, 0.6))
+    assert (whole - near)[batch.valid[-1]].abs().max() > 1e-6

@@ -23,7 +23,11 @@ FORCE = {
 EFFECTS: dict[str, list[dict[str, Any]]] = {
     "one": [{"name": "relative_speed", "kappa": 0.3}],
     "zone": [{"name": "speed_zone", "alpha": 0.7, "a": 10.0, "b": 40.0}],
-    "both": [{"name": "reaction_delay", "T": 0.4}, {"name": "relative_speed", "kappa": 0.3}],
+    "several": [
+        {"name": "reaction_delay", "T": 0.4},
+        {"name": "relative_speed", "kappa": 0.3},
+        {"name": "speed_zone", "alpha": 0.7, "a": 10.0, "b": 40.0},
+    ],
     "memory": [{"name": "reaction_delay", "T": 0.4}, {"name": "inertia", "tau_v": 0.5}],
 }
 
@@ -38,7 +42,12 @@ def check(model: System, batch: Any) -> None:
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
 @pytest.mark.parametrize(
-    "effects", [pytest.param("one", marks=pytest.mark.thorough), *list(EFFECTS)[1:]]
+    "effects",
+    [
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("one", "zone")),
+        "several",
+        "memory",
+    ],
 )
 def test_traffic_with_effects(effects: str, leader: str, ragged: Any) -> None:
     model = build_model({**LAW, "leader": leader, "effects": EFFECTS[effects]})
@@ -53,5 +62,5 @@ def test_a_crowd_with_an_effect(crowd: Any) -> None:
 def test_no_compiled_law_ignores_an_effect(ragged: Any) -> None:
     batch = single(ragged)
     plain = FusedSolver(DT)(build_model({**LAW, "leader": "constant"}), batch)
-    slow = build_model({**LAW, "leader": "constant", "effects": EFFECTS["both"]})
+    slow = build_model({**LAW, "leader": "constant", "effects": EFFECTS["several"]})
     assert (FusedSolver(DT)(slow, batch).x - plain.x).abs().max() > 0.01

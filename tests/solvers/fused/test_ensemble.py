@@ -98,7 +98,9 @@ def test_refusals(ragged) -> None:  # type: ignore[no-untyped-def]
         solver.ensemble(model, {"terms.0.L": torch.ones(2), "terms.0.v0": torch.ones(3)}, batch)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.thorough)]
+)
 @pytest.mark.parametrize(
     "name", ["n4", *(pytest.param(law, marks=pytest.mark.thorough) for law in ("lin", "log"))]
 )

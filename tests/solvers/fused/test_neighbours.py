@@ -252,10 +252,25 @@ def test_lists_in_single_precision(walls: bool) -> None:
     assert difference(single[1], wanted) < 1e-4
 
 
+def networks(oneself: bool) -> Crowd:
+    draw = torch.Generator().manual_seed(2)
+    return Crowd([Relaxation(), NetworkForce(self_interaction=oneself, generator=draw)])
+
+
 @pytest.mark.parametrize("oneself", [False, True])
 def test_networks_with_a_cutoff(oneself: bool) -> None:
-    batch, draw = hall(40), torch.Generator().manual_seed(2)
-    model = Crowd([Relaxation(), NetworkForce(self_interaction=oneself, generator=draw)])
+    batch, model = hall(40), networks(oneself)
+    with torch.no_grad():
+        exact = TorchdiffeqSolver("euler", "discrete", 0.02)(model, batch).x[batch.valid]
+        for cutoff, same in ((100.0, True), (2.0, False)):
+            found = FusedSolver(0.02, cutoff=cutoff)(model, batch).x[batch.valid]
+            assert (float((found - exact).abs().max()) < 1e-12) is same
+
+
+@pytest.mark.thorough  # compiled for as long as everything above
+@pytest.mark.parametrize("oneself", [False, True])
+def test_the_gradient_of_networks_with_a_cutoff(oneself: bool) -> None:
+    batch, model = hall(40), networks(oneself)
     _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     for cutoff, same in ((100.0, True), (2.0, False)):
         _, own = gradient(model, FusedSolver(0.02, cutoff=cutoff), batch)

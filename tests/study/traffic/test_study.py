@@ -71,7 +71,7 @@ def test_fit_finds_the_truth(store: str) -> None:
 def test_a_box_holds_the_weights_and_costs(store: str) -> None:
     costs = {}
     for box in (None, 0.5):
-        one = tasks.fit(store, "r", "n2", box, 4, 0.02, 60, 0, [], 0)
+        one = tasks.fit(store, "r", "n4", box, 4, 0.02, 60, 0, [], 0)
         weights = np.concatenate(
             [np.ravel(v) for k, v in one["parameters"].items() if k.startswith("network")]
         )

@@ -1,0 +1,92 @@
+"""Gauss and Newton's method as an optimiser of the training loop, one damped step at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from torch.optim import Optimizer
+
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.least_squares import EASE, STIFFEN, STUCK, box_step
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError
+from nnode.models.system import System
+from nnode.solvers.base import Solver
+
+
+class GaussNewton(Optimizer):
+    """A damped step of Gauss and Newton's on exact tangents, refused steps with more damping.
+
+    It is told by :meth:`attach` what is minimised, in place of a closure.
+
+    Args:
+        system: the model; its calibrated parameters are changed in place.
+        damping: of the first step, relative to the curvature of each parameter.
+        tolerance: it has converged when a step lowers the cost by less than this share.
+
+    Attributes:
+        converged: whether no step lowers the cost any more.
+
+    Source:
+        Nocedal & Wright, Numerical Optimization, 2nd ed., section 10.3.
+    """
+
+    def __init__(self, system: System, damping: float = 1e-3, tolerance: float = 1e-9) -> None:
+        if not damping > 0:
+            raise ValueError(f"damping={damping} must be positive")
+        if not tolerance >= 0:
+            raise ValueError(f"tolerance={tolerance} must not be negative")
+        trained = [p for p in system.parameters() if p.requires_grad]
+        super().__init__(trained, {"damping": damping, "converged": False})
+        self.system, self.tolerance = system, tolerance
+        self._cost: Any = None
+
+    @property
+    def converged(self) -> bool:
+        return bool(self.param_groups[0]["converged"])
+
+    def attach(self, solver: Solver, batch: Batch, convention: Convention) -> None:
+        """Say what the next step lowers.
+
+        Raises:
+            ConfigError: another solver than the compiled one, or a model that is no formula of a
+                lane.
+        """
+        if self._cost is not None and self._cost.batch is batch:
+            return
+        # compiled code takes a second to import
+        from nnode.calibrate.gauss_newton import TangentCost
+        from nnode.solvers.fused import FusedSolver
+
+        if not isinstance(solver, FusedSolver):
+            raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
+        self._cost = TangentCost(self.system, batch, solver, convention)
+
+    def step(self, closure: Callable[[], Any] | None = None) -> float:  # type: ignore[override]
+        """Take a step; returns the mean cost before it.
+
+        Raises:
+            SimulationError: the model cannot be simulated with its present parameters.
+        """
+        cost, group = self._cost, self.param_groups[0]
+        row = np.clip(cost.row(self.system), cost.low, cost.high)
+        curved = cost(row)
+        now = float(curved.cost.mean())
+        if not math.isfinite(now):
+            cost.complain(curved.cost)
+        gradient, hessian = curved.gradient.mean(0), curved.hessian.mean(0)
+        damping, value, trial = group["damping"], math.inf, row
+        while damping < STUCK:
+            trial = box_step(row, gradient, hessian, damping, cost.low, cost.high)
+            value = float(cost.costs(trial).mean())
+            if value < now:
+                break
+            damping *= STIFFEN
+        if value < now:
+            cost.fill_(self.system, trial)
+            group["damping"] = max(damping * EASE, 1e-9)
+        group["converged"] = not now - value > self.tolerance * now
+        return now
