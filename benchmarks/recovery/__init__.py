@@ -1,0 +1,1 @@
+"""Parameters that are typed into other programs, recovered from what these simulate."""

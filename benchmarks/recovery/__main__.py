@@ -1,0 +1,61 @@
+"""The table of docs/exchange.md: ``python -m benchmarks.recovery [CASE ...]``."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.recovery.cases import CASES
+from benchmarks.recovery.recover import Recovered
+
+HEAD = (
+    "| simulated by | law here | paths with what was typed in, RMSE | | typed in | recovered, "
+    "relative error | of measured positions, 95 % | |\n|---|---|---|---|---|---|---|---|"
+)
+
+
+def main() -> None:
+    names = sys.argv[1:] or list(CASES)
+    print(HEAD, flush=True)
+    for name in names:
+        case = CASES[name]
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                found = case.recovered(Path(folder))
+            except ImportError as error:
+                print(f"{name} is left out: {error}", file=sys.stderr)
+                continue
+        for line in rows(case.program, case.law, found):
+            print(line, flush=True)
+
+
+def rows(program: str, law: str, found: Recovered) -> list[str]:
+    """Lines of the table, one for each parameter."""
+    lines = []
+    for i, name in enumerate(found.names):
+        first = [program, law, _length(found.forward)] if not i else [""] * 3
+        typed, measured, half = found.typed[i], found.measured[i], found.half[i]
+        if found.identified[i]:
+            digits = _decimals(half)
+            last = [f"{found.off[i]:.0e}", f"{measured:.{digits}f} ± {half:.{digits}f}", ""]
+        else:
+            last = ["", "", "not identified"]
+        lines.append(f"| {' | '.join([*first, name, f'{typed:g}', *last])} |")
+    return lines
+
+
+def _decimals(half: float) -> int:
+    """So many that an interval has two digits."""
+    return max(0, 1 - int(f"{half:e}".partition("e")[2]))
+
+
+def _length(metres: float) -> str:
+    for unit, size in (("m", 1.0), ("cm", 1e-2), ("mm", 1e-4)):
+        if metres >= size:
+            return f"{metres / size:.2g} {unit}"
+    return f"{metres:.0e} m"
+
+
+if __name__ == "__main__":
+    main()

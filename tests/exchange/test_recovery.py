@@ -1,0 +1,109 @@
+"""What was typed into SUMO and JuPedSim is found again in what they simulate.
+
+The scenes have no noise. SUMO writes nine decimals: places are rounded by 5e-10 m at most, by
+2.9e-10 m in the mean square, and so is what a first state or a leader is off. JuPedSim writes
+whole numbers of 64 bits.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from benchmarks.recovery.cases import CASES
+from benchmarks.recovery.recover import Recovered
+
+pytestmark = pytest.mark.slow
+
+#: m: rounding of what is compared, and of where both began.
+ROUNDED = 1e-9
+#: A law that is the program's own follows from such paths to this relative error: 0.1 m of
+#: independent errors leave 0.3 % at most of any parameter that is identified, rounding a share of
+#: 3e-9 of that. The search ends a little before.
+SAME = 1e-9
+#: Standard errors. Of 1000 normal numbers one is farther away than 3.3.
+FAR = 3.3
+
+
+@cache
+def recovered(name: str) -> Recovered:
+    with TemporaryDirectory() as folder:
+        return CASES[name].recovered(Path(folder))
+
+
+def check(found: Recovered, unknown: set[str], same: float = SAME) -> None:
+    """All but the unknown are found, and said to be; intervals hold what was typed in."""
+    assert {n for n, known in zip(found.names, found.identified, strict=True) if not known} == (
+        unknown
+    )
+    assert (found.off[found.identified] < same).all()
+    assert (np.abs(found.score[found.identified]) < FAR).all()
+
+
+@pytest.mark.parametrize("name", ["idm_euler", "idm_ballistic_rest", "krauss_crawl"])
+def test_sumo_s_laws_are_the_same_to_the_last_decimal(sumo: Path, name: str) -> None:
+    found = recovered(name)
+    assert found.forward < ROUNDED
+    assert found.worst < 3 * ROUNDED
+    check(found, set())
+
+
+def test_a_speed_that_nobody_reaches_is_not_identified(sumo: Path) -> None:
+    found = recovered("krauss_moving")
+    assert found.forward < ROUNDED
+    check(found, {"v0"})
+    assert np.isinf(found.half[found.names.index("v0")])
+
+
+def test_the_field_s_idm_differs_from_sumo_s_where_a_ballistic_step_ends_at_rest(
+    sumo: Path,
+) -> None:
+    # SUMO drives v dt/2 in it, here it is v²/(2 A): at most A dt²/8 less, A being what they brake
+    # with, b at most as they come to rest; and each of seven stops behind the one ahead
+    found = recovered("idm_ballistic")
+    once = found.typed[found.names.index("b")] * 0.1**2 / 8
+    assert ROUNDED < found.worst < 7 * once
+    # what 1 mm does: a hundredth of 0.1 m, which leave 0.3 %
+    check(found, set(), same=3e-5)
+
+
+def test_the_field_s_krauss_differs_from_sumo_s_in_the_last_metre_behind_who_stands(
+    sumo: Path,
+) -> None:
+    # there SUMO drives at b dt until a centimetre is left, here the gap shrinks at its own rate
+    # 1/T: at most the stretch itself, b dt (1 s)
+    found = recovered("krauss_stopping")
+    stretch = found.typed[found.names.index("b")] * 0.1
+    assert 1e-3 < found.worst < stretch
+    assert (found.off < 0.01).all()
+
+
+def test_sumo_s_krauss_in_ballistic_steps_is_a_formula(sumo: Path) -> None:
+    found = recovered("krauss_ballistic")
+    assert found.worst < 1e-4  # as they start: a hundredth of a millimetre
+    check(found, set(), same=1e-6)
+
+
+def test_jupedsim_s_social_force_is_the_same(jupedsim: ModuleType) -> None:
+    found = recovered("force_contact")
+    assert found.worst < 1e-12
+    check(found, set())
+
+
+def test_forces_of_contact_are_not_identified_where_nobody_touches(jupedsim: ModuleType) -> None:
+    found = recovered("force_default")
+    assert found.worst < 1e-12
+    check(found, {"k", "kappa"})
+
+
+def test_jupedsim_s_collision_free_speeds_are_the_same(jupedsim: ModuleType) -> None:
+    pytest.importorskip("nnode.models.field_crowd")
+    found = recovered("collision_free")
+    # directions here have 1e-6 m and 1e-12 added within their lengths
+    assert found.worst < 1e-9
+    check(found, set())
