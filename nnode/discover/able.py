@@ -7,7 +7,7 @@ from nnode.laws.crowd import SMALLEST
 from nnode.models.crowd_formula import CrowdBase, crowd_of
 from nnode.models.effects import Effect, IndividualEffect
 from nnode.models.extend import effects_of
-from nnode.models.system import System
+from nnode.models.system import System, Traffic
 
 
 def check_effect(effect: type[Effect]) -> None:
@@ -42,6 +42,11 @@ def check_model(system: System) -> None:
         raise ConfigError(
             f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "
             "evaluated, but not yet diagnosed"
+        )
+    if isinstance(system, Traffic) and system.lane is not None and "dt" in system.lane.symbols:
+        raise ConfigError(
+            "the law names dt, the length of a step, and the diagnosis of lanes takes other steps; "
+            "it can be trained and evaluated, but not diagnosed"
         )
     for term in system.terms if system.domain == "crowd" else ():
         if term.memory:

@@ -149,7 +149,7 @@ def test_what_has_no_tangents_is_refused(pairs: Batch) -> None:
         TangentCost(Crowd([Relaxation()]), pairs, FusedSolver())
     with pytest.raises(ConfigError, match="needs solver=fused"):
         GaussNewton(model()).attach(TorchdiffeqSolver(), pairs, Convention.gap)
+    lin = {"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0, "L": 5.0, "L_min": 2.0}
+    run = FusedSolver(0.1)(build_model(lin), pairs)
     with pytest.raises(ConfigError, match="second order"):
-        lin = build_model({"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0,
-                           "L": 5.0, "L_min": 2.0})  # fmt: skip
-        sequence_costs(FusedSolver(0.1)(lin, pairs), pairs, Convention.speed)
+        sequence_costs(run, pairs, Convention.speed)
