@@ -240,7 +240,7 @@ def test_tangents_of_eight_parameters_are_timed(tmp_path, monkeypatch, capsys) -
     })  # fmt: skip
     benchmark(options(shapes=["tangents"]), tmp_path)
     (row,) = json.loads((tmp_path / "benchmark.json").read_text())["problems"]
-    assert row["difference"] < 1e-5
+    assert row["difference"] < 1e-9
     assert row["engines"]["tangents"]["median"] > 0
     assert "idm_zone: 2 sequences, 3 cars" in capsys.readouterr().out
 
@@ -249,9 +249,8 @@ def test_tangents_that_are_wrong_are_not_timed(monkeypatch) -> None:  # type: ig
     from benchmarks.speed import tangents
 
     slope = torch.ones(8, 3, 2, 3, dtype=torch.float64)
-    own = {"forward": lambda: torch.zeros(3, 2, 3, dtype=torch.float64), "tangents": lambda: slope}
-    monkeypatch.setattr(tangents, "calls", lambda _: own)
+    monkeypatch.setattr(tangents, "calls", lambda _: {"tangents": lambda: slope})
     (shape,) = SHAPES["tangents"]
     tiny = replace(shape, sequences=2, agents=3, samples=2)
-    with pytest.raises(SimulationError, match="differ from difference quotients"):
+    with pytest.raises(SimulationError, match="differ from the gradient"):
         tangents.check(pose(tiny, "idm_zone", torch.float64))
