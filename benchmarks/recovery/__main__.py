@@ -11,7 +11,7 @@ from benchmarks.recovery.recover import Recovered
 
 HEAD = (
     "| simulated by | law here | paths, typed in | paths, recovered | typed in | | "
-    "recovered, relative error | of measured positions, 95 % | |\n|---|---|---|---|---|---|---|---|---|"
+    "recovered, relative error | of measured positions, 95 % | |\n" + "|---" * 9 + "|"
 )
 
 
