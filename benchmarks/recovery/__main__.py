@@ -10,8 +10,8 @@ from benchmarks.recovery.cases import CASES
 from benchmarks.recovery.recover import Recovered
 
 HEAD = (
-    "| simulated by | law here | paths with what was typed in, RMSE | | typed in | recovered, "
-    "relative error | of measured positions, 95 % | |\n|---|---|---|---|---|---|---|---|"
+    "| simulated by | law here | paths, typed in | paths, recovered | typed in | | "
+    "recovered, relative error | of measured positions, 95 % | |\n" + "|---" * 9 + "|"
 )
 
 
@@ -34,13 +34,14 @@ def rows(program: str, law: str, found: Recovered) -> list[str]:
     """Lines of the table, one for each parameter."""
     lines = []
     for i, name in enumerate(found.names):
-        first = [program, law, _length(found.forward)] if not i else [""] * 3
+        paths = [_length(found.forward), _length(found.path)]
+        first = [program, law, *paths] if not i else [""] * 4
         typed, measured, half = found.typed[i], found.measured[i], found.half[i]
+        last = ["", "", "not identified"]
         if found.identified[i]:
-            digits = _decimals(half)
-            last = [f"{found.off[i]:.0e}", f"{measured:.{digits}f} ± {half:.{digits}f}", ""]
-        else:
-            last = ["", "", "not identified"]
+            digits, missed = _decimals(half), abs(measured - typed) > half
+            value = f"{measured:.{digits}f} ± {half:.{digits}f}"
+            last = [f"{found.off[i]:.0e}", value, "misses it" if missed else ""]
         lines.append(f"| {' | '.join([*first, name, f'{typed:g}', *last])} |")
     return lines
 
@@ -51,8 +52,8 @@ def _decimals(half: float) -> int:
 
 
 def _length(metres: float) -> str:
-    for unit, size in (("m", 1.0), ("cm", 1e-2), ("mm", 1e-4)):
-        if metres >= size:
+    for unit, size, least in (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4)):
+        if metres >= least:
             return f"{metres / size:.2g} {unit}"
     return f"{metres:.0e} m"
 

@@ -102,8 +102,17 @@ def test_forces_of_contact_are_not_identified_where_nobody_touches(jupedsim: Mod
 
 
 def test_jupedsim_s_collision_free_speeds_are_the_same(jupedsim: ModuleType) -> None:
-    pytest.importorskip("nnode.models.field_crowd")
     found = recovered("collision_free")
     # directions here have 1e-6 m and 1e-12 added within their lengths
     assert found.worst < 1e-9
-    check(found, set())
+    # with errors of measurement the cost has many minima, and intervals are those of one of them
+    assert found.identified.all()
+    assert (found.off < SAME).all()
+
+
+def test_jupedsim_s_centrifugal_force_is_the_same_but_for_who_stands(jupedsim: ModuleType) -> None:
+    # the ellipse of somebody at 3 mm/s turns with any rounding: 1e-7 m become millimetres
+    found = recovered("centrifugal")
+    assert found.forward < 0.01
+    assert found.identified.all()
+    assert (found.off < 0.01).all()
