@@ -110,6 +110,7 @@ def test_batches_do_not_matter() -> None:
     for name in ("costs", "horizons"):
         first, second = together.pop(name), apart.pop(name)
         assert json.dumps(first) == json.dumps(second)
+    assert together.pop("objectives") == pytest.approx(apart.pop("objectives"))
     assert together == pytest.approx(apart)
 
 
