@@ -122,7 +122,7 @@ def test_effects_act_on_a_law_of_one_s_own(ragged: Any) -> None:
     ("change", "problem"),
     [
         ({"rate": {"x": "v0*gap"}}, r"mine = mine\.v0\*gap has the unit m²/s, expected m/s"),
-        ({"rate": {"y": "v0"}}, "must be one entry"),
+        ({"rate": {"y": "v0"}}, "must have two entries"),
         ({"rate": "v0"}, "must be one entry"),
         ({"rate": {"x": "v0*(1 - M/gap)"}}, "M is unknown; there are L, "),
         ({"rate": {"x": "__import__('os').system('true')"}}, "not allowed"),
