@@ -40,7 +40,7 @@ def lines() -> Iterator[str]:
             for name, description in PEOPLE.items():
                 yield from _of(law_from(name, description), "")
         yield title
-        for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
+        for effect in CATALOGUE.of(domain, every=True):  # type: ignore[arg-type]
             yield from _of(effect(), "W becomes " if domain == "traffic" else "")
 
 

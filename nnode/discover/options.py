@@ -50,7 +50,7 @@ def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
         raise ConfigError(f"discover.max_effects={options.max_effects} must be at least 0")
     if options.step is not None and not (math.isfinite(options.step) and options.step > 0):
         raise ConfigError(f"discover.step={options.step} must be a positive number of s, or null")
-    known = [effect.name for effect in CATALOGUE.of(domain) if effect.sought]
+    known = [effect.name for effect in CATALOGUE.of(domain)]
     _known("discover.exclude", options.exclude, known, domain)
     chosen = known
     if options.effects is not None:

@@ -170,7 +170,7 @@ def add_effects(model: System, chosen: Sequence[Options]) -> None:
     added = []
     for entry in chosen:
         name, values = _entry(entry)
-        known = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain))]
+        known = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain), every=True)]
         if name not in known:
             near = get_close_matches(name, known, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
@@ -214,7 +214,7 @@ def _check_order(model: System, effect: Effect) -> None:
         return
     second = effect.second is not None
     if model.order > 1 and not second:
-        known = [e.name for e in CATALOGUE.of("traffic") if e.second is not None]
+        known = [e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None]
         raise ConfigError(
             f"model.effects: {effect.name} changes a speed, and this law says an acceleration; "
             f"for those there are {', '.join(known)}"

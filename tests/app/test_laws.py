@@ -16,7 +16,7 @@ def test_the_catalogue_is_printed_whole() -> None:
     for name in ("lin", "log", "network_speed", *FIELD, "social_force", "network_force"):
         assert f"\n  {name}:" in done.stdout
     for domain in ("traffic", "crowd"):
-        for effect in CATALOGUE.of(domain):  # type: ignore[arg-type]
+        for effect in CATALOGUE.of(domain, every=True):  # type: ignore[arg-type]
             if not effect.__module__.startswith("nnode."):
                 continue  # another test's own
             assert f"\n  {effect.name}: " in done.stdout

@@ -226,9 +226,10 @@ class Catalogue:
         self.effects[effect.name] = effect
         return effect
 
-    def of(self, domain: Domain) -> list[type[Effect]]:
-        """The effects of a domain."""
-        found = [effect for effect in self.effects.values() if effect.domain == domain]
+    def of(self, domain: Domain, *, every: bool = False) -> list[type[Effect]]:
+        """The effects of a domain that a diagnosis looks for, or every one."""
+        own = [effect for effect in self.effects.values() if effect.domain == domain]
+        found = [effect for effect in own if every or effect.sought]
         return sorted(found, key=lambda effect: effect.rank)
 
 

@@ -20,7 +20,7 @@ from tests.models.following import DT, accelerations, behind, model, numbers
 
 LONG, TRUCK = 4.0, 10.0
 GAPS, SPEEDS = [20.0, 31.0, 27.0], [14.0, 11.0, 13.0, 12.0]
-SECOND = [e.name for e in CATALOGUE.of("traffic") if e.second is not None]
+SECOND = [e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None]
 LIN = {"term": "lin", "name": "lin", "leader": "measured", "v0": 30.0, "L": 6.0, "L_min": 1.0}
 
 
@@ -229,7 +229,9 @@ def test_nobody_drives_faster_than_the_zone_allows() -> None:
     assert v[-1] > 20
 
 
-@pytest.mark.parametrize("name", sorted({e.name for e in CATALOGUE.of("traffic")} - set(SECOND)))
+@pytest.mark.parametrize(
+    "name", sorted({e.name for e in CATALOGUE.of("traffic", every=True)} - set(SECOND))
+)
 def test_what_changes_speeds_is_refused_where_a_law_says_accelerations(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"{name} changes a speed.*for those there are .*memory"):
         model("idm", {"name": name})

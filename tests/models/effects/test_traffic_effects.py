@@ -17,7 +17,7 @@ from nnode.models.effects import CATALOGUE
 from nnode.models.extend import extended, without
 from nnode.solvers import TorchdiffeqSolver
 
-NAMES = [effect.name for effect in CATALOGUE.of("traffic") if effect.sought]
+NAMES = [effect.name for effect in CATALOGUE.of("traffic")]
 V0, LENGTH = 30.0, 6.0
 
 
