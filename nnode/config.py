@@ -45,7 +45,7 @@ from nnode.models.options import (
     NetworkSpeedOptions,
     SocialForceOptions,
 )
-from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
+from nnode.study.options import CrowdStudyOptions, FollowingStudyOptions, TrafficStudyOptions
 
 
 @dataclass
@@ -155,6 +155,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "cbo_schema"): ConsensusOptions,
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
+    ("study", "following_study_schema"): FollowingStudyOptions,
 }
 
 

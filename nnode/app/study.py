@@ -20,7 +20,7 @@ from nnode.study.options import StudyOptions
 log = logging.getLogger(__name__)
 
 #: The module of each study; imported when it is asked for.
-STUDIES = {"traffic": "nnode.study.traffic.study", "crowd": "nnode.study.crowd.study"}
+STUDIES = {name: f"nnode.study.{name}.study" for name in ("traffic", "crowd", "following")}
 
 #: Folder of quick studies inside the study's own: they must not replace full results.
 QUICK = "quick"

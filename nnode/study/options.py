@@ -11,7 +11,7 @@ from omegaconf import MISSING
 class StudyOptions:
     """What all studies share."""
 
-    name: str = MISSING  # traffic | crowd
+    name: str = MISSING  # traffic | crowd | following
     source: str | None = None  # folder with the raw files; null downloads
     download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
     quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
@@ -49,3 +49,12 @@ class CrowdStudyOptions(StudyOptions):
     steps: int = 4  # of the networks by Levenberg and Marquardt's method, at each length
     bootstrap: int = 100  # resamples of stretches of time
     cuts: int = 25  # first frames, within a second, from which open conventions cut sequences
+
+
+@dataclass
+class FollowingStudyOptions(StudyOptions):
+    """Laws of car following on pairs and platoons with published results."""
+
+    name: str = "following"
+    restarts: int = 4  # starts of every calibration; networks get as many
+    folds: int = 5  # of cross-validation, by cluster

@@ -1,0 +1,1 @@
+"""Car following: pairs with published results, platoons on a track, people behind automated cars."""
