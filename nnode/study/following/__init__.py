@@ -1,1 +1,1 @@
-"""Car following: pairs with published results, platoons on a track, people behind automated cars."""
+"""Car following: pairs with published results, platoons, people behind automated cars."""

@@ -57,11 +57,6 @@ class Candidate:
         beside = () if self.network is None or self.given else (f"network {self.network}",)
         return " + ".join((self.law, *(e.replace("_", " ") for e in self.effects), *beside))
 
-    @property
-    def key(self) -> str:
-        """As a file name."""
-        return self.name.replace(" + ", "-").replace(" ", "_")
-
     def system(self, seed: int = 0) -> System:
         """The model behind a measured leader; weights of a network depend on the seed."""
         return build_model(
@@ -75,6 +70,11 @@ class Candidate:
             },
             seed=seed,
         )
+
+
+def key(name: str) -> str:
+    """A candidate's name as a file name."""
+    return name.replace(" + ", "-").replace(" ", "_")
 
 
 def _effects(law: str, *effects: str) -> list[Candidate]:

@@ -96,13 +96,21 @@ def folds(label: np.ndarray, number: int, seed: int) -> np.ndarray:
 
 
 def behind(platoon: Sequence) -> list[Sequence]:
-    """Every follower of a platoon with the vehicle ahead of it, foremost pair first."""
+    """Every follower of a platoon with the vehicle ahead of it, foremost pair first.
+
+    The vehicle ahead is where its measured speed brings it, and the follower its measured gap
+    further back, as the published calibrations have it: over a quarter of an hour gaps and
+    speeds of one vehicle differ by metres.
+    """
     found = []
     for i in reversed(range(platoon.n_agents - 1)):
         keep = np.zeros(platoon.n_agents, dtype=bool)
         keep[[i, i + 1]] = True
         pair = platoon.select(keep)
-        found.append(replace(pair, name=f"{platoon.name}/{pair.agents[0]}"))
+        v = pair.velocity()[:, 1]
+        lead = np.concatenate([v[:1] * 0, np.cumsum((v[1:] + v[:-1]) / 2 * pair.dt, axis=0)])
+        x = np.stack([lead - (pair.x[:, 1] - pair.x[:, 0]), lead], 1)
+        found.append(replace(pair, name=f"{platoon.name}/{pair.agents[0]}", x=x))
     return found
 
 
@@ -116,3 +124,9 @@ def part(sequence: Sequence, first: float, last: float) -> Sequence:
         x=sequence.x[low:high],
         v=None if sequence.v is None else sequence.v[low:high],
     )
+
+
+def gap_of(pair: Sequence) -> np.ndarray:
+    """``(K,)`` gap of a pair from bumper to bumper, m; lengths that are not known count as 0."""
+    length = np.nan_to_num(np.zeros(2) if pair.length is None else pair.length)
+    return np.asarray(pair.x[:, 1, 0] - pair.x[:, 0, 0] - length[1])

@@ -122,9 +122,9 @@ def lateness(system: System) -> dict[str, float]:
     found = {"lag": 0.0, "delay": 0.0}
     for term in system.terms:
         if term.name == "inertia":
-            found["lag"] = float(term.tau_v)
+            found["lag"] = float(term.tau_v.detach())
         elif term.name == "reaction_delay":
-            found["delay"] = float(term.T)
+            found["delay"] = float(term.T.detach())
     return found
 
 
@@ -142,7 +142,7 @@ def platoon(
     time = dt * np.arange(math.ceil(periods * 2 * math.pi / frequency / dt))
     lead = v * time + amplitude / frequency * (1 - np.cos(frequency * time))
     behind = (gap + length) * np.arange(followers, -1, -1)
-    x = np.stack([lead - away if not away else v * time - away for away in behind], -1)
+    x = np.stack([v * time - away for away in behind[:-1]] + [lead], -1)
     speed = np.full_like(x, v)
     speed[:, -1] += amplitude * np.sin(frequency * time)
     sequence = Sequence(
@@ -152,7 +152,7 @@ def platoon(
     found = FusedSolver()(system, collate([sequence]))
     assert found.v is not None
     last = slice(3 * len(time) // 4, None)
-    swing = found.v[last, 0, ::-1, 0].detach().numpy()
+    swing = found.v[last, 0, :, 0].detach().numpy()[:, ::-1]
     wave = np.exp(-1j * frequency * time[last])
     # the part at the leader's frequency, by least squares on sine and cosine
     basis = np.stack([wave.real, wave.imag, np.ones(len(wave))], -1)
