@@ -72,7 +72,7 @@ def compare(law: str, folder: str) -> dict[str, Any]:
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--source", default=os.environ.get("NNODE_DATA"), help="raw files")
     parser.add_argument("--laws", nargs="+", default=["idm"], choices=list(printed.BOUNDS))
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark/following.json"))
@@ -96,7 +96,7 @@ def main() -> None:
                 f"{one['pooled']['cold']['wall_s']:.1f} s"
             )
     asked.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(asked.out, found)
+    write_json(asked.out, {"laws": found})
     print(f"results: {asked.out}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -55,7 +56,7 @@ class Candidate:
     def name(self) -> str:
         """As pages show it."""
         beside = () if self.network is None or self.given else (f"network {self.network}",)
-        return " + ".join((self.law, *(e.replace("_", " ") for e in self.effects), *beside))
+        return " + ".join((self.law, *self.effects, *beside)).replace("_", " ")
 
     def system(self, seed: int = 0) -> System:
         """The model behind a measured leader; weights of a network depend on the seed."""
@@ -96,7 +97,7 @@ EVERY: dict[str, Candidate] = {
         Candidate("idm", network=4),
         Candidate("idm", ("memory",), 4),
         Candidate("helly", ("memory",), 4),
-        Candidate("remembering network", network=4, given=_REMEMBERING),
+        Candidate("remembering_network", network=4, given=_REMEMBERING),
     )
 }
 
@@ -116,7 +117,7 @@ def starts(candidate: Candidate, cost: TangentCost, number: int, seed: int) -> n
         row = cost.row(candidate.system(seed + i))
         if i:
             limited = np.isfinite(cost.low) & np.isfinite(cost.high)
-            factor = np.exp(rng.uniform(*np.log(FACTORS), size=len(row)))
+            factor = np.exp(rng.uniform(math.log(FACTORS[0]), math.log(FACTORS[1]), len(row)))
             row = np.where(limited, row * factor, row)
         rows.append(np.clip(row, cost.low, cost.high))
     return np.stack(rows)

@@ -45,8 +45,12 @@ def calibrated(
 
 
 def named(cost: TangentCost, row: np.ndarray) -> dict[str, float]:
-    """Parameters by name, without the law's own."""
-    return {name.split("__", 1)[-1]: float(x) for name, x in zip(cost.names, row, strict=True)}
+    """Parameters by name; one that a term before has as well bears its own term's before it."""
+    found: dict[str, float] = {}
+    for symbol, value in zip(cost.names, row, strict=True):
+        owner, name = symbol.split("__", 1)
+        found[f"{owner}.{name}" if name in found else name] = float(value)
+    return found
 
 
 def at_limits(cost: TangentCost, row: np.ndarray) -> list[str]:
@@ -92,13 +96,15 @@ def floor(folder: str, name: str, restarts: int, seed: int) -> Result:
     candidate, batch = EVERY[name], data.batch(folder)
     cost = costs_of(candidate, batch)
     centre = calibrated(candidate, cost, 1, seed)[0].row
-    fits = [alone(cost, row) for row in (centre, *starts(candidate, cost, restarts, seed))]
-    best = np.argmin([fit.cost for fit in fits], axis=0)
+    fits = [
+        alone(cost, row, steps=STEPS) for row in (centre, *starts(candidate, cost, restarts, seed))
+    ]
+    best = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
     rows = np.stack([fits[k].row[b] for b, k in enumerate(best)])
     return {
         "names": list(named(cost, centre)),
         "rows": rows.tolist(),
-        "costs": np.min([fit.cost for fit in fits], axis=0).tolist(),
+        "costs": np.min(np.array([fit.cost for fit in fits]), axis=0).tolist(),
         "limits": [at_limits(cost, row) for row in rows],
     }
 

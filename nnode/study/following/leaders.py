@@ -37,7 +37,7 @@ def by_leader(folder: str, name: str, restarts: int, seed: int) -> Result:
     def fitted(keep: np.ndarray, rows: np.ndarray) -> np.ndarray:
         weights = keep / keep.sum()
         fits = [pooled(cost, r, weights, steps=STEPS, tolerance=TOLERANCE) for r in rows]
-        return fits[int(np.argmin([fit.cost for fit in fits]))].row
+        return fits[int(np.argmin(np.array([fit.cost for fit in fits])))].row
 
     whole = {side: fitted(keep, begin) for side, keep in sides.items()}
     without: dict[str, list[list[float]]] = {side: [] for side in sides}

@@ -121,7 +121,8 @@ def _cross_validated(study: Study) -> list[Block]:
         "those of the shelf), starts and the penalty on networks' weights "
         f"({DECAY:g} m times their squares) were fixed before any test pair was looked at, but for "
         "an earlier trial that had seen what idm, helly and idm with memory reach on them. "
-        "Looking two vehicles ahead is no candidate: a pair has no second one. The floor, every pair with numbers of its own, is "
+        "Looking two vehicles ahead is no candidate: a pair has no second one. "
+        "The floor, every pair with numbers of its own, is "
         f"{np.mean(floor['costs']):.2f} m for {REFERENCE} on the pairs that it is calibrated on."
     )
     order = list(table.index)

@@ -85,12 +85,13 @@ def _precision(study: Study, name: str) -> list[Block]:
         index=pd.Index(names, name="parameter"),
     )
     shown = table if len(names) <= 8 else table.drop(columns=[f"r({n})" for n in names])
-    away = correlation.to_numpy()[np.triu_indices(len(names), 1)]
+    matrix = np.array(one["correlation"], dtype=float)
+    away = matrix[np.triu_indices(len(names), 1)]
     pairs = [
-        f"{names[i]} and {names[j]} ({correlation.iloc[i, j]:+.2f})"
+        f"{names[i]} and {names[j]} ({matrix[i, j]:+.2f})"
         for i in range(len(names))
         for j in range(i + 1, len(names))
-        if abs(correlation.iloc[i, j]) > STRONG
+        if abs(matrix[i, j]) > STRONG
     ]
     open_ = [n for n in names if not _closed(one["profiles"][n], own["parameters"][n])]
     strongest = float(np.abs(away).max()) if away.size else 0.0
@@ -171,9 +172,9 @@ def _drivers(study: Study) -> list[Block]:
     touched = sum(bool(found) for found in limits)
     text = (
         "Calibrated on the first half of every training pair and judged on the second: "
-        f"{REFERENCE} with one set of numbers for all, with numbers of each pair's own, and with those drawn "
-        "towards the common ones. What lasts of a driver is the covariance of its numbers in both "
-        "halves (method of moments); deviations in units of that spread are penalised, by a factor "
+        f"{REFERENCE} with one set of numbers for all, with numbers of each pair's own, "
+        "and with those drawn towards the common ones. What lasts of a driver is the "
+        "covariance of its numbers in both halves (method of moments); deviations in units of that spread are penalised, by a factor "
         "that each fold takes from the others "
         f"({', '.join(f'{x:g}' for x in sorted(set(one['strengths'])))} m). "
         f"Alone over its whole length, {touched} of {len(limits)} pairs end with a parameter at a "

@@ -56,7 +56,7 @@ def best_alone(
         alone(cost, row, steps=STEPS, tolerance=1e-7, pool=decay(cost))
         for row in starts(candidate, cost, restarts, seed)
     ]
-    which = np.argmin([fit.cost for fit in fits], axis=0)
+    which = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
     rows = np.stack([fits[k].row[b] for b, k in enumerate(which)])
     return cost, rows, cost.costs(rows)
 

@@ -54,7 +54,7 @@ def acceleration(
     }  # fmt: skip
     known = {name: torch.tensor(np.array(x, dtype=float)) for name, x in values.items()}
     if "q" in law.lane(law.name).starts:
-        known["q"] = torch.full(gap.shape, float(law.T), dtype=torch.float64)
+        known["q"] = law.get_parameter("T").detach().expand(gap.shape)
     with torch.no_grad():
         return np.asarray(law.evaluated(known).expand(gap.shape).numpy())
 
@@ -90,15 +90,10 @@ class Slopes:
 
 def slopes(system: System, gap: float, v: float, length: float) -> Slopes:
     """By central differences."""
-    found = []
-    for i in range(3):
-        ends = []
-        for sign in (1, -1):
-            at = [gap, v, 0.0]
-            at[i] += sign * STEP
-            ends.append(float(acceleration(system, *map(np.array, at), length)))  # type: ignore[arg-type]
-        found.append((ends[0] - ends[1]) / (2 * STEP))
-    return Slopes(*found)
+    at = np.array([gap, v, 0.0]) + STEP * np.concatenate([np.eye(3), -np.eye(3)])
+    rate = acceleration(system, *at.T, length=length)
+    found = (rate[:3] - rate[3:]) / (2 * STEP)
+    return Slopes(*map(float, found))
 
 
 def passed(
@@ -122,9 +117,9 @@ def lateness(system: System) -> dict[str, float]:
     found = {"lag": 0.0, "delay": 0.0}
     for term in system.terms:
         if term.name == "inertia":
-            found["lag"] = float(term.tau_v.detach())
+            found["lag"] = float(term.get_parameter("tau_v").detach())
         elif term.name == "reaction_delay":
-            found["delay"] = float(term.T.detach())
+            found["delay"] = float(term.get_parameter("T").detach())
     return found
 
 
