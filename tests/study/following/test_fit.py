@@ -78,6 +78,7 @@ def test_cross_validation_finds_the_hidden_law(known: list[Sequence]) -> None:
     assert len(found["starts"]) == 2
 
 
+@pytest.mark.thorough  # calibrations of every pair, some thirty times
 def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     own = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
     pairs = driven(time_gaps=own)
