@@ -11,6 +11,9 @@ from matplotlib.lines import Line2D
 
 from nnode.plots.style import GREY, OKABE_ITO, SMALL_FONT, curve_style, dress, new_figure
 
+#: Rises of the error up to this are shown, m: beyond it no value is in question.
+SHOWN = 0.6
+
 _BLUE, _RED = OKABE_ITO["blue"], OKABE_ITO["vermillion"]
 
 
@@ -40,7 +43,9 @@ def errors(
     ax.set_yticks(place, names)
     ax.set_ylim(-0.8, len(names) - 0.2)
     dress(ax, x=f"error minus that of {reference} ({unit})")
-    ax.legend(handles=handles, fontsize=SMALL_FONT, frameon=False, loc="lower right")
+    figure.legend(
+        handles=handles, fontsize=SMALL_FONT, frameon=False, loc="outside upper center", ncols=2
+    )
     return figure
 
 
@@ -84,8 +89,7 @@ def profiles(found: Mapping[str, Mapping[str, np.ndarray]], units: Mapping[str, 
         ticks = [t for t in (0.25, 0.5, 1, 2, 5, 10, 20, 50, 100)
                  if min(one["values"]) <= t <= max(one["values"])]  # fmt: skip
         ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
-    top = max(float(np.max(one["rise"])) for one in found.values())
-    axes[0].set_ylim(-0.08 * top, 1.1 * top)
+    axes[0].set_ylim(-0.1 * SHOWN, SHOWN)
     return figure
 
 
@@ -151,7 +155,6 @@ def _along(ax: Axes, along: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None
         ax.plot(place, theory, color=style["color"], linewidth=1.2, linestyle=style["linestyle"])
         ax.plot(place, simulated, style["marker"], color=style["color"], markersize=4)
     dress(ax, x="place behind the leader", y="swing over the leader's")
-    ax.set_yscale("log")
     kinds = [
         Line2D([], [], color=GREY, linewidth=1.2, label="linear theory"),
         Line2D([], [], color=GREY, marker="o", linestyle="", markersize=4, label="simulated"),
