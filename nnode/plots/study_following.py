@@ -42,6 +42,10 @@ def errors(
     ax.axvline(0, color=GREY, linewidth=0.8)
     ax.set_yticks(place, names)
     ax.set_ylim(-0.8, len(names) - 0.2)
+    # one that blows up on a few pairs must not hide the others
+    ends = np.abs(np.concatenate([values[:, 1:].ravel() for values in differences.values()]))
+    limit = 1.15 * float(np.quantile(ends, 0.9))
+    ax.set_xlim(-limit, limit)
     dress(ax, x=f"error minus that of {reference} ({unit})")
     figure.legend(
         handles=handles, fontsize=SMALL_FONT, frameon=False, loc="outside upper center", ncols=2

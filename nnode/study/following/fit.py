@@ -96,9 +96,7 @@ def floor(folder: str, name: str, restarts: int, seed: int) -> Result:
     candidate, batch = EVERY[name], data.batch(folder)
     cost = costs_of(candidate, batch)
     centre = calibrated(candidate, cost, 1, seed)[0].row
-    fits = [
-        alone(cost, row, steps=STEPS) for row in (centre, *starts(candidate, cost, restarts, seed))
-    ]
+    fits = [alone(cost, row) for row in (centre, *starts(candidate, cost, restarts, seed))]
     best = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
     rows = np.stack([fits[k].row[b] for b, k in enumerate(best)])
     return {

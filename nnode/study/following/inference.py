@@ -10,7 +10,7 @@ from nnode.calibrate.gauss_newton import TangentCost, alone, pooled, sandwich
 from nnode.data.sequence import collate
 from nnode.study.following import data
 from nnode.study.following.candidates import EVERY, starts
-from nnode.study.following.fit import STEPS, at_limits, costs_of, named
+from nnode.study.following.fit import at_limits, costs_of, named
 from nnode.study.statistics import paired
 
 Result = dict[str, Any]
@@ -18,7 +18,7 @@ Result = dict[str, Any]
 #: Factors on a parameter, at which all others are calibrated again.
 PROFILE = tuple(float(f) for f in np.geomspace(0.25, 4, 17))
 #: Factors on the penalty by which pairs are drawn towards the pool.
-STRENGTHS = (0.0, 0.01, 0.1, 1.0, 10.0)
+STRENGTHS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 #: A parameter's spread between pairs is at least this share of the pooled value.
 LEAST_SPREAD = 0.02
 
@@ -92,10 +92,7 @@ def halves(
     begin = [centre, *starts(EVERY[name], first, restarts, seed)]
 
     def best(cost: TangentCost, pool: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-        fits = [
-            alone(cost, one, steps=STEPS, pool=pool)
-            for one in (begin if pool is None else begin[:1])
-        ]
+        fits = [alone(cost, one, pool=pool) for one in (begin if pool is None else begin[:1])]
         which = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
         return np.stack([fits[k].row[b] for b, k in enumerate(which)])
 

@@ -84,6 +84,7 @@ def platoon_blocks(study: Study) -> list[Block]:
             "the last 30 %; *fold*: inside the first 70 %, by which the law is chosen. *At a "
             "limit*: how many of the four followers' parameters ended at one.",
             bold=bold,
+            digits={"at a limit": 0},
         ),
         *_runs(study),
     ]
@@ -124,6 +125,7 @@ def _runs(study: Study) -> list[Block]:
             table,
             f"Time gap T (s) of idm, calibrated on every follower of all {frame['run'].nunique()} "
             "runs by itself, by the setting of the distance.",
+            digits={"followers": 0},
             full=frame,
         ),
         FigureBlock(
@@ -199,6 +201,7 @@ def leader_blocks(study: Study) -> list[Block]:
             costs,
             "Error of the gap (m) on pairs of a cluster that was left out, by what was calibrated "
             "on; differences to one calibration for both kinds, clusters resampled.",
+            digits={"pairs": 0},
         ),
     ]
 

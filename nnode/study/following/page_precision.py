@@ -50,6 +50,7 @@ def _objectives(study: Study) -> list[Block]:
         )  # fmt: skip
         both = pd.concat([table, numbers], axis=1)
         both["at a limit"] = [", ".join(one[o]["limits"]) for o in OBJECTIVES]
+        both.index.name = "minimised"
         bold = pd.DataFrame(False, index=both.index, columns=both.columns)
         for column in OBJECTIVES:
             bold.loc[str(both[column].astype(float).idxmin()), column] = True

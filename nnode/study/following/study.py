@@ -20,7 +20,7 @@ from nnode.study.runner import Task, hash_of, run_tasks
 
 TITLE = "Car following: laws, effects, drivers"
 SUBTITLE = (
-    "Eleven laws of following with and without effects, calibrated by Gauss and Newton's method "
+    "Laws of following with and without effects, calibrated by Gauss and Newton's method "
     "on exact tangents: NGSIM I-80 with a published division, OpenACC, TGSIM."
 )
 
