@@ -91,7 +91,7 @@ class Slopes:
 def slopes(system: System, gap: float, v: float, length: float) -> Slopes:
     """By central differences."""
     at = np.array([gap, v, 0.0]) + STEP * np.concatenate([np.eye(3), -np.eye(3)])
-    rate = acceleration(system, *at.T, length=length)
+    rate = acceleration(system, at[:, 0], at[:, 1], at[:, 2], length)
     found = (rate[:3] - rate[3:]) / (2 * STEP)
     return Slopes(*map(float, found))
 
