@@ -44,7 +44,7 @@ def errors(
     ax.set_ylim(-0.8, len(names) - 0.2)
     # one that blows up on a few pairs must not hide the others
     ends = np.abs(np.concatenate([values[:, 1:].ravel() for values in differences.values()]))
-    limit = 1.15 * float(np.quantile(ends, 0.9))
+    limit = 1.15 * float(np.nanquantile(ends, 0.9))
     ax.set_xlim(-limit, limit)
     dress(ax, x=f"error minus that of {reference} ({unit})")
     figure.legend(

@@ -125,6 +125,9 @@ def _cross_validated(study: Study) -> list[Block]:
         "The floor, every pair with numbers of its own, is "
         f"{np.mean(floor['costs']):.2f} m for {REFERENCE} on the pairs that it is calibrated on."
     )
+    left = [name for name in EVERY if name not in study.names]
+    if left:
+        text += f" Listed, and not calibrated for this page: {', '.join(left)}."
     order = list(table.index)
     differences = {
         "held out, clusters resampled": _rows(study.against_reference(n) for n in order),
@@ -145,14 +148,15 @@ def _cross_validated(study: Study) -> list[Block]:
             "Mean root mean square error of the gap (m) on training pairs: calibrated on all, and "
             "held out; 95 % intervals, clusters resampled. *Better*: share of the pairs on which "
             f"the candidate has the lower error than {REFERENCE}. *At a limit*: parameters that "
-            "ended at the edge of what is allowed: such numbers are not measured.",
+            "ended at the edge of what is allowed: such numbers are not measured. ∞: it blew up on "
+            "a pair.",
             bold=bold,
         ),
         FigureBlock(
             "candidates",
             plots.errors(order, differences, "m", REFERENCE),
-            f"Errors of the gap minus those of {REFERENCE} on the same pairs, with 95 % intervals; what "
-            "lies beyond the frame stands in the tables.",
+            f"Errors of the gap minus those of {REFERENCE} on the same pairs, with 95 % intervals; "
+            "what lies beyond the frame stands in the tables.",
             "Differences of all candidates to the reference, held out and on test pairs.",
         ),
         TableBlock(

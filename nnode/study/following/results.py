@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,12 +58,12 @@ class Study:
     def against_reference(self, name: str, by_pair: bool = False) -> Paired:
         """A candidate minus the reference on held-out training pairs, clusters resampled."""
         group = np.arange(len(self.clusters)) if by_pair else self.clusters
-        return paired(self.heldout(name), self.heldout(REFERENCE), group, self.options.seed)
+        return _paired(self.heldout(name), self.heldout(REFERENCE), group, self.options.seed)
 
     def test_against(self, name: str) -> Paired:
         """A candidate minus the reference on the test pairs, pairs resampled."""
         values = self.tested(name)
-        return paired(values, self.tested(REFERENCE), np.arange(len(values)), self.options.seed)
+        return _paired(values, self.tested(REFERENCE), np.arange(len(values)), self.options.seed)
 
     def pairs(self, test: bool = False) -> tuple[Sequence, ...]:
         """Of one side of the published division."""
@@ -83,8 +84,17 @@ class Study:
             return cost.fill_(system, np.array(self.one("cv", name)["row"]))
 
 
+def _paired(first: np.ndarray, second: np.ndarray, group: np.ndarray, seed: int) -> Paired:
+    """A comparison in which a candidate may have blown up on a pair: then it has no interval."""
+    if np.isfinite(first).all():
+        return paired(first, second, group, seed)
+    return Paired(math.inf, math.nan, math.nan, math.nan, float((first < second).mean()))
+
+
 def interval(values: np.ndarray, group: np.ndarray, seed: int) -> tuple[float, float]:
-    """95 % percentile interval of a mean, groups resampled."""
+    """95 % percentile interval of a mean, groups resampled; NaN where a value is infinite."""
+    if not np.isfinite(values).all():
+        return math.nan, math.nan
     rng = np.random.default_rng(seed)
     low, high = np.quantile(group_weights(group, DRAWS, rng) @ values, [0.025, 0.975])
     return float(low), float(high)
