@@ -69,9 +69,9 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The paper's studies on the real recordings (downloaded, or from NNODE_DATA), pages into docs/.
+# Studies on the real recordings (downloaded, or from NNODE_DATA; following: from there), pages into docs/.
 study: setup
-	for name in traffic crowd; do \
+	for name in traffic crowd following; do \
 	  $(BIN)/python scripts/study.py study=$$name || exit $$?; \
 	  rm -rf docs/studies/$$name && mkdir -p docs/studies/$$name && \
 	  cp -r runs/study/$$name/study.html runs/study/$$name/study.md runs/study/$$name/*.csv \

@@ -47,7 +47,12 @@ from nnode.models.options import (
     NetworkSpeedOptions,
     SocialForceOptions,
 )
-from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions, WalkingStudyOptions
+from nnode.study.options import (
+    CrowdStudyOptions,
+    FollowingStudyOptions,
+    TrafficStudyOptions,
+    WalkingStudyOptions,
+)
 
 
 @dataclass
@@ -163,6 +168,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
     ("study", "walking_study_schema"): WalkingStudyOptions,
+    ("study", "following_study_schema"): FollowingStudyOptions,
 }
 
 

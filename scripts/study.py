@@ -4,6 +4,8 @@ Examples:
   python scripts/study.py study=traffic
   # shows within a minute that all works; no figures to cite
   python scripts/study.py study=crowd study.quick=true
+  # pairs and platoons that the study cannot download: a folder with ngsim_pairs, openacc, tgsim
+  NNODE_DATA=FOLDER python scripts/study.py study=following
   python scripts/study.py study=traffic study.workers=8 hydra.run.dir=runs/study/mine
 
 Results: study.html, the same in Markdown, and a CSV of every table and of all parameters. The same

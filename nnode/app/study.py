@@ -21,9 +21,7 @@ log = logging.getLogger(__name__)
 
 #: The module of each study; imported when it is asked for.
 STUDIES = {
-    "traffic": "nnode.study.traffic.study",
-    "crowd": "nnode.study.crowd.study",
-    "walking": "nnode.study.walking.study",
+    name: f"nnode.study.{name}.study" for name in ("traffic", "crowd", "following", "walking")
 }
 
 #: Folder of quick studies inside the study's own: they must not replace full results.

@@ -329,6 +329,11 @@ def law_from(name: str, description: Any, **network: Any) -> FormulaLaw | Formul
             "model.law needs parameters and rate, as in {parameters: {v0: 30 m/s, L: 5 m}, "
             "rate: {x: v0*(1 - L/gap)}}"
         )
+    if not name.isidentifier() or "__" in name:
+        raise ConfigError(
+            f"model.name={name!r} of a formula must be letters, digits and single underscores, as "
+            "my_law"
+        )
     rate = description["rate"]
     people = isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
     keys = (*_CROWD_KEYS, *_REDUCED) if people else _KEYS

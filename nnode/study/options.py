@@ -11,7 +11,7 @@ from omegaconf import MISSING
 class StudyOptions:
     """What all studies share."""
 
-    name: str = MISSING  # traffic | crowd
+    name: str = MISSING  # traffic | crowd | following
     source: str | None = None  # folder with the raw files; null downloads
     download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
     quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
@@ -58,3 +58,12 @@ class WalkingStudyOptions(StudyOptions):
     name: str = "walking"
     horizons: list[float] = field(default_factory=lambda: [1.0, 2.0, 3.0, 4.0, 5.0])  # s
     folds: int = 2  # groups of runs, each held out once
+
+
+@dataclass
+class FollowingStudyOptions(StudyOptions):
+    """Laws of car following on pairs and platoons with published results."""
+
+    name: str = "following"
+    restarts: int = 4  # starts of every calibration; networks get as many
+    folds: int = 5  # of cross-validation, by cluster

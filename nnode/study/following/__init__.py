@@ -1,0 +1,1 @@
+"""Car following: pairs with published results, platoons, people behind automated cars."""

@@ -1,0 +1,129 @@
+"""The laws that are compared, with and without effects, and where their calibrations start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from nnode.calibrate.gauss_newton import TangentCost
+from nnode.models.build import build_model
+from nnode.models.field import FIELD, NEURONS
+from nnode.models.system import System
+
+#: Starts of parameters with limits: the usual value times a factor that is drawn from here.
+FACTORS = (0.5, 2.0)
+#: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.
+DECAY = 1e-3
+
+#: A network that is told the time gap that a driver keeps at first, and how it fades.
+_REMEMBERING: dict[str, Any] = {
+    "parameters": {
+        "tau_m": {"value": "30 s", "low": "1 s", "high": "2000 s"},
+        "T": {"value": "1.2 s", "low": "0.05 s", "high": "5 s"},
+    },
+    "constants": {"s0": "2 m", "slowest": "2 m/s", "shortest": "0.1 s", "longest": "5 s"},
+    "states": {
+        "q": [
+            "s", "(T - q)/tau_m", "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)"
+        ]
+    },
+    "where": {"net": "gap - length_1"},
+    "rate": {"v": "NN(net/20, v/10, dv/2, q)"},
+    "source": "acceleration as a network of gap, speed, speed difference and a fading time gap",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A law of :data:`nnode.models.field.FIELD` and what is added to it.
+
+    Attributes:
+        law: its name.
+        effects: of the catalogue.
+        network: neurons of a network beside the law; None: none, or the law's own.
+    """
+
+    law: str
+    effects: tuple[str, ...] = ()
+    network: int | None = None
+    given: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    @property
+    def name(self) -> str:
+        """As pages show it."""
+        beside = () if self.network is None or self.given else (f"network {self.network}",)
+        return " + ".join((self.law, *self.effects, *beside)).replace("_", " ")
+
+    def system(self, seed: int = 0) -> System:
+        """The model behind a measured leader; weights of a network depend on the seed."""
+        return build_model(
+            {
+                "term": "formula",
+                "name": self.law,
+                "leader": "measured",
+                "law": FIELD[self.law] if self.given is None else self.given,
+                "network": NEURONS.get(self.law, self.network),
+                "effects": [{"name": effect} for effect in self.effects],
+            },
+            seed=seed,
+        )
+
+
+def key(name: str) -> str:
+    """A candidate's name as a file name."""
+    return name.replace(" + ", "-").replace(" ", "_")
+
+
+def _effects(law: str, *effects: str) -> list[Candidate]:
+    return [Candidate(law, tuple(effect.split("+"))) for effect in effects]
+
+
+#: Two vehicles ahead are not in pairs: looking further ahead is no candidate.
+EVERY: dict[str, Candidate] = {
+    one.name: one
+    for one in (
+        *(Candidate(name) for name in FIELD),
+        *_effects("idm", "memory", "inertia", "reaction_delay"),
+        *_effects("helly", "memory", "inertia", "reaction_delay"),
+        *_effects("gipps", "memory"),
+        *_effects("krauss", "memory"),
+        *_effects("fvdm", "reaction_delay"),
+        *_effects("idm", "memory+inertia", "memory+reaction_delay"),
+        *_effects("helly", "memory+inertia", "memory+reaction_delay"),
+        Candidate("idm", network=4),
+        Candidate("idm", ("memory",), 4),
+        Candidate("helly", ("memory",), 4),
+        Candidate("remembering_network", network=4, given=_REMEMBERING),
+    )
+}
+
+#: What others are compared with.
+REFERENCE = "idm"
+
+
+def starts(candidate: Candidate, cost: TangentCost, number: int, seed: int) -> np.ndarray:
+    """``(number, P)`` rows: the shelf's own values, then random ones within the limits.
+
+    Weights of networks are drawn as models draw them, those beside a law start at 0 in their
+    last layer.
+    """
+    rng = np.random.default_rng(seed)
+    rows = []
+    for i in range(number):
+        row = cost.row(candidate.system(seed + i))
+        if i:
+            limited = np.isfinite(cost.low) & np.isfinite(cost.high)
+            factor = np.exp(rng.uniform(math.log(FACTORS[0]), math.log(FACTORS[1]), len(row)))
+            row = np.where(limited, row * factor, row)
+        rows.append(np.clip(row, cost.low, cost.high))
+    return np.stack(rows)
+
+
+def decay(cost: TangentCost) -> tuple[np.ndarray, np.ndarray] | None:
+    """Centre and weights of the penalty on a network's weights; None where there is none."""
+    free = ~(np.isfinite(cost.low) & np.isfinite(cost.high))
+    return (np.zeros(len(free)), DECAY * free) if free.any() else None
