@@ -1,3 +1,3 @@
 """Fixtures that benchmarks share with the scripts' tests."""
 
-from tests.app.conftest import script  # noqa: F401
+from tests.app.conftest import forks, script  # noqa: F401

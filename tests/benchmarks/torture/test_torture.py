@@ -27,9 +27,9 @@ def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
 
 @pytest.mark.thorough
 def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
-    found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=700")
+    found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=800")
     assert found["tried"]["kills"] == 6
-    assert found["tried"]["fuzz"] == 700
+    assert found["tried"]["fuzz"] == 800
     assert found["tried"]["disk"] >= 6
     assert found["tried"]["folder"] >= 2
     rows = {(row["campaign"], row["what"]): row for row in found["rows"]}
