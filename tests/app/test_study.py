@@ -37,7 +37,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["study=trafic"], "study=trafic is unknown, expected one of crowd, following, traffic, walking"),
+        (["study=trafic"], "study=trafic is unknown, expected one of crowd, following, traffic"),
         (["study.qick=true"], r"did you mean study\.quick"),
         (["study=traffic", "study.horizons=[1]"], r"option study\.horizons is unknown"),
         (["study=crowd", "study.horizons=[one]"], "expected a number"),
