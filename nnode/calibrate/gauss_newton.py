@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import Convention, changed_gap, errors, net_gaps
+from nnode.calibrate.cost import FOLLOWING, Convention, changed_gap, errors, net_gaps
 from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, SimulationError
@@ -121,15 +121,13 @@ class TangentCost:
     def costs(self, rows: np.ndarray) -> np.ndarray:
         """``(B,)`` costs for parameters ``(P,)``, or for those of every sequence ``(B, P)``."""
         x, v, _, _ = self._simulated(rows, ())
-        return self._cost(*errors(x, v, self.batch, self._kind)).numpy()
+        return self._cost(*self._errors(x, v)).numpy()
 
     def __call__(self, rows: np.ndarray) -> Curved:
         """Costs and their derivatives, of parameters ``(P,)`` or ``(B, P)``."""
         x, v, dx, dv = self._simulated(rows, tuple(self.names))
-        away, seen = errors(x, v, self.batch, self._kind)
-        if self.convention in (Convention.integral, Convention.sum):
-            seen = self.batch.valid
-            away = torch.where(seen, x - self.batch.x[..., 0], 0.0)
+        away, seen = self._errors(x, v)
+        if self.convention not in FOLLOWING:
             slope = torch.where(seen, dx, 0.0)
         elif self.convention is Convention.speed:
             assert dv is not None
@@ -157,10 +155,12 @@ class TangentCost:
         blown = ~torch.isfinite(cost)
         return Curved(cost.numpy(), *(_none(part, blown).numpy() for part in found))
 
-    @property
-    def _kind(self) -> Convention:
-        places = self.convention in (Convention.integral, Convention.sum)
-        return Convention.gap if places else self.convention
+    def _errors(self, x: Tensor, v: Tensor | None) -> tuple[Tensor, Tensor]:
+        """``(K, B, N)`` errors of places, or ``(K, B, N - 1)`` of followers, and which count."""
+        if self.convention in FOLLOWING:
+            return errors(x, v, self.batch, self.convention)
+        seen = self.batch.valid
+        return torch.where(seen, x - self.batch.x[..., 0], 0.0), seen
 
     @property
     def _weight(self) -> float:
@@ -168,7 +168,7 @@ class TangentCost:
 
     def _cost(self, away: Tensor, seen: Tensor) -> Tensor:
         total = away.double().square().sum((0, -1))
-        if self.convention in (Convention.integral, Convention.sum):
+        if self.convention not in FOLLOWING:
             return self._finite(0.5 * self._weight * total)
         mean = total / seen.sum((0, -1)).clamp(min=1)
         return self._finite(mean.sqrt() if self.convention is Convention.spacing else mean)

@@ -63,6 +63,18 @@ def test_costs_and_slopes_are_those_of_autograd(kind: Convention, pairs: Batch) 
     np.testing.assert_allclose(curved.gradient.sum(0), [float(s) for s in slopes], rtol=1e-9)
 
 
+@pytest.mark.parametrize("kind", [Convention.integral, Convention.gap])
+def test_costs_of_platoons_are_those_that_come_with_slopes(kind: Convention) -> None:
+    time = 0.1 * np.arange(30)
+    lead = 12 * time + np.sin(time)
+    x = np.stack([lead - 45, lead - 20, lead], 1)[..., None]
+    batch = collate([Sequence(name="a", recording="r", time=time, x=x)])
+    cost = TangentCost(model(), batch, FusedSolver(), kind)
+    wanted = sequence_costs(TorchdiffeqSolver(None, "discrete")(model(), batch), batch, kind)
+    np.testing.assert_allclose(cost(cost.start).cost, wanted.detach().numpy(), rtol=1e-11)
+    np.testing.assert_allclose(cost.costs(cost.start), wanted.detach().numpy(), rtol=1e-11)
+
+
 def test_costs_are_what_their_names_say(pairs: Batch) -> None:
     run = TorchdiffeqSolver(None, "discrete")(model(T=1.1), pairs)
     found = {kind: sequence_costs(run, pairs, kind).detach().numpy() for kind in FOLLOWING}
