@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.cost import FOLLOWING, Convention, changed_gap, errors, net_gaps
-from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step
+from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step, damped_step
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, SimulationError
 from nnode.models.system import System, Traffic
@@ -246,18 +246,12 @@ def pooled(
         if penalty is not None:
             gradient = gradient + 2 * penalty[1] * (row - penalty[0])
             hessian = hessian + 2 * np.diag(penalty[1])
-        trial, value = row, math.inf
-        while damping < STUCK:
-            trial = box_step(row, gradient, hessian, damping, cost.low, cost.high)
-            value = total(cost.costs(trial), trial)
-            if value < now:
-                break
-            damping *= STIFFEN
-        if not value < now:
-            break
-        fall, row, damping = now - value, trial, max(damping * EASE, 1e-9)
-        now = value
-        if fall <= max(tolerance * now, _ROUNDING * now):
+        before = now
+        row, now, damping = damped_step(
+            lambda trial: total(cost.costs(trial), trial),
+            now, row, gradient, hessian, damping, cost.low, cost.high,
+        )  # fmt: skip
+        if not before - now > max(tolerance, _ROUNDING) * now:
             break
     return Fit(row, now, number, damping)
 

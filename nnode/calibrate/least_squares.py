@@ -175,6 +175,25 @@ def _derivatives(
     return columns
 
 
+def damped_step(
+    cost: Callable[[np.ndarray], float], now: float, row: np.ndarray, gradient: np.ndarray,
+    curvature: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray,
+) -> tuple[np.ndarray, float, float]:  # fmt: skip
+    """The first step from ``row`` that lowers the cost from ``now``, with more and more damping.
+
+    Returns:
+        where it ends and the cost there, and the next step's damping; ``row``, ``now`` and the
+        last damping where no step lowers it.
+    """
+    while damping < STUCK:
+        trial = box_step(row, gradient, curvature, damping, low, high)
+        value = cost(trial)
+        if value < now:
+            return trial, value, max(damping * EASE, 1e-9)
+        damping *= STIFFEN
+    return row, now, damping
+
+
 def box_step(
     row: np.ndarray, gradient: np.ndarray, curvature: np.ndarray, damping: float,
     low: np.ndarray, high: np.ndarray,

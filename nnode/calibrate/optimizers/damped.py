@@ -10,7 +10,7 @@ import numpy as np
 from torch.optim import Optimizer
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.least_squares import EASE, STIFFEN, STUCK, box_step
+from nnode.calibrate.least_squares import damped_step
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
@@ -78,15 +78,12 @@ class GaussNewton(Optimizer):
         if not math.isfinite(now):
             cost.complain(curved.cost)
         gradient, hessian = curved.gradient.mean(0), curved.hessian.mean(0)
-        damping, value, trial = group["damping"], math.inf, row
-        while damping < STUCK:
-            trial = box_step(row, gradient, hessian, damping, cost.low, cost.high)
-            value = float(cost.costs(trial).mean())
-            if value < now:
-                break
-            damping *= STIFFEN
+        end, value, damping = damped_step(
+            lambda trial: float(cost.costs(trial).mean()),
+            now, row, gradient, hessian, group["damping"], cost.low, cost.high,
+        )  # fmt: skip
         if value < now:
-            cost.fill_(self.system, trial)
-            group["damping"] = max(damping * EASE, 1e-9)
+            cost.fill_(self.system, end)
+            group["damping"] = damping
         group["converged"] = not now - value > self.tolerance * now
         return now

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,15 +57,22 @@ def prepare_horizon(
     Only people who are tracked through a whole sequence are part of it: the longer it is, the
     fewer and the slower they are.
     """
-    common = {"source": source, "download": download, "t_seq": horizon}
-    if not others:
-        options = JuelichOptions(recording=RECORDING, walls=WALLS, **common)  # type: ignore[arg-type]
-    else:
-        options = JuelichOptions(
-            name="hermes", recording=list(OTHERS), frame_rate=16.0, unit="cm", walking_axis="y",
-            walls=OTHER_WALLS, view=VIEW, **common,  # type: ignore[arg-type]
-        )  # fmt: skip
+    options = corridor(others, source=source, download=download, t_seq=horizon)
     return prepare(options, folder)
+
+
+def corridor(others: bool, **more: Any) -> JuelichOptions:
+    """Options of the paper's recording, or of the other runs.
+
+    Args:
+        more: further options of the data source.
+    """
+    if not others:
+        return JuelichOptions(recording=RECORDING, walls=WALLS, **more)
+    return JuelichOptions(
+        name="hermes", recording=list(OTHERS), frame_rate=16.0, unit="cm", walking_axis="y",
+        walls=OTHER_WALLS, view=VIEW, **more,
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=8)

@@ -7,11 +7,11 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from nnode.data.options import JuelichOptions, Velocity
+from nnode.data.options import Velocity
 from nnode.data.prepare import prepare
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.store import Store
-from nnode.study.crowd.data import OTHER_WALLS, OTHERS, RECORDING, VIEW, WALLS
+from nnode.study.crowd.data import OTHERS, RECORDING, corridor
 
 #: Recordings of both experiments; frame rates differ, so that they are two batches.
 RUNS = {"main": (RECORDING,), "others": OTHERS}
@@ -28,17 +28,10 @@ def prepare_runs(
     them. Sequences of one person, and the first one of a recording, which nothing went before,
     are left out by :func:`sequences`.
     """
-    common = {
-        "source": source, "download": download, "t_seq": horizon, "history": HISTORY,
-        "velocity": Velocity.backward, "min_agents": 2,
-    }  # fmt: skip
-    if kind == "main":
-        options = JuelichOptions(recording=RECORDING, walls=WALLS, **common)  # type: ignore[arg-type]
-    else:
-        options = JuelichOptions(
-            name="hermes", recording=list(OTHERS), frame_rate=16.0, unit="cm", walking_axis="y",
-            walls=OTHER_WALLS, view=VIEW, **common,  # type: ignore[arg-type]
-        )  # fmt: skip
+    options = corridor(
+        kind != "main", source=source, download=download, t_seq=horizon, history=HISTORY,
+        velocity=Velocity.backward, min_agents=2,
+    )  # fmt: skip
     return prepare(options, folder)
 
 
