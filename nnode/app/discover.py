@@ -174,7 +174,7 @@ def _job(
             f"model={model['name']} is a {system.domain} model, data={data.name} are "
             f"{data.domain} data; choose both of one domain"
         )
-    check_options(options, system.domain)  # type: ignore[arg-type]
+    check_options(options, system.domain, system.order)  # type: ignore[arg-type]
     check_model(system)
     inputs = read_inputs(data, folder / "data")
     if data.prepared is None:  # a folder is taken as it is

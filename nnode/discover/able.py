@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+
 from nnode.errors import ConfigError
 from nnode.laws.crowd import SMALLEST
+from nnode.models.build import add_effects
 from nnode.models.crowd_formula import CrowdBase, crowd_of
 from nnode.models.effects import Effect, IndividualEffect
 from nnode.models.extend import effects_of
@@ -25,17 +28,23 @@ def check_effect(effect: type[Effect]) -> None:
         )
 
 
+def not_offered(effect: type[Effect], system: System) -> str:
+    """Why an effect cannot act on a model; empty: it can."""
+    if system.domain != "traffic" or system.order == 1:
+        return ""
+    try:
+        add_effects(copy.deepcopy(system), [effect.name])
+    except ConfigError as error:
+        return str(error).removeprefix("model.effects: ")
+    return ""
+
+
 def check_model(system: System) -> None:
     """Refuse a model that the engine of its domain cannot simulate.
 
     Raises:
         ConfigError: names the term and what to do.
     """
-    if system.domain == "traffic" and system.order > 1:
-        raise ConfigError(
-            "the diagnosis of lanes simulates laws of first order, and this one says an "
-            "acceleration; it can be trained and evaluated, but not yet diagnosed"
-        )
     law = crowd_of([t for t in system.terms if isinstance(t, CrowdBase)])
     if system.domain == "crowd" and law is not None and (law.order == 1 or law.sums[SMALLEST]):
         what = "of first order" if law.order == 1 else "with smallest values over others"

@@ -32,7 +32,8 @@ def catalogue(own: bool = False) -> str:
     """
     parts = []
     for domain, title in (("traffic", "Traffic"), ("crowd", "Crowds")):
-        effects = [e for e in CATALOGUE.of(cast(Domain, domain)) if own or _ours(e)]
+        every = CATALOGUE.of(cast(Domain, domain), every=True)
+        effects = [e for e in every if e.sought and (own or _ours(e))]
         if effects:
             parts.append(f"### {title}\n\n{_HEAD}\n" + "\n".join(map(_row, effects)))
     return "\n\n".join(parts)

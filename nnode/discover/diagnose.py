@@ -12,7 +12,7 @@ import numpy as np
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model
+from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import Division, divide
 from nnode.discover.found import Found
 from nnode.discover.judge.confirm import LEVEL, engine_of
@@ -113,11 +113,13 @@ def diagnose(
         SimulationError: the model cannot be simulated on these data at all.
     """
     domain = cast(Domain, system.domain)
-    names = check_options(options, domain)
+    names = check_options(options, domain, system.order)
     check_model(system)
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
-    wanted = [effect for effect in CATALOGUE.of(domain) if effect.name in names]
+    known = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
+    refused = {e.name: reason for e in known if (reason := not_offered(e, system))}
+    wanted = [effect for effect in known if effect.name not in refused]
     effects = [effect for effect in wanted if not issubclass(effect, IndividualEffect)]
     look = _looked_for(system, sequences, options, effects, clock, stages)
     if look.tested.together:
@@ -189,6 +191,7 @@ def diagnose(
             "sealed": [sequences[i].name for i in division.sealed],
         },
         notes=[division.note] if division.note else [],
+        not_offered=refused,
         seconds=clock.seconds,
         sealed=each,
     )

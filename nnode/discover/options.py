@@ -33,8 +33,11 @@ class DiscoverOptions:
     animation: bool = True  # one sealed sequence as a moving picture in the page
 
 
-def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
+def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> list[str]:
     """Refuse what no diagnosis can work with.
+
+    Args:
+        order: of the law.
 
     Returns:
         The names of the effects to look for, in the catalogue's order.
@@ -50,7 +53,7 @@ def check_options(options: DiscoverOptions, domain: Domain) -> list[str]:
         raise ConfigError(f"discover.max_effects={options.max_effects} must be at least 0")
     if options.step is not None and not (math.isfinite(options.step) and options.step > 0):
         raise ConfigError(f"discover.step={options.step} must be a positive number of s, or null")
-    known = [effect.name for effect in CATALOGUE.of(domain)]
+    known = [effect.name for effect in CATALOGUE.of(domain, order)]
     _known("discover.exclude", options.exclude, known, domain)
     chosen = known
     if options.effects is not None:

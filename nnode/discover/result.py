@@ -282,6 +282,7 @@ class Diagnosis:
     notes: list[str]
     seconds: dict[str, float]
     sealed: list[dict[str, Any]] = field(default_factory=list)  # name, before, after of each
+    not_offered: dict[str, str] = field(default_factory=dict)  # effect to why the law has no place
 
     def plain(self) -> dict[str, Any]:
         """Plain types for JSON."""

@@ -34,7 +34,7 @@ class Along:
     def given(self, motion: Motion) -> tuple[np.ndarray, dict[str, Any]]:
         """States ``(M, N, K, B)``, and what a model's formulas name."""
         y = np.ascontiguousarray(self.states.permute(3, 2, 0, 1).numpy())
-        y = motion.placed(y, self._place)
+        y = motion.placed(y, self._place, self._speed)
         return y, motion.given(self.time.numpy()[:, None], y, self._speed)
 
     def rates(self, system: System) -> Tensor:
@@ -68,4 +68,4 @@ class Along:
         x = torch.where(lead, every.measured[0], x)
         speed = torch.where(lead, every.measured_rate[0], rate)
         time = self.time[:, None].expand(-1, len(self.scene.agent)).flatten()
-        return State(time, x, None, every, system, speed)
+        return State(time, x, speed if system.order > 1 else None, every, system, speed)

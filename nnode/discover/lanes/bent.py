@@ -45,7 +45,7 @@ class Bent(Motion):
         found = super().rates(y, given)
         value = self.seen(*self.simulations(y, found), given["t"])[1]
         bend = self.curve.variable.curve(value, self.curve.amounts.numpy())[0]
-        found[0, :-1] += np.where(self.follows, self.scale * bend[:-1], 0.0)
+        found[self.top, :-1] += np.where(self.follows, self.scale * bend[:-1], 0.0)
         return found
 
     def simulations(self, y: np.ndarray, rates: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -60,7 +60,8 @@ class Bent(Motion):
         time = torch.as_tensor(t, dtype=torch.float64)
         if time.ndim:
             time = time.expand(-1, sequences).flatten()
-        state = State(time, x, None, self.every, self.system, rate)
+        speed = rate if self.top else None
+        state = State(time, x, speed, self.every, self.system, rate)
         found = self.curve.variable.value(state)
         return found, found.detach().numpy().T.reshape(x.shape[1], -1, sequences)
 
@@ -117,12 +118,13 @@ class Bend:
                 if found is not None:
                     part[i] = steep[i] * found[..., 0].numpy().T.reshape(y.shape[1:])
         self.matrix = whole(slopes, y.shape)
-        self.matrix[0] += np.einsum("ijkb,jqmkb->iqmkb", self._by[1], self.matrix[0])
-        self.matrix[0, :, 0] += self._by[0]
+        top = motion.top
+        self.matrix[top] += np.einsum("ijkb,jqmkb->iqmkb", self._by[1], self.matrix[0])
+        self.matrix[top, :, 0] += self._by[0]
 
     def passed_on(self, source: np.ndarray) -> np.ndarray:
-        """``(N, K, B)`` changes of the speeds by those of the formula's."""
-        found: np.ndarray = source + np.einsum("ijkb,jkb->ikb", self._by[1], source)
+        """``(N, K, B)`` what changes of the formula's speeds do by way of the curve."""
+        found: np.ndarray = np.einsum("ijkb,jkb->ikb", self._by[1], source)
         return found
 
 

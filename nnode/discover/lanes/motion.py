@@ -20,6 +20,7 @@ from nnode.laws.arrays import Straight, straight
 from nnode.laws.differentiate import derivatives
 from nnode.laws.expression import Expr
 from nnode.laws.lane import Lane
+from nnode.laws.steps import stepped
 from nnode.laws.tensors import SAFE, LaneRates
 from nnode.models.formula import inputs_of, own_values, values_of
 from nnode.models.scene import Scene
@@ -31,11 +32,11 @@ Values = dict[str, Any]
 
 
 def formula_of(system: System) -> Lane | None:
-    """The formula of a model of first order; None where a term is code."""
-    if type(system) is not Traffic or system.order > 1:
+    """A model's formula, speeds never below 0 in it; None where a term is code."""
+    if type(system) is not Traffic:
         return None
     lane = system.lane
-    return lane if lane is not None and lane.is_formula else None
+    return stepped(lane, "rk4") if lane is not None and lane.is_formula else None
 
 
 class Leaders:
@@ -95,6 +96,7 @@ class Motion:
 
     Attributes:
         values: of the parameters' symbols, numbers or ``(R, 1)``.
+        top: number of the state whose rate the law says.
         follows: ``(N - 1, 1, B)`` True for those behind another vehicle.
         leads: ``(N, 1, B)`` True for those in front.
     """
@@ -112,7 +114,7 @@ class Motion:
             name: value.numpy()[..., None] if value.ndim else np.float64(value.item())
             for name, value in zip(lane.owned, known, strict=True)
         }
-        self.measured = system.leader == "measured"
+        self.measured, self.top = system.leader == "measured", lane.order - 1
         follower = scene.follower
         second = follower & torch.cat([follower[:, 1:], torch.zeros_like(follower[:, :1])], 1)
         self.follows, self.second = (_rows(mask)[:-1] for mask in (follower, second))
@@ -122,12 +124,15 @@ class Motion:
         self.fixed: Values = {name: _rows(value)[:-1] for name, value in inputs.items()}
         self.fixed["start"] = scene.start.numpy()
         self.fixed["second"] = self.second.astype(float)
+        self.fixed["dt"] = np.float64(scene.step)
 
-    def placed(self, y: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """States ``(M, N, L, B)`` with measured leaders where they were, ``(B,)`` or ``(L, B)``."""
+    def placed(self, y: np.ndarray, place: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """States ``(M, N, L, B)`` with measured leaders where they were, and as fast as they were,
+        each ``(B,)`` or ``(L, B)``."""
         if self.measured:
             y = y.copy()
-            np.copyto(y[0], place, where=self.leads)
+            for own, one in zip(y[: self.lane.order], (place, speed), strict=False):
+                np.copyto(own, one, where=self.leads)
         return y
 
     def given(self, t: Any, y: np.ndarray, speed: np.ndarray) -> Values:

@@ -140,8 +140,8 @@ class Response:
         if self._bend is not None:
             assert isinstance(motion, Bent)
             for own in found:
-                own[0] = self._bend.passed_on(own[0])
-            found[entries[motion.name, 0], 0] = self._bend.height
+                own[motion.top] += self._bend.passed_on(own[0])
+            found[entries[motion.name, 0], motion.top] = self._bend.height
         return torch.from_numpy(found).permute(0, 3, 4, 2, 1)
 
     def _starts(self, own: Mapping[str, Tensor]) -> Tensor | None:

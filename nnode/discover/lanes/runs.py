@@ -58,7 +58,7 @@ class _ByFormula:
     def rate(self, t: float, y: np.ndarray) -> np.ndarray:
         motion = self._motion
         place, speed = self._leaders.at(t)
-        y = motion.placed(y, place)
+        y = motion.placed(y, place, speed)
         found = motion.rates(y, motion.given(t, y, speed))
         if motion.measured:
             # a leader's state is never read: its place is known at every time

@@ -255,7 +255,8 @@ class Screen:
             if share < FORBIDDEN:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._by_chance(trace.effect.name, chance)
-        size = max(map(abs, probe.steps.values())) if trace.effect.memory else 0.0
+        # of an effect with a memory the trace is that of a finite strength, where it has one
+        size = max(map(abs, probe.steps.values()), default=0.0) if trace.effect.memory else 0.0
         evidence = [
             Evidence(probe.options, size, parts[:, i], grams[:, i, i], minimal[i])
             for i in range(z.shape[1])

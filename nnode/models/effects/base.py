@@ -99,7 +99,7 @@ class Effect(Term):
             fixed within every recording, recordings are what tells of it.
         individual: every agent has a strength of its own, with mean zero over the agents; the
             reported strength is their standard deviation.
-        sought: whether a diagnosis looks for it.
+        sought: orders of the laws in which a diagnosis looks for it.
     """
 
     domain: ClassVar[Domain]
@@ -112,7 +112,7 @@ class Effect(Term):
     consecutive: ClassVar[bool] = False
     covariate: ClassVar[str | None] = None
     individual: ClassVar[bool] = False
-    sought: ClassVar[bool] = True
+    sought: ClassVar[tuple[int, ...]] = (1, 2)
 
     def __init__(self, **values: float) -> None:
         super().__init__()
@@ -226,10 +226,10 @@ class Catalogue:
         self.effects[effect.name] = effect
         return effect
 
-    def of(self, domain: Domain, *, every: bool = False) -> list[type[Effect]]:
-        """The effects of a domain that a diagnosis looks for, or every one."""
+    def of(self, domain: Domain, order: int = 1, *, every: bool = False) -> list[type[Effect]]:
+        """The effects of a domain that a diagnosis looks for in laws of an order, or every one."""
         own = [effect for effect in self.effects.values() if effect.domain == domain]
-        found = [effect for effect in own if every or effect.sought]
+        found = [effect for effect in own if every or order in effect.sought]
         return sorted(found, key=lambda effect: effect.rank)
 
 

@@ -138,16 +138,8 @@ class Inertia(Effect):
         return [Probe({}, {"tau_v": tau}) for tau in (0.3, 0.8, 2.0) if has_law(system)]
 
 
-class _SecondOrder(Effect):
-    """An effect on accelerations, which are not diagnosed."""
-
-    domain = "traffic"
-    strengths = {}
-    sought = False
-
-
 @CATALOGUE.add
-class PureDelay(_SecondOrder):
+class PureDelay(Effect):
     """Drivers react exactly as they would have some time ago, at most 15 steps.
 
     Every step hands the acceleration on to the next of 15 states. The acceleration's slope by T
@@ -156,16 +148,19 @@ class PureDelay(_SecondOrder):
 
     T: Tensor
     name = "pure_delay"
+    domain = "traffic"
     formula = "W(t - T)"
     second = Rule(rate="late", delayed={"late": ("W", "m/s^2", "T")}, remembered=15)
     source = "Treiber, Kesting & Helbing 2006 (reaction time)"
+    strengths = {}
     settings = {"T": Setting(0.5, Interval(0.0, 1.5), "s")}
     rank = 36
     memory = 15
+    sought = ()  # a map from step to step; reaction_delay is looked for
 
 
 @CATALOGUE.add
-class Memory(_SecondOrder):
+class Memory(Effect):
     """A driver starts with the time gap that he is seen to have, and relaxes to the common one.
 
     Seen is (gap - s0)/v in the first state; below 2 m/s it is that of 2 m/s, and it lies between
@@ -174,6 +169,7 @@ class Memory(_SecondOrder):
 
     tau_m: Tensor
     name = "memory"
+    domain = "traffic"
     formula = "law with time gap q in place of T; tau_m dq/dt = T - q"
     second = Rule(
         rate="W + law(T=q) - law()",
@@ -187,6 +183,14 @@ class Memory(_SecondOrder):
         constants={"slowest": (2.0, "m/s"), "shortest": (0.1, "s"), "longest": (5.0, "s")},
     )
     source = "after the memory effects of Treiber & Helbing 2003"
+    strengths = {}
     settings = {"tau_m": Setting(30.0, Interval(1.0, 2000.0), "s")}
     rank = 14
     memory = 1
+    sought = (2,)
+    kin = "who"
+    separated_by = "the same drivers for a longer time"
+
+    @classmethod
+    def probes(cls, batch: Batch, system: System) -> list[Probe]:
+        return [Probe({"tau_m": tau}, {}) for tau in (5.0, 20.0, 80.0)]

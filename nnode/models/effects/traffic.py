@@ -54,7 +54,7 @@ def law_in(system: System | None) -> FollowTheLeader:
 
 def has_law(system: System) -> bool:
     """Whether a model has a law of the gap; without one, an effect on it cannot be looked for."""
-    return system.find(FollowTheLeader) is not None
+    return system.find(FollowTheLeader) is not None or system.order > 1
 
 
 def gaps(x: Tensor) -> Tensor:
