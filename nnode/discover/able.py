@@ -6,6 +6,7 @@ import copy
 
 from nnode.errors import ConfigError
 from nnode.laws.crowd import SMALLEST
+from nnode.laws.expression import symbols
 from nnode.models.build import add_effects
 from nnode.models.crowd_formula import CrowdBase, crowd_of
 from nnode.models.effects import Effect, IndividualEffect
@@ -52,10 +53,11 @@ def check_model(system: System) -> None:
             f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "
             "evaluated, but not yet diagnosed"
         )
-    if isinstance(system, Traffic) and system.lane is not None and "dt" in system.lane.symbols:
+    lane = system.lane if isinstance(system, Traffic) else None
+    if lane is not None and any("dt" in symbols([r]) for r in list(lane.rates.values())[lane.order :]):
         raise ConfigError(
-            "the law names dt, the length of a step, and the diagnosis of lanes takes other steps; "
-            "it can be trained and evaluated, but not diagnosed"
+            "the model remembers something step by step, and the diagnosis of lanes takes other "
+            "steps; it can be trained and evaluated, but not diagnosed"
         )
     for term in system.terms if system.domain == "crowd" else ():
         if term.memory:

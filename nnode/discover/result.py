@@ -259,6 +259,46 @@ class Structure:
 
 
 @dataclass
+class ComparedLaw:
+    """A base law on open clusters.
+
+    Attributes:
+        parameters: that were calibrated, their number.
+        error: mean square error of positions of the open sequences, m².
+        behind: by what share its held-out cost lies above that of the best law, in the mean of
+            logarithms over clusters.
+        p_value: one-sided, paired by cluster, that it is as good as the best law.
+        values: parameter to value and unit.
+    """
+
+    name: str
+    parameters: int
+    error: float
+    behind: float
+    p_value: float
+    values: dict[str, tuple[float, str]]
+
+
+@dataclass
+class Laws:
+    """Base laws, the best first.
+
+    Attributes:
+        refused: law to the reason why it was not compared.
+        clusters: that they were compared on.
+    """
+
+    ranking: list[ComparedLaw]
+    refused: dict[str, str]
+    clusters: int
+
+    @property
+    def best(self) -> str:
+        """The name of the first; empty where none was compared."""
+        return self.ranking[0].name if self.ranking else ""
+
+
+@dataclass
 class Diagnosis:
     """The whole of a diagnosis; see the classes of its parts."""
 
@@ -283,6 +323,7 @@ class Diagnosis:
     seconds: dict[str, float]
     sealed: list[dict[str, Any]] = field(default_factory=list)  # name, before, after of each
     not_offered: dict[str, str] = field(default_factory=dict)  # effect to why the law has no place
+    laws: Laws | None = None  # base laws compared with each other
 
     def plain(self) -> dict[str, Any]:
         """Plain types for JSON."""

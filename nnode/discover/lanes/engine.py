@@ -114,10 +114,7 @@ class TrafficEngine:
     def simulate(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N, W)`` states; their first component are positions, m."""
         batch = self.smoothed
-        longest = min(STEP[system.order], fastest(system, rows))
-        # several samples in a step, or several steps in a sample
-        stride = max(1, math.floor(longest / batch.dt + 1e-9))
-        steps = max(1, math.ceil(batch.dt / longest - 1e-9))
+        stride, steps = self._steps(system, rows)
         h = batch.dt * stride / steps
         runs = side_by_side(system, rows, replace(system.scene(batch), step=h))
         y = runs.start(batch)
@@ -132,6 +129,12 @@ class TrafficEngine:
                 found.append(after)
             y, slope = after, then
         return runs.states(found[: batch.n_samples])
+
+    def _steps(self, system: System, rows: Tensor) -> tuple[int, int]:
+        """Samples in a step, or steps in a sample."""
+        longest = min(STEP[system.order], fastest(system, rows))
+        stride = max(1, math.floor(longest / self.batch.dt + 1e-9))
+        return stride, max(1, math.ceil(self.batch.dt / longest - 1e-9))
 
     def deviations(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N)`` measured minus simulated positions, m; 0 for leaders and outside of
@@ -172,14 +175,19 @@ class TrafficEngine:
         return self._columns(response, response.moved(torch.stack(sources)))
 
     def _whole(self, response: Response, effect: type[Effect], probe: Probe) -> Tensor:
-        """``(1, n)`` change of the residuals by an effect of finite strength."""
+        """``(1, n)`` change of the residuals by an effect of finite strength; zero where vehicles
+        would be moved by more than all the road that was seen: that is no small change."""
         values, amount = dict(probe.options), 1.0
         for name, step in probe.steps.items():
             values[name], amount = effect.strengths[name].neutral + step, step
         changed, _ = extended(response.system, effect(**values))
         with torch.no_grad():
             x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
-        return self._columns(response, (x - response.states[..., 0])[None] / amount)
+        moved = torch.where(self.follows, x - response.states[..., 0], 0.0)
+        seen = self.batch.x[..., 0][self.batch.valid]
+        if not float(moved.abs().max()) <= float(seen.max() - seen.min()):
+            moved = torch.zeros_like(moved)
+        return self._columns(response, moved[None] / amount)
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
@@ -213,8 +221,10 @@ class TrafficEngine:
             self.deviations(system, row[None])
         assert self._last is not None
         fixed = fill(copy.deepcopy(system), row)
+        stride, steps = self._steps(system, row[None])
+        scene = replace(fixed.scene(self.smoothed), step=self.batch.dt * stride / steps)
         with torch.no_grad():
-            found = Response(fixed, self.smoothed, self._last[2])
+            found = Response(fixed, self.smoothed, scene, self._last[2])
         self._response = system, row.clone(), found
         return found
 

@@ -36,7 +36,7 @@ def formula_of(system: System) -> Lane | None:
     if type(system) is not Traffic:
         return None
     lane = system.lane
-    return stepped(lane, "rk4") if lane is not None and lane.is_formula else None
+    return stepped(lane, "euler") if lane is not None and lane.is_formula else None
 
 
 class Leaders:

@@ -18,6 +18,7 @@ from nnode.discover.lanes.bent import Bend, Bent, motion_of
 from nnode.discover.lanes.motion import Motion, slopes
 from nnode.discover.lanes.sweep import Sweep
 from nnode.discover.residuals.engine import trained
+from nnode.models.scene import Scene
 from nnode.models.system import System
 
 
@@ -73,13 +74,12 @@ class Response:
 
     Args:
         system: the model, with the run's parameters.
-        batch: the sequences.
+        batch: the sequences. scene: their surroundings, with the step of the run.
         states: ``(K, B, N, W)`` of the run at the sampling times.
     """
 
-    def __init__(self, system: System, batch: Batch, states: Tensor) -> None:
+    def __init__(self, system: System, batch: Batch, scene: Scene, states: Tensor) -> None:
         self.system, self.batch, self.states = system, batch, states
-        scene = system.scene(batch)
         self.along = Along(scene, states)
         self._motion = motion_of(system, scene)
         self._bend: Bend | None = None

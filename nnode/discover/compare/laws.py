@@ -1,0 +1,122 @@
+"""Base laws compared on clusters that their calibration left out: a wrong law is the commonest
+missing effect.
+
+Every law is calibrated to positions, the best of them tells how its residuals depend on each other
+in time, and all are calibrated once more to residuals that are whitened so: laws are compared by
+the same numbers. Their costs are those of clusters that a calibration left out. Where another law
+comes out best, it tells the whitening, and all are compared once more.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import cast
+
+import numpy as np
+
+from nnode.data.sequence import Domain, Sequence
+from nnode.discover.able import check_model
+from nnode.discover.division import divide
+from nnode.discover.judge.confirm import engine_of
+from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.residuals.engine import Engine, row_of, square_of
+from nnode.discover.residuals.fit import ROUGH, Fit, refine
+from nnode.discover.result import ComparedLaw, Laws
+from nnode.discover.statistics.paired import compare, heldout
+from nnode.errors import ConfigError, SimulationError
+from nnode.models.system import System
+
+#: Rounds of choosing the law that tells the whitening.
+ROUNDS = 3
+
+
+def compare_laws(
+    candidates: Mapping[str, System], sequences: list[Sequence], options: DiscoverOptions
+) -> Laws:
+    """Rank laws on the open clusters of a diagnosis with the same options.
+
+    Args:
+        candidates: models by name; they are not changed. Those that the diagnosis cannot simulate
+            are told as refused, with the reason.
+        sequences: without faults, at least three of them.
+
+    Raises:
+        DataError: too few sequences.
+    """
+    division = divide(sequences, options)
+    chosen = [sequences[i] for i in division.open]
+    domain = cast(Domain, next(iter(candidates.values())).domain)
+    engine = engine_of(domain, chosen, division.label[division.open])
+    found, refused = _calibrated(engine, candidates)
+    if not found:
+        return Laws([], refused, 0)
+    squares = {name: square_of(engine, fit.system) for name, fit in found.items()}
+    first = min(squares, key=squares.__getitem__)
+    costs: dict[str, np.ndarray] = {}
+    for _ in range(ROUNDS):
+        engine.settle(found[first].system, row_of(found[first].system))
+        found = {name: _refined(engine, fit) for name, fit in found.items()}
+        costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
+        best = min(costs, key=lambda name: _level(costs[name]))
+        if best == first:
+            break
+        first = best
+    ranking = []
+    for name in sorted(costs, key=lambda name: _level(costs[name])):
+        against = compare(costs[name], costs[best])
+        system = found[name].system
+        ranking.append(
+            ComparedLaw(
+                name=name,
+                parameters=len(found[name].row),
+                error=square_of(engine, system),
+                behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
+                p_value=1.0 if name == best else against.p_value,
+                values={k: (float(v), unit) for k, (v, unit) in system.physical().items()},
+            )
+        )
+    return Laws(ranking, refused, int(engine.cluster.max()) + 1)
+
+
+def _level(costs: np.ndarray) -> float:
+    """Mean logarithm of the clusters' costs: no cluster dominates."""
+    found = np.log(np.maximum(np.nan_to_num(costs, nan=np.inf), 1e-300)).mean()
+    return float(found)
+
+
+def _calibrated(
+    engine: Engine, candidates: Mapping[str, System]
+) -> tuple[dict[str, Fit], dict[str, str]]:
+    """Every law from the better of two starts, by the engine's residuals as they are."""
+    found: dict[str, Fit] = {}
+    refused: dict[str, str] = {}
+    for name, system in candidates.items():
+        try:
+            check_model(system)
+        except ConfigError as error:
+            refused[name] = str(error)
+            continue
+        start = copy.deepcopy(system).double()
+        starts = [start]
+        if isinstance(engine, TrafficEngine):
+            starts.append(engine.near(start))
+        fits = [fit for one in starts if (fit := _rough(engine, one)) is not None]
+        if fits:
+            found[name] = min(fits, key=lambda fit: fit.cost)
+        else:
+            refused[name] = "it blows up on these data"
+    return found, refused
+
+
+def _rough(engine: Engine, system: System) -> Fit | None:
+    try:
+        return refine(engine, system, tolerance=ROUGH)
+    except SimulationError:
+        return None
+
+
+def _refined(engine: Engine, fit: Fit) -> Fit:
+    return refine(engine, copy.deepcopy(fit.system))
