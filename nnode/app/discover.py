@@ -7,13 +7,14 @@ import shlex
 import signal
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.app.base_laws import candidates, compared, law_options
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, shell_override
@@ -39,16 +40,21 @@ from nnode.discover.report.files import (
     interval,
     model_yaml,
     plain_report,
+    ranked,
     sentence,
     write_report,
 )
 from nnode.errors import ConfigError
 from nnode.files import write_text
 from nnode.models import System, build_model
+from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import load_own
 from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
+
+#: Folder of the diagnosis of the law that comes nearest, where another one was asked for.
+NEAREST = "nearest_law"
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,13 @@ def discover(config: DictConfig, folder: Path) -> None:
                 found = _diagnose(job, stages)
                 stages.begin("drawing")
                 drawn = _drawn(job, found, folder) if options.page else None
+            other = _nearest(job, found)
+            if other is not None:
+                place = folder / NEAREST
+                with Stages(f"diagnosis of {other.model['name']}", STAGES) as stages:
+                    second = _diagnose(other, stages)
+                    stages.begin("drawing")
+                    drawn_too = _drawn(other, second, place) if options.page else None
         except KeyboardInterrupt:
             number = guard.requested or signal.SIGINT
             raise Interrupted(
@@ -101,8 +114,13 @@ def discover(config: DictConfig, folder: Path) -> None:
                 number,
             ) from None
     with InterruptGuard() as guard:
+        if other is not None:
+            beside = _write(other, second, place, drawn_too)
         paths = _write(job, found, folder, drawn)
     _print(found, paths, time.monotonic() - start)
+    if other is not None:
+        print(f"\nthe law that comes nearest, {other.model['name']}:")
+        _print(second, beside, time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
         raise Interrupted(f"stopped by {name} when all was written", guard.requested)
@@ -133,7 +151,8 @@ def diagnose_table(
         options: further options of the diagnosis.
 
     Returns:
-        The content of ``report.json``.
+        The content of ``report.json``; ``nearest``: that of the law that comes nearest, where it
+        is another one.
 
     Raises:
         NNodeError: see :func:`discover`.
@@ -146,9 +165,18 @@ def diagnose_table(
         table = table_options(data, domain, walls, place)
         job = _job(own, table, _plain(table), groups, chosen, place)
         found = _diagnose(job)
+        report = plain_report(found.diagnosis)
+        other = _nearest(job, found)
+        if other is not None:
+            second = _diagnose(other)
+            report["nearest"] = plain_report(second.diagnosis)
         if folder is not None:
+            if other is not None:
+                beside = place / NEAREST
+                drawn = _drawn(other, second, beside) if chosen.page else None
+                _write(other, second, beside, drawn)
             _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
-    return plain_report(found.diagnosis)
+    return report
 
 
 def _plain(options: Any) -> dict[str, Any]:
@@ -176,6 +204,7 @@ def _job(
         )
     check_options(options, system.domain, system.order)  # type: ignore[arg-type]
     check_model(system)
+    candidates(str(model["name"]), system, options)
     inputs = read_inputs(data, folder / "data")
     if data.prepared is None:  # a folder is taken as it is
         # what the extended model is trained and tested on are the sequences without a fault
@@ -187,13 +216,41 @@ def _job(
 def _diagnose(job: Job, stages: Stages | None = None) -> Found:
     """Run the diagnosis, and add what only its caller knows."""
     set_threads(None, job.system.domain)
-    inputs = job.inputs
+    inputs, name = job.inputs, str(job.model["name"])
+    start = time.monotonic()
+    if stages is not None:
+        stages.begin("comparing laws")
+    laws = compared(name, job.system, inputs.sequences, job.options)
+    seconds = {"reading": job.seconds, "laws": round(time.monotonic() - start, 3)}
     found = diagnose(job.system, inputs.sequences, job.options, stages=stages)
     diagnosis = found.diagnosis
+    diagnosis.laws = laws
     diagnosis.data_faults = inputs.data_faults
-    diagnosis.model = str(job.model["name"])
-    diagnosis.seconds = {"reading": job.seconds, **diagnosis.seconds}
+    diagnosis.model = name
+    diagnosis.seconds = {**seconds, **diagnosis.seconds}
     return found
+
+
+def _nearest(job: Job, found: Found) -> Job | None:
+    """The diagnosis of the law that comes nearest; None where it is the one that was asked for."""
+    laws = found.diagnosis.laws
+    if laws is None or laws.best in ("", str(job.model["name"])):
+        return None
+    model = law_options(laws.best)
+    options = replace(job.options, compare=[])
+    if options.effects is not None or options.exclude:  # those that laws of its order know
+        order = build_model(model, options.seed).order
+        known = {e.name for e in CATALOGUE.of(found.diagnosis.domain, order)}  # type: ignore[arg-type]
+        effects = None if options.effects is None else [e for e in options.effects if e in known]
+        out = [e for e in options.exclude if e in known]
+        options = replace(options, effects=effects, exclude=out)
+    return replace(
+        job,
+        model=model,
+        groups={**job.groups, "model": laws.best},
+        system=build_model(model, options.seed),
+        options=options,
+    )
 
 
 def training_config(job: Job, found: Found) -> dict[str, Any]:
@@ -262,6 +319,8 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
 def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:
     d = found.diagnosis
     print(f"verdict: {d.verdict}")
+    if d.laws is not None and d.laws.ranking:
+        print(f"laws, by held-out cost: {ranked(d.laws)}")
     print(sentence(d))
     for effect in d.effects or d.leads:
         print(f"  {effect.name}: {interval(effect)}")

@@ -34,7 +34,7 @@ def not_offered(effect: type[Effect], system: System) -> str:
     if system.domain != "traffic" or system.order == 1:
         return ""
     try:
-        add_effects(copy.deepcopy(system), [effect.name])
+        add_effects(copy.deepcopy(system), [{"name": effect.name}])
     except ConfigError as error:
         return str(error).removeprefix("model.effects: ")
     return ""
@@ -54,7 +54,8 @@ def check_model(system: System) -> None:
             "evaluated, but not yet diagnosed"
         )
     lane = system.lane if isinstance(system, Traffic) else None
-    if lane is not None and any("dt" in symbols([r]) for r in list(lane.rates.values())[lane.order :]):
+    added = [] if lane is None else list(lane.rates.values())[lane.order :]
+    if "dt" in symbols(added):
         raise ConfigError(
             "the model remembers something step by step, and the diagnosis of lanes takes other "
             "steps; it can be trained and evaluated, but not diagnosed"

@@ -51,6 +51,7 @@ LEADS = 3
 
 #: Stages of a diagnosis, with the seconds that they take on the motorway recordings.
 STAGES = {
+    "comparing laws": 10.0,
     "calibrating": 2.0,
     "locating": 1.5,
     "naming": 11.5,

@@ -24,6 +24,8 @@ class DiscoverOptions:
     seed: int = 0  # of the split, of resampling and of a network's start weights
     effects: list[str] | None = None  # names of the catalogue to look for; null: all
     exclude: list[str] = field(default_factory=list)  # names not to look for
+    # models to compare before effects are looked for; null: the domain's laws; []: none
+    compare: list[str] | None = None
     max_effects: int = 4  # at most so many are added
     structure: bool = (
         True  # look for what has no name; without, it is faster and nothing is unknown

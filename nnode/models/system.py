@@ -172,10 +172,13 @@ class Traffic(System):
         return lane_of(self._terms())
 
     def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
-        lane = self.lane
+        lane, terms = self.lane, self._terms()
+        if lane is None:  # what is code and remembers nothing does not matter at the start
+            terms = [term for i, term in enumerate(terms) if not i or term.memory]
+            lane = lane_of(terms)
         if lane is None or not lane.starts:
             return super()._memories(batch, step)
-        x, v, terms, scene = batch.x[0], batch.v[0], self._terms(), self.scene(batch)
+        x, v, scene = batch.x[0], batch.v[0], self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
         known = starts_of(terms, lane, x, v, scene)
         told = [t.remember(x, v, self) for t in terms if t.memory and not begins(t, self.order)]

@@ -36,8 +36,8 @@ from nnode.models.extend import effects_of, extended, without
 from nnode.models.system import System
 from nnode.models.term import State, Term
 
-#: Longest step of the simulation, s, by the law's order: errors are below 1 mm (tests). Steps are no
-#: longer than the shortest time constant of the states that terms own.
+#: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
+#: constant of the states that terms own.
 STEP = {1: 0.4, 2: 0.2}
 #: Sequences are compared in windows of about this length, s, each simulated from so much
 #: before (at most a share of the sequence) that its start is forgotten.

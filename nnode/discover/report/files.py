@@ -16,7 +16,7 @@ from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.optimizers import build_optimizer
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Found
-from nnode.discover.result import Coefficient, Diagnosis, NamedEffect
+from nnode.discover.result import Coefficient, Diagnosis, Laws, NamedEffect
 from nnode.files import write_text
 from nnode.models import FeedForward, System, build_model
 from nnode.models.effects import CATALOGUE
@@ -99,6 +99,14 @@ def interval(effect: NamedEffect) -> str:
         value, low, high = estimate(c)
         parts.append(f"{name} = {value} [{low}, {high}]{in_unit(c.unit)}")
     return ", ".join(parts)
+
+
+def ranked(laws: Laws) -> str:
+    """The best laws in one line, and by how much they are behind."""
+    return ", ".join(
+        one.name + (f" (+{100 * one.behind:.3g} %)" if one.behind > 0 else "")
+        for one in laws.ranking[:5]
+    )
 
 
 def sentence(diagnosis: Diagnosis) -> str:

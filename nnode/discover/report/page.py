@@ -79,6 +79,7 @@ def page_blocks(
     """The page in the order of the diagnosis, the verdict first."""
     d = found.diagnosis
     return [
+        *_laws(d),
         *_verdict(d, drawn, found),
         *_data(d, drawn),
         *_agents(d),
@@ -89,6 +90,28 @@ def page_blocks(
         *_usage(d, commands, folder, found),
         _provenance(d, inputs),
     ]
+
+
+def _laws(d: Diagnosis) -> list[Block]:
+    """Which base law comes nearest, before anything is said to be missing."""
+    if d.laws is None or not d.laws.ranking:
+        return []
+    best, clusters = d.laws.best, d.laws.clusters
+    own = next((one for one in d.laws.ranking if one.name == d.model), None)
+    if best == d.model:
+        words = f"Of the laws that were compared, {best} comes nearest to the open sequences."
+    elif own is None:
+        words = f"{best} comes nearest to the open sequences; {d.model} was not compared."
+    else:
+        words = (
+            f"**{best} comes nearer than {d.model}**, whose held-out cost is "
+            f"{100 * own.behind:.3g} % higher (p = {amount(own.p_value, 2)}). What {d.model} "
+            f"lacks may be no effect but the other law: `nearest_law/` holds its diagnosis."
+        )
+    words += f" Costs are those of {clusters} clusters that calibrations left out in turn."
+    if d.laws.refused:
+        words += " Not compared: " + "; ".join(f"{k}: {v}" for k, v in d.laws.refused.items()) + "."
+    return [Heading("Which base law"), Text(words), tables.laws_table(d.laws)]
 
 
 def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:

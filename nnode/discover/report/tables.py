@@ -8,7 +8,7 @@ import pandas as pd
 
 from nnode.data.quality import KINDS
 from nnode.discover.report.files import amount, estimate, in_unit
-from nnode.discover.result import Diagnosis, NamedEffect
+from nnode.discover.result import Diagnosis, Laws, NamedEffect
 from nnode.models.term import short_names
 from nnode.pages.page import TableBlock
 
@@ -42,6 +42,31 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
     ]
     return _table(
         name, rows, "Coefficients with 95 % intervals; one-sided p on the sealed clusters."
+    )
+
+
+def laws_table(laws: Laws) -> TableBlock:
+    """Base laws, the best first."""
+    rows = [
+        {
+            "law": one.name,
+            "parameters": one.parameters,
+            "held-out cost above the best (%)": amount(100 * one.behind),
+            "p": amount(one.p_value, 2),
+            "mean square error (m²)": amount(one.error),
+            "calibrated": ", ".join(
+                f"{name.partition('.')[2] or name} {amount(value)}{in_unit(unit)}"
+                for name, (value, unit) in one.values.items()
+            ),
+        }
+        for one in laws.ranking
+    ]
+    return _table(
+        "laws",
+        rows,
+        "Base laws on the open sequences, behind measured leaders. *held-out cost*: of whitened "
+        "residuals, mean of logarithms over clusters; *p*: one-sided, that the law is as good as "
+        "the first; the errors are those of windows of positions.",
     )
 
 
