@@ -130,6 +130,9 @@ class Gap:
     Attributes:
         before: of the model as it was given, calibrated on the open sequences.
         after: of the extended model.
+        plain, plain_after: of both, calibrated to nothing but the positions of whole open
+            sequences: plain calibrations that the effects must beat as well. NaN in crowds, and
+            where agents' own numbers were named.
         noise_floor: of the measurement.
         closed: (before - after) / (before - noise_floor).
     """
@@ -138,6 +141,8 @@ class Gap:
     after: float
     noise_floor: float
     closed: float
+    plain: float = float("nan")
+    plain_after: float = float("nan")
 
 
 @dataclass
@@ -264,7 +269,8 @@ class ComparedLaw:
 
     Attributes:
         parameters: that were calibrated, their number.
-        error: mean square error of positions of the open sequences, m².
+        error: mean square error of positions of whole sequences in clusters that a calibration to
+            nothing else left out, m²; in crowds of residuals.
         behind: by what share its held-out cost lies above that of the best law, in the mean of
             logarithms over clusters.
         p_value: one-sided, paired by cluster, that it is as good as the best law.

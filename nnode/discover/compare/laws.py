@@ -1,10 +1,10 @@
 """Base laws compared on clusters that their calibration left out: a wrong law is the commonest
 missing effect.
 
-Every law is calibrated to positions, the best of them tells how its residuals depend on each other
-in time, and all are calibrated once more to residuals that are whitened so: laws are compared by
-the same numbers. Their costs are those of clusters that a calibration left out. Where another law
-comes out best, it tells the whitening, and all are compared once more.
+Every law is calibrated to the positions of whole sequences, the best of them tells how residuals
+depend on each other in time, and all are calibrated once more to residuals that are whitened so:
+laws are compared by the same numbers. Their costs are those of clusters that a calibration left
+out. Where another law comes out best, it tells the whitening, and all are compared once more.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import numpy as np
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model
 from nnode.discover.division import divide
-from nnode.discover.judge.confirm import engine_of
+from nnode.discover.judge.confirm import engine_of, plain_engine
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.residuals.engine import Engine, row_of, square_of
+from nnode.discover.residuals.engine import Engine, row_of
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.statistics.paired import compare, heldout
@@ -47,18 +47,20 @@ def compare_laws(
         DataError: too few sequences.
     """
     division = divide(sequences, options)
-    chosen = [sequences[i] for i in division.open]
+    chosen, label = [sequences[i] for i in division.open], division.label[division.open]
     domain = cast(Domain, next(iter(candidates.values())).domain)
-    engine = engine_of(domain, chosen, division.label[division.open])
-    found, refused = _calibrated(engine, candidates)
+    whole = plain_engine(domain, chosen, label)
+    found, refused = _calibrated(whole, candidates)
     if not found:
         return Laws([], refused, 0)
-    squares = {name: square_of(engine, fit.system) for name, fit in found.items()}
-    first = min(squares, key=squares.__getitem__)
+    number = np.bincount(whole.cluster)
+    errors = {name: heldout(fit, whole.cluster) / number for name, fit in found.items()}
+    first = min(errors, key=lambda name: float(errors[name].mean()))
+    engine = engine_of(domain, chosen, label)
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
         engine.settle(found[first].system, row_of(found[first].system))
-        found = {name: _refined(engine, fit) for name, fit in found.items()}
+        found = {n: refine(engine, copy.deepcopy(fit.system)) for n, fit in found.items()}
         costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
         best = min(costs, key=lambda name: _level(costs[name]))
         if best == first:
@@ -72,7 +74,7 @@ def compare_laws(
             ComparedLaw(
                 name=name,
                 parameters=len(found[name].row),
-                error=square_of(engine, system),
+                error=float(errors[name].mean()),
                 behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
                 p_value=1.0 if name == best else against.p_value,
                 values={k: (float(v), unit) for k, (v, unit) in system.physical().items()},
@@ -116,7 +118,3 @@ def _rough(engine: Engine, system: System) -> Fit | None:
         return refine(engine, system, tolerance=ROUGH)
     except SimulationError:
         return None
-
-
-def _refined(engine: Engine, fit: Fit) -> Fit:
-    return refine(engine, copy.deepcopy(fit.system))

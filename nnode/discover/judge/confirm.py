@@ -42,6 +42,16 @@ def engine_of(
     return TrafficEngine(sequences, clusters=clusters)
 
 
+def plain_engine(
+    domain: str, sequences: list[Sequence], clusters: np.ndarray | None = None
+) -> Engine:
+    """What most calibrations look at: positions of whole sequences, all errors alike; in crowds
+    the engine's own."""
+    if domain == "crowd":
+        return CrowdEngine(sequences, clusters=clusters)
+    return TrafficEngine(sequences, np.inf, clusters, np.inf)
+
+
 class Comparing:
     """Models on some sequences.
 

@@ -64,6 +64,7 @@ class TrafficEngine:
         sequences: at least one, of the same sampling interval.
         window: length of a window, s; infinite simulates whole sequences.
         clusters: ``(S,)`` of the sequences; None: each is one.
+        large: residuals beyond this count less.
 
     Attributes:
         unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
@@ -75,8 +76,9 @@ class TrafficEngine:
         sequences: list[Sequence],
         window: float = WINDOW,
         clusters: np.ndarray | None = None,
+        large: float = LARGE,
     ) -> None:
-        self.sequences = sequences
+        self.sequences, self.large = sequences, large
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
         self.batch = collate(part[0] for each in parts for part in each)
@@ -147,7 +149,7 @@ class TrafficEngine:
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` whitened residuals, the largest drawn in."""
-        return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen])
+        return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen], self.large)
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)`` derivatives of the residuals, by linear response."""
@@ -232,7 +234,8 @@ class TrafficEngine:
         """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
         away = self.batch.x[..., 0] - response.states[..., 0]
         residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
-        weight = torch.where(residual.abs() <= LARGE, 1.0, LARGE / drawn_in(residual).abs())
+        size = drawn_in(residual, self.large).abs()
+        weight = torch.where(residual.abs() <= self.large, 1.0, self.large / size)
         found = self.filter(torch.where(self.follows, -moved, 0.0)).permute(1, 2, 3, 0)[self.seen]
         return torch.nan_to_num(found.mul_(weight[:, None])).T
 
@@ -298,15 +301,17 @@ class TrafficEngine:
         self.filter = PlatoonFilter.fitted(away, self.seen, order)
 
 
-def drawn_in(residual: Tensor) -> Tensor:
+def drawn_in(residual: Tensor, most: float = LARGE) -> Tensor:
     """Residuals whose squares are Huber's loss: a vehicle that breaks down does not outweigh
     all others.
 
     Source: Huber 1964.
     """
     size = residual.abs()
-    large = torch.sqrt((2 * LARGE * size - LARGE**2).clamp(min=0)).copysign(residual)
-    return torch.where(size <= LARGE, residual, large)
+    if math.isinf(most):
+        return residual
+    large = torch.sqrt((2 * most * size - most**2).clamp(min=0)).copysign(residual)
+    return torch.where(size <= most, residual, large)
 
 
 def fastest(system: System, rows: Tensor) -> float:

@@ -25,6 +25,7 @@ from nnode.discover.report.figures.marks import (
 )
 from nnode.discover.report.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
 from nnode.discover.report.files import amount, individual, interval
+from nnode.models import System
 from nnode.pages.page import FigureBlock, MovingBlock
 from nnode.plots.quality import faults_figure
 
@@ -34,6 +35,7 @@ FAULTY, PLACES = 10, 9
 #: Seconds of a crowd's sequence that are shown: later, small errors have grown to other ways.
 SHOWN = 4.0
 
+#: Of maps of deviations.
 UNITS = {"traffic": "m/s", "crowd": "m/s²"}
 
 
@@ -47,6 +49,11 @@ class Figures:
     places: list[FigureBlock] = field(default_factory=list)
     unknown: list[FigureBlock] = field(default_factory=list)
     paths: list[FigureBlock | MovingBlock] = field(default_factory=list)
+
+
+def unit_of(system: System) -> str:
+    """Of what a law says: a speed, or an acceleration."""
+    return "m/s" if system.order == 1 else "m/s²"
 
 
 def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
@@ -73,7 +80,7 @@ def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
         drawn.unknown.append(
             FigureBlock(
                 "unknown",
-                flexible_curve(d.unknown, UNITS[inputs.domain]),
+                flexible_curve(d.unknown, unit_of(found.base)),
                 f"What a flexible fit adds, by {first}. A description, not an explanation.",
                 f"Curve of the missing term by {first}.",
             )
@@ -108,7 +115,7 @@ def _faults(inputs: Inputs) -> FigureBlock:
 
 
 def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[FigureBlock]:
-    unit = UNITS[inputs.domain]
+    unit = unit_of(found.base)
     blocks = []
     curves = [place for place in found.diagnosis.places if place.curve][:PLACES]
     if curves:
@@ -125,7 +132,7 @@ def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Figu
                 ),
             )
         )
-    maps = _maps(inputs, found, options)
+    maps, unit = _maps(inputs, found, options), UNITS[inputs.domain]
     if not len(next(iter(maps.values())).time):
         return blocks
     said = ", ".join(f"{name}: {_spread(map_)} {unit} rms" for name, map_ in maps.items())

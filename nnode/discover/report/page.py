@@ -14,7 +14,7 @@ from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report import tables
-from nnode.discover.report.captions import UNITS, Figures, figures
+from nnode.discover.report.captions import Figures, figures, unit_of
 from nnode.discover.report.files import (
     CHECKPOINT,
     amount,
@@ -84,8 +84,8 @@ def page_blocks(
         *_data(d, drawn),
         *_agents(d),
         *_model(d),
-        *_places(d, drawn, UNITS[inputs.domain]),
-        *_rest(d, drawn, UNITS[inputs.domain]),
+        *_places(d, drawn, unit_of(found.base)),
+        *_rest(d, drawn, unit_of(found.base)),
         *_shown(d, drawn),
         *_usage(d, commands, folder, found),
         _provenance(d, inputs),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -66,7 +67,8 @@ def laws_table(laws: Laws) -> TableBlock:
         rows,
         "Base laws on the open sequences, behind measured leaders. *held-out cost*: of whitened "
         "residuals, mean of logarithms over clusters; *p*: one-sided, that the law is as good as "
-        "the first; the errors are those of windows of positions.",
+        "the first. The mean square errors are those of whole paths in clusters that calibrations "
+        "to nothing else left out.",
     )
 
 
@@ -193,8 +195,11 @@ def gap_table(d: Diagnosis) -> TableBlock:
         for what, value in (
             (f"{d.model}, calibrated", d.gap.before),
             ("with the effects", d.gap.after),
+            (f"{d.model}, calibrated to whole paths alone", d.gap.plain),
+            ("with the effects, calibrated so", d.gap.plain_after),
             ("noise of the measurement", d.gap.noise_floor),
         )
+        if not math.isnan(value)
     ]
     return _table(
         "gap",

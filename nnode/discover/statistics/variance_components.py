@@ -180,8 +180,11 @@ class Curve:
         return self.plateau(ratio(same) - ratio(between), same[1].sum(0))
 
     def plateau(self, common: np.ndarray, weight: np.ndarray) -> tuple[float, float, float]:
-        """The least squares of a constant and an exponential that falls with the lag."""
+        """The least squares of a constant and an exponential that falls with the lag; all 0 where
+        nothing is known of either."""
         best = (np.inf, 0.0, 0.0, 0.0)
+        if not weight.sum() > 0:
+            return best[1:]
         level = float((weight * common).sum() / weight.sum())
         for tau in np.geomspace(self.lags[0] / 3, LONGEST * self.lags[-1], TRIED):
             fall = np.exp(-self.lags / tau)
