@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
+from scipy.linalg import solveh_banded
 
 #: Order of the differences that are kept small: the third, so that a constant acceleration is
 #: not smoothed away.
 ORDER = 3
 #: Weights of smoothness that cross-validation chooses from.
 WEIGHTS = np.logspace(-2, 7, 37)
+#: From so many samples on, ends do not matter for how much a weight smooths.
+LONG = 1000
 
 
 def smooth(x: np.ndarray) -> np.ndarray:
@@ -21,24 +26,38 @@ def smooth(x: np.ndarray) -> np.ndarray:
     """
     if len(x) < 6:
         return x.copy()
-    values, vectors = _modes(len(x))
-    columns = x.reshape(len(x), -1)
-    parts = vectors.T @ columns
-    score = []
+    columns, values = x.reshape(len(x), -1), _sizes(len(x))
+    found, least = columns, np.inf
     for weight in WEIGHTS:
-        keep = 1 / (1 + weight * values)
-        left = (((1 - keep)[:, None] * parts) ** 2).sum()
-        score.append(left / (len(x) - keep.sum()) ** 2)
-    keep = 1 / (1 + WEIGHTS[int(np.argmin(score))] * values)
-    found: np.ndarray = vectors @ (keep[:, None] * parts)
+        smoothed = solveh_banded(_banded(len(x), weight), columns, lower=True)
+        kept = (1 / (1 + weight * values)).sum()
+        score = ((columns - smoothed) ** 2).sum() / (len(x) - kept) ** 2
+        if score < least:
+            found, least = smoothed, score
     return found.reshape(x.shape)
 
 
-def _modes(samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and eigenvectors of the penalty on differences."""
+def _banded(samples: int, weight: float) -> np.ndarray:
+    """1 and the weighted penalty on differences, as lower diagonals ``(ORDER + 1, K)``."""
+    step = np.diff(np.eye(ORDER + 1), ORDER, axis=0)[0]
+    found = np.zeros((ORDER + 1, samples))
+    for i in range(ORDER + 1):
+        for j in range(i + 1):
+            found[i - j, j : samples - ORDER + j] += weight * step[i] * step[j]
+    found[0] += 1
+    return found
+
+
+@cache
+def _sizes(samples: int) -> np.ndarray:
+    """Eigenvalues of the penalty on differences; of many samples those of a circle, which differ
+    at the ends alone."""
+    if samples > LONG:
+        waves = np.pi * np.arange(samples) / samples
+        found: np.ndarray = (2 - 2 * np.cos(waves)) ** ORDER
+        return found
     difference = np.diff(np.eye(samples), ORDER, axis=0)
-    values, vectors = np.linalg.eigh(difference.T @ difference)
-    return np.maximum(values, 0.0), vectors
+    return np.maximum(np.linalg.eigvalsh(difference.T @ difference), 0.0)
 
 
 def noise_variance(x: np.ndarray) -> float:

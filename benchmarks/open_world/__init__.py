@@ -1,0 +1,1 @@
+"""The diagnosis where the base law is wrong: worlds that neither it nor its catalogue made."""

@@ -1,0 +1,1 @@
+"""Platoons that follow a law of the literature, written out by hand."""
