@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.lanes.along import Along
+from nnode.discover.lanes.motion import formula_of
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
 from nnode.discover.lanes.response import Response
 from nnode.discover.lanes.runs import side_by_side
@@ -31,6 +32,7 @@ from nnode.discover.residuals.engine import (
 )
 from nnode.discover.residuals.fit import limits
 from nnode.discover.residuals.variables import Variable
+from nnode.laws.expression import symbols
 from nnode.models.effects import Effect, IndividualEffect, Probe
 from nnode.models.extend import effects_of, extended, without
 from nnode.models.system import System
@@ -39,6 +41,8 @@ from nnode.models.term import State, Term
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.
 STEP = {1: 0.4, 2: 0.2}
+#: That of laws which say what holds one step later, s: SUMO's usual one.
+MAPPED = 0.1
 #: Sequences are compared in windows of about this length, s, each simulated from so much
 #: before (at most a share of the sequence) that its start is forgotten.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
@@ -135,6 +139,9 @@ class TrafficEngine:
     def _steps(self, system: System, rows: Tensor) -> tuple[int, int]:
         """Samples in a step, or steps in a sample."""
         longest = min(STEP[system.order], fastest(system, rows))
+        lane = formula_of(system)
+        if lane is not None and "dt" in symbols([lane.law or lane.rates[lane.top]]):
+            longest = min(longest, MAPPED)
         stride = max(1, math.floor(longest / self.batch.dt + 1e-9))
         return stride, max(1, math.ceil(self.batch.dt / longest - 1e-9))
 
