@@ -16,7 +16,7 @@ from nnode.discover.lanes.motion import Leaders, Motion
 from nnode.discover.residuals.engine import runs_of
 from nnode.discover.residuals.traced import recorded
 from nnode.models.scene import Scene
-from nnode.models.system import System
+from nnode.models.system import System, initial_with
 
 
 class Runs(Protocol):
@@ -41,19 +41,33 @@ def side_by_side(system: System, rows: Tensor, scene: Scene) -> Runs:
     motion = motion_of(system, scene, runs_of(system, rows))
     if motion is None:
         return _ByCode(system, rows, scene)
-    return _ByFormula(system, len(rows), motion, Leaders(scene))
+    return _ByFormula(system, rows, motion, Leaders(scene))
+
+
+@torch.no_grad()
+def _starts(system: System, rows: Tensor, batch: Batch) -> Tensor:
+    """``(R, B, N, W)`` states at the start; what terms remember depends on the parameters."""
+    if not any(getattr(term, "memory", 0) for term in system.terms):
+        y = system.initial(batch)
+        return y.expand(len(rows), *y.shape)
+    every = runs_of(system, rows)
+    return torch.stack(
+        [
+            initial_with(system, {name: p[r] for name, p in every.items()}, batch)
+            for r in range(len(rows))
+        ]
+    )
 
 
 class _ByFormula:
     """States are ``(M, N, R, B)``; see :class:`Motion`."""
 
-    def __init__(self, system: System, number: int, motion: Motion, leaders: Leaders) -> None:
-        self._system, self._number, self._motion, self._leaders = system, number, motion, leaders
+    def __init__(self, system: System, rows: Tensor, motion: Motion, leaders: Leaders) -> None:
+        self._system, self._rows, self._motion, self._leaders = system, rows, motion, leaders
 
     def start(self, batch: Batch) -> np.ndarray:
-        with torch.no_grad():
-            y = self._system.initial(batch).permute(2, 1, 0).numpy()[:, :, None]
-        return np.repeat(y, self._number, 2)
+        y = _starts(self._system, self._rows, batch).permute(3, 2, 0, 1)
+        return np.ascontiguousarray(y.numpy())
 
     def rate(self, t: float, y: np.ndarray) -> np.ndarray:
         motion = self._motion
@@ -75,12 +89,11 @@ class _ByCode:
     def __init__(self, system: System, rows: Tensor, scene: Scene) -> None:
         self._system, self._scene = system, scene
         self._parameters = runs_of(system, rows)
-        self._number = len(rows)
+        self._rows = rows
         self._graph: Callable[..., Tensor] | None = None
 
     def start(self, batch: Batch) -> Tensor:
-        y = self._system.initial(batch)
-        return y.expand(self._number, *y.shape).clone()
+        return _starts(self._system, self._rows, batch).clone()
 
     def rate(self, t: float, y: Tensor) -> Tensor:
         time, values = torch.tensor(t, dtype=torch.float64), list(self._parameters.values())
