@@ -25,9 +25,8 @@ from nnode.discover.judge.verdict import (
     places,
     structure,
 )
-from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import curves, weighed
-from nnode.discover.name.search import BETTER, Search, search, settled
+from nnode.discover.name.search import BETTER, Search, begun, search, settled
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.residuals.engine import Engine, of_residuals, square_of
 from nnode.discover.residuals.fit import Fit
@@ -36,6 +35,7 @@ from nnode.discover.result import Clusters, Diagnosis, FirstScreen, Place, Verdi
 from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
+from nnode.errors import SimulationError
 from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.system import System
 from nnode.progress import Stages
@@ -224,8 +224,13 @@ def _looked_for(
     division = divide(sequences, options, together=together)
     chosen = [sequences[i] for i in division.open]
     engine = engine_of(domain, chosen, division.label[division.open])
-    start = copy.deepcopy(system).double()
-    base = settled(engine, engine.near(start) if isinstance(engine, TrafficEngine) else start)
+    start = begun(engine, copy.deepcopy(system).double())
+    if start is None:
+        raise SimulationError(
+            "the model cannot be simulated on these data: it blows up from its own parameters and "
+            "from those near the measured rates; start from others, or look at the data"
+        )
+    base = settled(engine, start.system)
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     stages.begin("locating")

@@ -20,13 +20,13 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model
 from nnode.discover.division import divide
 from nnode.discover.judge.confirm import engine_of, plain_engine
-from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.name.search import begun
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, row_of
-from nnode.discover.residuals.fit import ROUGH, Fit, refine
+from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.statistics.paired import compare, heldout
-from nnode.errors import ConfigError, SimulationError
+from nnode.errors import ConfigError
 from nnode.models.system import System
 
 #: Rounds of choosing the law that tells the whitening.
@@ -101,20 +101,9 @@ def _calibrated(
         except ConfigError as error:
             refused[name] = str(error)
             continue
-        start = copy.deepcopy(system).double()
-        starts = [start]
-        if isinstance(engine, TrafficEngine):
-            starts.append(engine.near(start))
-        fits = [fit for one in starts if (fit := _rough(engine, one)) is not None]
-        if fits:
-            found[name] = min(fits, key=lambda fit: fit.cost)
-        else:
+        fit = begun(engine, copy.deepcopy(system).double())
+        if fit is None:
             refused[name] = "it blows up on these data"
+        else:
+            found[name] = fit
     return found, refused
-
-
-def _rough(engine: Engine, system: System) -> Fit | None:
-    try:
-        return refine(engine, system, tolerance=ROUGH)
-    except SimulationError:
-        return None

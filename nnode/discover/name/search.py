@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from nnode.discover.locate.curves import curves
 from nnode.discover.name.candidate import Candidate, calibrated
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine, row_of, square_of
-from nnode.discover.residuals.fit import FINE, Fit, refine
+from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.profile import moved
@@ -85,6 +86,19 @@ class Search:
     screen: Screen | None = None
     first: list[Score] = field(default_factory=list)
     square: float = 0.0
+
+
+def begun(engine: Engine, system: System) -> Fit | None:
+    """A model calibrated in the engine's residuals as they are, from the better of two starts: its
+    own parameters, and those near the measured rates. None where both blow up."""
+    near = getattr(engine, "near", None)
+    fits = []
+    for start in (copy.deepcopy(system), *([] if near is None else [near(system)])):
+        try:
+            fits.append(refine(engine, start, tolerance=ROUGH))
+        except SimulationError:
+            continue
+    return min(fits, key=lambda fit: fit.cost, default=None)
 
 
 def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:

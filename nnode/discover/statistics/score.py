@@ -107,8 +107,15 @@ def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     probes = effect.probes(engine.batch, fit.system)
     row = torch.from_numpy(fit.row)
     columns = [engine.screen_columns(fit.system, row, effect, p).numpy().T for p in probes]
-    if effect.consecutive and probes:
-        return [Trace(effect, probes, np.concatenate(columns, 1))]
+    if effect.consecutive:
+        # cells of one size are neighbours of each other
+        sizes = [tuple(probe.steps.values()) for probe in probes]
+        found = []
+        for size in dict.fromkeys(sizes):
+            own = [i for i, other in enumerate(sizes) if other == size]
+            parts = [columns[i] for i in own]
+            found.append(Trace(effect, [probes[i] for i in own], np.concatenate(parts, 1)))
+        return found
     return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
 
 

@@ -35,6 +35,8 @@ _INSIDE = "clip(({at} - a)/edge + 0.5, 0, 1)*clip((b - {at})/edge + 0.5, 0, 1)"
 _SLOWER = "W + law(v0=v0*(1 + (alpha - 1)*share)) - law()"
 #: So many cells of a road or a time are looked at one by one.
 CELLS = 32
+#: Quantiles of the speeds that are driven, to which a desired speed is brought.
+SPEEDS = (0.3, 0.7)
 
 
 def law_in(system: System | None) -> FollowTheLeader:
@@ -74,11 +76,30 @@ def for_followers(state: State, change: Tensor) -> Tensor:
     return torch.where(state.scene.follower, change, 0.0)[..., None]
 
 
-def _cells(low: float, high: float) -> list[Probe]:
-    """Probes of neighbouring cells of [low, high]."""
+def _cells(low: float, high: float, batch: Batch, system: System) -> list[Probe]:
+    """Probes of neighbouring cells of [low, high], for each size of the factor."""
     width = (high - low) / CELLS
     ends = [low + width * i for i in range(CELLS + 1)]
-    return [Probe({"a": a, "b": b}, {"alpha": -0.1}) for a, b in pairwise(ends)]
+    return [
+        Probe({"a": a, "b": b}, {"alpha": size})
+        for size in _sizes(batch, system)
+        for a, b in pairwise(ends)
+    ]
+
+
+def _sizes(batch: Batch, system: System) -> list[float]:
+    """Amounts by which the factor on a desired speed is varied.
+
+    An acceleration may not feel its desired speed before that comes near to the speeds that are
+    driven, such as with a power of the one over the other; so factors that bring it there are tried
+    as well.
+    """
+    v0 = [float(value.detach()) for k, (value, _) in system.physical().items() if k.endswith(".v0")]
+    if system.order == 1 or not v0:
+        return [_FACTOR.step]
+    speeds = np.quantile(batch.v[..., 0][batch.valid].numpy(), SPEEDS)
+    found = [_FACTOR.at(float(speed) / v0[0] - 1) - 1 for speed in speeds]
+    return [_FACTOR.step, *(size for size in found if size < 2 * _FACTOR.step)]
 
 
 _FACTOR = Strength(1.0, -0.1, Interval(0.05, 3.0), "1", usual=0.1)
@@ -111,7 +132,7 @@ class SpeedZone(Effect):
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         x = batch.x[..., 0][batch.valid]
-        return _cells(float(x.min()), float(x.max()))
+        return _cells(float(x.min()), float(x.max()), batch, system)
 
 
 @CATALOGUE.add
@@ -141,7 +162,8 @@ class SpeedPeriod(Effect):
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         lasts = (batch.valid.any(-1).sum(0) - 1) * batch.dt
-        return _cells(float(batch.start.min()), float((batch.start + lasts).max()))
+        end = float((batch.start + lasts).max())
+        return _cells(float(batch.start.min()), end, batch, system)
 
 
 @CATALOGUE.add

@@ -1,0 +1,248 @@
+"""Platoons whose followers SUMO drives, in scenes from a seed, and what each should be called.
+
+Every platoon has a road of its own. Its leader is told its speed at every step; the rest is SUMO's.
+What is right to say was written down before anything was run: the names of :attr:`Scene.right`, all
+of them and no other; or, where the catalogue may lack it, ``unknown`` as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+
+#: Roads, vehicles on each with the leader, seconds before and of the recording, SUMO's step (s).
+ROADS, CARS, WARM, SECONDS, STEP = 40, 5, 20.0, 30.0, 0.1
+#: Samples are so many steps apart. Errors of measured places, m.
+EVERY, ERROR = 2, (0.02, 0.2)
+#: Length of a road, of its stretch in the middle (m), and of vehicles.
+ROAD, STRETCH, LENGTH, TRUCK = 2400.0, (900.0, 1100.0), 5.0, 12.0
+#: A limit that binds nobody, m/s, and those that bind; leaders drive at 4 to 18 m/s.
+FREE, LIMIT = 45.0, (8.0, 11.0)
+
+Draw = Callable[[np.random.Generator], dict[str, float]]
+
+
+def _idm(rng: np.random.Generator) -> dict[str, float]:
+    return {"accel": rng.uniform(0.8, 2), "decel": rng.uniform(1.2, 2.5),
+            "tau": rng.uniform(0.9, 1.6), "minGap": rng.uniform(1.5, 2.5),
+            "maxSpeed": rng.uniform(24, 34)}  # fmt: skip
+
+
+def _krauss(rng: np.random.Generator) -> dict[str, float]:
+    return {**_idm(rng), "decel": rng.uniform(2, 4.5), "sigma": 0.0}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What SUMO simulates.
+
+    Attributes:
+        follow: its name of the car-following model.
+        draw: attributes of the vehicles' type.
+        first: laws that are right to come first; empty: any.
+        right: names that are right, all of them.
+        unknown: whether ``unknown`` is right as well, then with any of ``right``.
+        stretch: in the stretch there is a limit.
+        period: the limit falls for some seconds, everywhere.
+        more: attributes that are drawn besides: of all, or of each vehicle.
+        trucks: share of vehicles that are longer and keep a longer time gap.
+    """
+
+    follow: str
+    draw: Draw
+    first: tuple[str, ...] = ()
+    right: tuple[str, ...] = ()
+    unknown: bool = False
+    stretch: bool = False
+    period: bool = False
+    more: dict[str, tuple[float, float]] = field(default_factory=dict)
+    each: dict[str, tuple[float, float]] = field(default_factory=dict)
+    trucks: float = 0.0
+
+
+_LATE = ("reaction_delay", "inertia")
+IDM, KRAUSS = partial(Scene, "IDM", _idm), partial(Scene, "Krauss", _krauss)
+SCENES: dict[str, Scene] = {
+    "idm": IDM(first=("idm",)),
+    "krauss": KRAUSS(first=("krauss",)),
+    "eidm": Scene("EIDM", _idm, unknown=True),
+    "idm_stretch": IDM(first=("idm",), right=("speed_zone",), stretch=True),
+    "krauss_stretch": KRAUSS(first=("krauss",), right=("speed_zone",), stretch=True),
+    "idm_period": IDM(first=("idm",), right=("speed_period",), period=True),
+    "krauss_period": KRAUSS(first=("krauss",), right=("speed_period",), period=True),
+    "idm_late": IDM(right=_LATE, unknown=True, more={"actionStepLength": (0.8, 1.5)}),
+    "krauss_late": KRAUSS(right=_LATE, unknown=True, more={"actionStepLength": (0.8, 1.5)}),
+    "idm_trucks": IDM(first=("idm",), right=("vehicle_class",), trucks=0.4),
+    "idm_drivers": IDM(first=("idm",), right=("driver_heterogeneity",), each={"tau": (0.7, 2.2)}),
+    "krauss_dawdling": KRAUSS(more={"sigma": (0.3, 0.7)}),
+}
+
+
+def recorded(name: str, seed: int) -> pd.DataFrame:
+    """The table of a scene: sequence, time, agent, x, length, kind.
+
+    Raises:
+        ImportError: SUMO is not installed.
+    """
+    scene = SCENES[name]
+    digest = hashlib.sha256(f"{name} {seed}".encode()).digest()
+    rng = np.random.default_rng(list(digest))
+    values = {**scene.draw(rng), **{k: rng.uniform(*v) for k, v in scene.more.items()}}
+    with TemporaryDirectory() as place:
+        folder = Path(place)
+        home = Path(str(import_module("sumo").SUMO_HOME))
+        command = _written(home, folder, scene, values, rng)
+        _simulated(command, home, scene, rng)
+        table = _read(folder / "fcd.xml")
+    table["x"] += rng.uniform(*ERROR) * rng.standard_normal(len(table))
+    return table
+
+
+def _written(
+    home: Path, folder: Path, scene: Scene, values: dict[str, float], rng: np.random.Generator
+) -> list[str]:
+    """Write the roads and the traffic; returns how SUMO is started."""
+    ends = {"a": 0.0, "b": STRETCH[0], "c": STRETCH[1], "d": ROAD}
+    limit = rng.uniform(*LIMIT) if scene.stretch else FREE
+    nodes, edges, cars = [], [], []
+    for k in range(ROADS):
+        nodes += [f'<node id="{n}{k}" x="{x:g}" y="{50 * k}"/>' for n, x in ends.items()]
+        for one, two in ("ab", "bc", "cd"):
+            speed = limit if one == "b" else FREE
+            edges.append(
+                f'<edge id="{one}{k}" from="{one}{k}" to="{two}{k}" numLanes="1" speed="{speed}"/>'
+            )
+        x = rng.uniform(320.0, 720.0)
+        for i in range(CARS):
+            truck = scene.trucks > 0 and rng.random() < scene.trucks
+            own = {**values, **{key: rng.uniform(*ends) for key, ends in scene.each.items()}}
+            if truck:
+                own["tau"] += 0.8
+            length = TRUCK if truck else LENGTH
+            text = " ".join(f'{key}="{value:.9g}"' for key, value in own.items())
+            kind = "lead" if not i else "truck" if truck else "car"
+            model = "" if not i else f'carFollowModel="{scene.follow}" {text}'
+            cars.append(
+                f'<vType id="{kind}.{k}-{i}" length="{length}" speedFactor="1" speedDev="0" '
+                f'{model}/><vehicle id="{k}-{i}" type="{kind}.{k}-{i}" depart="0" '
+                f'departPos="{x:.3f}" departSpeed="12" insertionChecks="none">'
+                f'<route edges="a{k} b{k} c{k}"/></vehicle>'
+            )
+            x -= length + 2.5 + 12 * rng.uniform(1.0, 1.8)
+    (folder / "a.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
+    (folder / "a.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
+    (folder / "a.rou.xml").write_text(f"<routes>{''.join(cars)}</routes>")
+    made = [home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
+            "-o", folder / "a.net.xml", "--no-internal-links"]  # fmt: skip
+    subprocess.run([str(part) for part in made], check=True, capture_output=True)
+    return [str(part) for part in (
+        home / "bin" / "sumo", "-n", folder / "a.net.xml", "-r", folder / "a.rou.xml",
+        "--step-length", STEP, "--precision", 6, "--no-step-log", "--no-warnings",
+        "--seed", int(rng.integers(1 << 30)), "--fcd-output", folder / "fcd.xml",
+        "--fcd-output.attributes", "id,type,x,y", "--collision.action", "none",
+    )]  # fmt: skip
+
+
+def _simulated(command: list[str], home: Path, scene: Scene, rng: np.random.Generator) -> None:
+    """Run SUMO, every leader at speeds of its own."""
+    sys.path.append(str(home / "tools"))
+    try:
+        traci: ModuleType = import_module("traci")
+    finally:
+        sys.path.remove(str(home / "tools"))
+    steps = round((WARM + SECONDS) / STEP)
+    speeds = np.stack([_speeds(rng, steps) for _ in range(ROADS)])
+    begin = WARM + rng.uniform(0.2, 0.5) * SECONDS
+    slow = rng.uniform(*LIMIT)
+    traci.start(command, stdout=subprocess.DEVNULL)
+    try:
+        traci.simulationStep()
+        for k in range(ROADS):
+            traci.vehicle.setSpeedMode(f"{k}-0", 0)
+        for step in range(steps):
+            for k in range(ROADS):
+                traci.vehicle.setSpeed(f"{k}-0", float(speeds[k, step]))
+            if scene.period and step in (round(begin / STEP), round((begin + 8) / STEP)):
+                limit = slow if step == round(begin / STEP) else FREE
+                for name in traci.edge.getIDList():
+                    traci.edge.setMaxSpeed(name, limit)
+            traci.simulationStep()
+    finally:
+        traci.close()
+
+
+def _speeds(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """``(K,)`` m/s of a leader: for some seconds each it keeps its speed, speeds up or brakes."""
+    rates: list[float] = []
+    while len(rates) < steps:
+        rate = float(rng.choice([0.0, rng.uniform(0.3, 1.2), -rng.uniform(0.3, 2.0)]))
+        rates += [rate] * round(rng.uniform(2, 7) / STEP)
+    found = [12.0]
+    for rate in rates[: steps - 1]:
+        found.append(float(np.clip(found[-1] + STEP * rate, 4.0, 18.0)))
+    return np.array(found)
+
+
+def _read(path: Path) -> pd.DataFrame:
+    rows = []
+    for _, step in ElementTree.iterparse(path):
+        if step.tag != "timestep":
+            continue
+        at = round(float(step.attrib["time"]), 3)
+        if at >= WARM and round(at / STEP) % EVERY == 0:
+            rows += [(v.get("id"), v.get("type"), at, float(v.get("x", "nan"))) for v in step]
+        step.clear()
+    table = pd.DataFrame(rows, columns=["agent", "type", "time", "x"])
+    kind = table.pop("type").str.partition(".")[0]
+    table["kind"] = kind.where(kind == "truck", "car")
+    table["length"] = np.where(table["kind"] == "truck", TRUCK, LENGTH)
+    table.insert(0, "sequence", "s" + table["agent"].str.partition("-")[0].str.zfill(3))
+    return table
+
+
+def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]:
+    """One scene, diagnosed; plain JSON: which law came ``first``, and what is said with it."""
+    from nnode.app.discover import diagnose_table
+    from nnode.discover.options import DiscoverOptions
+
+    right, table = SCENES[scene], recorded(scene, seed)
+    start = time.monotonic()
+    options = DiscoverOptions(page=False, animation=False)
+    report = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
+    nearest = report.get("nearest", report)
+    first = report["laws"]["ranking"][0]["name"]
+    names = [effect["name"] for effect in nearest["effects"]]
+    alone = set(names) == set(right.right) or (
+        right.unknown and set(names) <= set(right.right) and (names or not right.right)
+    )
+    unsure = right.unknown and not names and nearest["verdict"] == "unknown"
+    return {
+        "scene": scene, "seed": seed, "asked": asked, "first": first,
+        "law_right": not right.first or first in right.first,
+        "verdict": nearest["verdict"], "names": names,
+        "leads": [effect["name"] for effect in nearest["leads"]],
+        "right": bool(alone or unsure),
+        "false": [name for name in names if name not in right.right],
+        "asked_verdict": report["verdict"],
+        "asked_names": [effect["name"] for effect in report["effects"]],
+        "seconds": time.monotonic() - start,
+    }  # fmt: skip
+
+
+def cases(first_seed: int, number: int) -> list[dict[str, Any]]:
+    """Arguments of :func:`diagnosed_scene`."""
+    return [{"scene": name, "seed": first_seed + i} for name in SCENES for i in range(number)]
