@@ -46,6 +46,7 @@ from nnode.errors import ConfigError
 from nnode.files import write_text
 from nnode.models import System, build_model
 from nnode.models.effects.own import load_own
+from nnode.program import scripts, typed
 from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
@@ -249,14 +250,17 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
     name, group = config["model"]["name"], config["groups"]["data"]
     place = shlex.quote(str(folder / MODEL))
-    train = ["python scripts/train.py", f"model={name}", f"data={group}"]
+    # an installed package's own folder is no place for a user's files
+    own = [] if scripts() else ["--config-dir conf"]
+    train = ["python scripts/train.py", *own, f"model={name}", f"data={group}"]
     options = changes("data", config["data"], group_defaults("data", group))
-    return [
+    lines = [
         f"python scripts/evaluate.py {checkpoint}",
         f"python scripts/plot_forces.py {checkpoint}",
-        f"cp {place} conf/model/{name}.yaml",
+        "mkdir -p conf/model && " * bool(own) + f"cp {place} conf/model/{name}.yaml",
         " ".join([*train, *options]),
     ]
+    return [typed(line) for line in lines]
 
 
 def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:

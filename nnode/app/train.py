@@ -43,6 +43,7 @@ from nnode.files import write_json
 from nnode.models import InteractionForce, System, build_model
 from nnode.models.term import short_names
 from nnode.plots import force_figure
+from nnode.program import typed
 from nnode.solvers import Solver, TorchdiffeqSolver, substeps
 
 log = logging.getLogger(__name__)
@@ -150,12 +151,10 @@ def train(config: DictConfig, folder: Path) -> None:
     try:
         trainer.fit()
     except Interrupted as stop:
-        raise Interrupted(
-            f"{stop}\nresume with: python scripts/train.py "
-            f"{shell_override('resume', trainer.last_path)} "
-            f"{shell_override('hydra.run.dir', folder)}",
-            stop.signal,
-        ) from None
+        again = [shell_override("resume", trainer.last_path)]
+        again.append(shell_override("hydra.run.dir", folder))
+        command = " ".join([typed("python scripts/train.py"), *again])
+        raise Interrupted(f"{stop}\nresume with: {command}", stop.signal) from None
     if world.first:
         _report(trainer, plain_config(config), folder, time.monotonic() - start, store)
 

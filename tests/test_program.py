@@ -1,0 +1,44 @@
+"""Commands are told as this user types them."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from nnode import program
+from nnode.discover.report.files import model_yaml
+
+ROOT = Path(__file__).parents[1]
+TEXT = "python scripts/train.py x=1; torchrun --nproc-per-node=2 scripts/train.py y=2"
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(program, "_running", "train")
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/nnode", "model=lin", "data.path=my file.csv"])
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    shutil.copytree(ROOT / "conf", tmp_path / "conf")
+    monkeypatch.setattr(sys, "argv", [str(tmp_path / "scripts" / "train.py"), "model=lin"])
+    return tmp_path
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_installed_program() -> None:
+    told = "nnode train x=1; torchrun --nproc-per-node=2 -m nnode train y=2"
+    assert program.typed(TEXT) == told
+    assert program.command_line() == "nnode train model=lin 'data.path=my file.csv'"
+    assert program.configuration() == ROOT / "conf"
+    assert "then: --config-dir conf model=m\n" in model_yaml({"name": "m", "term": "lin"}, False)
+
+
+def test_a_script_takes_the_configuration_beside_it(script: Path) -> None:
+    assert program.typed(TEXT) == TEXT
+    assert program.command_line() == f"python {script}/scripts/train.py model=lin"
+    assert program.configuration() == script / "conf"
+    assert "then: model=m\n" in model_yaml({"name": "m", "term": "lin"}, False)
