@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shlex
 import sys
@@ -14,6 +15,9 @@ PROGRAM = "nnode"
 #: The installed commands: their files are read before they are imported, as that takes seconds.
 COMMANDS = Path(__file__).parent / "app" / "commands"
 
+#: Variable of the environment: the root of the checkout whose script runs.
+_ROOT = "NNODE_SCRIPTS"
+
 #: The command of the installed program that this process runs; None: a script, or neither.
 _running: str | None = None
 
@@ -24,10 +28,18 @@ def running(name: str) -> None:
     _running = name
 
 
+def begin() -> None:
+    """Note how this process was started, for itself and for the processes that it starts."""
+    if _running is None:
+        os.environ[_ROOT] = str(Path(sys.argv[0]).resolve().parent.parent)
+    else:
+        os.environ.pop(_ROOT, None)
+
+
 def scripts() -> Path | None:
     """The root of the checkout whose script this process runs; None where it runs none."""
-    script = Path(sys.argv[0]).resolve()
-    return script.parent.parent if script.parent.name == "scripts" else None
+    root = os.environ.get(_ROOT)
+    return None if root is None else Path(root)
 
 
 def typed(text: str) -> str:

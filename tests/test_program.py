@@ -19,12 +19,16 @@ TEXT = "python scripts/train.py x=1; torchrun --nproc-per-node=2 scripts/train.p
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program, "_running", "train")
     monkeypatch.setattr(sys, "argv", ["/usr/bin/nnode", "model=lin", "data.path=my file.csv"])
+    monkeypatch.setenv("NNODE_SCRIPTS", "/of/an/earlier/script")
+    program.begin()
 
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     shutil.copytree(ROOT / "conf", tmp_path / "conf")
     monkeypatch.setattr(sys, "argv", [str(tmp_path / "scripts" / "train.py"), "model=lin"])
+    monkeypatch.setenv("NNODE_SCRIPTS", "")  # taken back at the end
+    program.begin()
     return tmp_path
 
 
@@ -42,3 +46,10 @@ def test_a_script_takes_the_configuration_beside_it(script: Path) -> None:
     assert program.command_line() == f"python {script}/scripts/train.py model=lin"
     assert program.configuration() == script / "conf"
     assert "then: model=m\n" in model_yaml({"name": "m", "term": "lin"}, False)
+
+
+def test_a_program_of_somebody_else_is_no_script_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NNODE_SCRIPTS", raising=False)
+    monkeypatch.setattr(sys, "argv", ["/home/me/scripts/train.py"])
+    assert program.typed(TEXT).startswith("nnode train x=1")
+    assert program.configuration() == ROOT / "conf"

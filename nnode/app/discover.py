@@ -18,7 +18,7 @@ from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, shell_override
 from nnode.app.python_inputs import Table, model_options, table_options
-from nnode.app.train import brief, set_threads
+from nnode.app.training import brief, set_threads
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions

@@ -26,7 +26,7 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
 from nnode.files import disk_words
-from nnode.program import configuration
+from nnode.program import begin, configuration
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
@@ -54,6 +54,7 @@ def run(
     register()
     # on a full disk the log cannot be written either, which shall not bury the run's own words
     logging.raiseExceptions = False
+    begin()
     folder = configuration()
     try:
         if parallel:

@@ -49,7 +49,7 @@ def test_help_names_purpose_groups_choices_options_and_results(name: str) -> Non
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_every_example_has_options_that_exist(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / f"{name}.py")])
+    monkeypatch.setenv("NNODE_SCRIPTS", str(ROOT))
     commands = examples(words(name, CONF))
     assert commands
     for command in commands:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +96,7 @@ def test_only_what_differs_is_told() -> None:
 def test_the_printed_training_reads_the_data_of_the_diagnosis(
     monkeypatch: pytest.MonkeyPatch, model: str, given: list[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(sys, "argv", [str(CONF.parent / "scripts" / "discover.py")])
+    monkeypatch.setenv("NNODE_SCRIPTS", str(CONF.parent))
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("discover", [f"model={model}", *given], return_hydra_config=True)
         HydraConfig.instance().set_config(config)
