@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from nnode.app.discover import diagnose_table as diagnose
     from nnode.app.estimator import Calibrator, fit
     from nnode.app.python_inputs import sequences
+    from nnode.app.report import Report
     from nnode.calibrate.checkpoint import load
     from nnode.data.sequence import Sequence
     from nnode.data.sequences import Sequences
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Calibration",
     "Calibrator",
+    "Report",
     "Sequence",
     "Sequences",
     "__version__",
@@ -32,6 +34,7 @@ __all__ = [
 _HOMES = {
     "Calibration": ("nnode.app.calibration", "Calibration"),
     "Calibrator": ("nnode.app.estimator", "Calibrator"),
+    "Report": ("nnode.app.report", "Report"),
     "Sequence": ("nnode.data.sequence", "Sequence"),
     "Sequences": ("nnode.data.sequences", "Sequences"),
     "diagnose": ("nnode.app.discover", "diagnose_table"),

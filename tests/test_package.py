@@ -8,8 +8,8 @@ import sys
 import nnode
 
 NAMES = [
-    "Calibration", "Calibrator", "Sequence", "Sequences", "__version__", "diagnose", "fit", "load",
-    "sequences",
+    "Calibration", "Calibrator", "Report", "Sequence", "Sequences", "__version__", "diagnose",
+    "fit", "load", "sequences",
 ]  # fmt: skip
 
 

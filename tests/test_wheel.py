@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.app.following import TRUE, pairs
 from tests.discover.platoons import platoons
 
 ROOT = Path(__file__).parents[1]
@@ -136,6 +137,36 @@ def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Ru
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert json.loads((work / "run" / "result.json").read_text())["history"][-1]["epoch"] == 5
+
+
+#: In an environment without what is optional.
+ESTIMATOR = """
+import sys
+sys.modules.update(dict.fromkeys(("sklearn", "xarray")))
+import nnode
+import pandas as pd
+table = pd.read_csv("pairs.csv")
+one = nnode.Calibrator(model="idm").fit(table)
+print(one.parameters_.estimate["idm.T"], one.predict(table).score(table))
+try:
+    one.result_.to_xarray()
+except nnode.errors.ConfigError as error:
+    print(error)
+assert "sklearn" not in {name for name, module in sys.modules.items() if module}
+"""
+
+
+@pytest.mark.thorough
+def test_the_estimator_works_without_scikit_learn(alone: Run) -> None:
+    work = Path(alone("python", "-c", "import os; print(os.getcwd())").stdout.strip())
+    pairs(number=4, seconds=20.0).to_csv(work / "pairs.csv", index=False)
+    done = alone("python", "-c", ESTIMATOR)
+    assert done.returncode == 0, done.stderr
+    found, said = done.stdout.splitlines()
+    T, score = map(float, found.split())
+    assert pytest.approx(TRUE["T"], rel=1e-3) == T
+    assert -1e-3 < score <= 0
+    assert "pip install 'nnode[xarray]'" in said
 
 
 @pytest.mark.thorough

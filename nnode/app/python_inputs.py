@@ -15,7 +15,7 @@ from omegaconf.errors import MissingMandatoryValue
 from nnode.calibrate.options import TrainerOptions
 from nnode.data.options import DataOptions, TableOptions
 from nnode.data.prepare import FORMATS
-from nnode.data.sequences import Sequences, seen_options
+from nnode.data.sequences import Sequences, columns, seen_options
 from nnode.errors import ConfigError
 from nnode.models.field import FIELD, NEURONS
 from nnode.models.field_crowd import PEOPLE
@@ -185,16 +185,17 @@ def data_of(given: Sequences) -> DataOptions:
     return cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
 
 
-def table_options(data: Table, domain: str, walls: str | Path | None, folder: Path) -> TableOptions:
-    """A table as a data set; one that is no file yet becomes one in ``folder``."""
-    if isinstance(data, pd.DataFrame):
+def table_options(
+    data: Table, domain: str | None, walls: str | Path | None, folder: Path | None
+) -> TableOptions:
+    """A tidy table as a data set; a data frame becomes a file where there is a folder for it."""
+    path = "" if isinstance(data, pd.DataFrame) else str(Path(data).expanduser().absolute())
+    if isinstance(data, pd.DataFrame) and folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / "table.parquet"
+        path = str((folder / "table.parquet").absolute())
         data.to_parquet(path, index=False)
-    else:
-        path = Path(data)
+    if domain is None:
+        domain = "crowd" if "y" in columns(data) else "traffic"
     return TableOptions(
-        domain=domain,
-        path=str(path.absolute()),
-        walls=None if walls is None else str(Path(walls).absolute()),
+        domain=domain, path=path, walls=None if walls is None else str(Path(walls).absolute())
     )

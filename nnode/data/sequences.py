@@ -232,7 +232,7 @@ class Sequences:
         return f"<p>{escape(self._about())}</p>{table}{more}"
 
 
-def _columns(source: pd.DataFrame | str | Path) -> set[str]:
+def columns(source: pd.DataFrame | str | Path) -> set[str]:
     """Names of a table's columns."""
     if isinstance(source, pd.DataFrame):
         return {str(name).strip() for name in source.columns}
@@ -246,7 +246,7 @@ def seen_options(source: pd.DataFrame | str | Path | None) -> DataOptions:
     """Options of the format that the columns of a table show; a tidy one where none is seen."""
     if source is None:
         raise ConfigError("there is no table: give one, or name a data set, as in data='esimas'")
-    names = _columns(source)
+    names = columns(source)
     if {"x_follower", "x_leader"} <= names:
         return PairOptions(path="")
     if "vehicle" in names and "sequence" not in names:
