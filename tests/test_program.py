@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from nnode import program
+from nnode.__main__ import main
 from nnode.discover.report.files import model_yaml
 
 ROOT = Path(__file__).parents[1]
@@ -53,3 +54,21 @@ def test_a_program_of_somebody_else_is_no_script_of_ours(monkeypatch: pytest.Mon
     monkeypatch.setattr(sys, "argv", ["/home/me/scripts/train.py"])
     assert program.typed(TEXT).startswith("nnode train x=1")
     assert program.configuration() == ROOT / "conf"
+
+
+def test_the_program_lists_its_commands(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scripts = {path.stem for path in (ROOT / "scripts").glob("*.py")}
+    monkeypatch.setattr(sys, "argv", ["nnode", "--help"])
+    main()
+    said = capsys.readouterr().out
+    commands = {line.split()[0] for line in said.splitlines() if line.startswith("  ")} & scripts
+    assert commands == {path.stem for path in program.COMMANDS.glob("[a-z]*.py")}
+    assert scripts - commands == {"benchmark", "benchmark_discovery", "torture"}
+    assert max(len(line) for line in said.splitlines()) <= 100
+    monkeypatch.setattr(sys, "argv", ["nnode", "discovr"])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 2
+    assert "did you mean discover?" in capsys.readouterr().err

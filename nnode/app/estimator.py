@@ -40,7 +40,8 @@ class Calibrator:
 
     A sample is a sequence: what is fitted, predicted and scored is a tidy table, or
     :func:`nnode.sequences` of one, which scikit-learn's splitters can divide:
-    ``cross_val_score(Calibrator("idm"), X, groups=X.groups, cv=GroupKFold(5))``.
+    ``cross_val_score(Calibrator("idm"), X, groups=X.groups, cv=GroupKFold(5))``. All work is done
+    on the CPU; the command can take a GPU.
 
     Args:
         model: a name as in ``conf/model``; options with their ``term``; or a
@@ -85,7 +86,8 @@ class Calibrator:
         Args:
             X: a data frame or the path of a table, :func:`nnode.sequences`, or a list of
                 :class:`nnode.data.sequence.Sequence`.
-            y, groups: not used; clusters are found from who is in the sequences.
+            y: not used.
+            groups: not used; clusters are found from who is in the sequences.
 
         Raises:
             NNodeError: a table, a model or options that do not fit; the message says what to do.
@@ -195,8 +197,7 @@ class Calibrator:
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
         trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
-        if solver.name == "fused":
-            trainer["device"] = Device.cpu.value  # where compiled code runs
+        trainer["device"] = Device.cpu.value
         data = OmegaConf.structured(data_of(given))
         data.split.heldout = self.heldout
         if isinstance(self.model, System):
@@ -273,7 +274,11 @@ def fit(
             exist, ``y`` and more, SI units; see ``docs/data.md``.
         domain: ``traffic`` or ``crowd``; None: as the columns show.
         walls: CSV with x1, y1, x2, y2, m.
-        model, leader, epochs, heldout, seed: see :class:`Calibrator`.
+        model: see :class:`Calibrator`, as for the following.
+        leader: what the first vehicle does.
+        epochs: at most.
+        heldout: share of the sequences that the calibration does not see.
+        seed: of start values and of the division.
 
     Raises:
         NNodeError: a table, a model or options that do not fit; the message says what to do.
