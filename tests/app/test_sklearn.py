@@ -9,6 +9,7 @@ import pytest
 
 import nnode
 from nnode.errors import NotFittedError
+from nnode.models import Linear, Traffic
 from tests.app.following import table
 
 pytest.importorskip("sklearn")
@@ -94,6 +95,13 @@ def test_a_clone_has_the_parameters_and_no_fit(sequences: nnode.Sequences) -> No
             copied.predict(sequences)
     with pytest.raises(TheirNotFittedError):
         check_is_fitted(copied)
+
+
+def test_a_module_is_cloned_with_its_values() -> None:
+    own = nnode.Calibrator(Traffic([Linear(v0=21.0, L=4.0)], leader="measured"))
+    copied = clone(own)
+    assert copied.model is not own.model
+    assert float(copied.model.physical()["lin.v0"][0]) == pytest.approx(21.0)
 
 
 def test_cross_validation_by_clusters_is_the_same_by_hand(sequences: nnode.Sequences) -> None:

@@ -115,6 +115,17 @@ def test_the_printed_training_reads_the_data_of_the_diagnosis(
     assert OmegaConf.to_container(read.data, resolve=True, enum_to_str=True) == told["data"]
 
 
+def test_the_installed_program_finds_a_model_in_a_folder_of_the_user_s(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("NNODE_SCRIPTS", raising=False)
+    data = {**group_defaults("data", "table"), "path": "drive.csv", "domain": "traffic"}
+    config = {"model": {"name": "mine"}, "data": data, "groups": {"data": "table"}}
+    *_, copy, train = _commands(config, tmp_path)
+    assert copy == f"mkdir -p conf/model && cp {tmp_path}/model.yaml conf/model/mine.yaml"
+    assert train.startswith("nnode train --config-dir conf model=mine data=table data.")
+
+
 def test_without_a_configuration_the_schema_tells_the_defaults() -> None:
     defaults = group_defaults("data", "table")
     values = {**defaults, "path": "drive.csv", "domain": "traffic"}
