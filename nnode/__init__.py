@@ -8,17 +8,39 @@ from typing import TYPE_CHECKING, Any
 from nnode.version import VERSION as __version__
 
 if TYPE_CHECKING:
+    from nnode.app.calibration import Calibration
     from nnode.app.discover import diagnose_table as diagnose
-    from nnode.app.notebook import fit
+    from nnode.app.estimator import Calibrator, fit
+    from nnode.app.python_inputs import sequences
+    from nnode.app.report import Report
     from nnode.calibrate.checkpoint import load
+    from nnode.data.sequence import Sequence
+    from nnode.data.sequences import Sequences
 
-__all__ = ["__version__", "diagnose", "fit", "load"]
+__all__ = [
+    "Calibration",
+    "Calibrator",
+    "Report",
+    "Sequence",
+    "Sequences",
+    "__version__",
+    "diagnose",
+    "fit",
+    "load",
+    "sequences",
+]
 
 #: Where each name comes from: imported on first use, a short command should not wait for torch.
 _HOMES = {
+    "Calibration": ("nnode.app.calibration", "Calibration"),
+    "Calibrator": ("nnode.app.estimator", "Calibrator"),
+    "Report": ("nnode.app.report", "Report"),
+    "Sequence": ("nnode.data.sequence", "Sequence"),
+    "Sequences": ("nnode.data.sequences", "Sequences"),
     "diagnose": ("nnode.app.discover", "diagnose_table"),
-    "fit": ("nnode.app.notebook", "fit"),
+    "fit": ("nnode.app.estimator", "fit"),
     "load": ("nnode.calibrate.checkpoint", "load"),
+    "sequences": ("nnode.app.python_inputs", "sequences"),
 }
 
 

@@ -44,3 +44,7 @@ class WriteError(NNodeError):
 
 class FolderInUseError(NNodeError):
     """Another run works in the folder."""
+
+
+class NotFittedError(NNodeError, ValueError, AttributeError):
+    """An estimator is asked for what it has only after a fit."""

@@ -7,10 +7,11 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from nnode.errors import DataError, WriteError
+from nnode.errors import ConfigError, DataError, WriteError
 
 #: Ends the names of files that are being written; ``.NAME.PROCESS`` stands before it.
 PARTIAL = ".partial"
@@ -97,3 +98,17 @@ def write_json(path: Path, content: dict[str, Any], indent: int | None = 2) -> P
     """Write JSON; NaN and infinities are kept, as Python's own reader takes them."""
     text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=True)
     return write_text(path, text + "\n")
+
+
+def xarray() -> Any:
+    """The library xarray, which is optional.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        return import_module("xarray")
+    except ImportError as error:
+        raise ConfigError(
+            "this needs xarray, which is not installed: pip install 'nnode[xarray]'"
+        ) from error

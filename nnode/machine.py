@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import platform
-import shlex
-import sys
 from collections.abc import Iterable
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from nnode.program import command_line
 from nnode.version import VERSION
 
 
@@ -48,7 +47,7 @@ def how_made(packages: Iterable[str]) -> dict[str, str]:
     here = machine(packages)
     versions = {"nnode": VERSION, **here["versions"]}
     return {
-        "Command": shlex.join(["python", *sys.argv]),
+        "Command": command_line(),
         "Date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         "Machine": f"{here['processor']}, {here['cores']} cores, {here['system']}",
         "Versions": ", ".join(f"{name} {number}" for name, number in versions.items()),

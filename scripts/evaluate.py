@@ -1,25 +1,6 @@
-"""Errors of a calibrated model beside its baselines.
+"""``nnode evaluate`` in a checkout; ``--help`` shows what it does, examples and options."""
 
-Examples:
-  # on the sequences that its training held out
-  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt
-  # on other data
-  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
-  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt part=all
-
-Results: a table, and metrics.json. Data and solver are those of the training where none are
-chosen.
-"""
-
-from functools import partial
-
-from nnode.app.cli.run import run
-from nnode.app.cli.saved import saved_groups
-from nnode.app.evaluate import evaluate_checkpoint
+from nnode.app.commands.evaluate import main
 
 if __name__ == "__main__":
-    run(
-        "evaluate",
-        evaluate_checkpoint,
-        partial(saved_groups, option="checkpoint", groups=("data", "solver")),
-    )
+    main()

@@ -1,21 +1,6 @@
-"""Force plots of one or many calibrated models.
+"""``nnode plot_forces`` in a checkout; ``--help`` shows what it does, examples and options."""
 
-Examples:
-  python scripts/plot_forces.py checkpoint=RUN/checkpoints/best.pt
-  # several models of traffic in one picture
-  python scripts/plot_forces.py 'checkpoint=[A/checkpoints/best.pt,B/checkpoints/best.pt]'
-  # a crowd's force within 2 m
-  python scripts/plot_forces.py checkpoint=RUN/checkpoints/best.pt extent=2
-
-Results: traffic, forces.png and forces.csv; crowds, contours of both components of the force and
-the six settings of the paper. The histogram of gaps is that of the first checkpoint's data.
-"""
-
-from functools import partial
-
-from nnode.app.cli.run import run
-from nnode.app.cli.saved import saved_groups
-from nnode.app.forces import plot_forces
+from nnode.app.commands.plot_forces import main
 
 if __name__ == "__main__":
-    run("plot_forces", plot_forces, partial(saved_groups, option="checkpoint", groups=("data",)))
+    main()

@@ -7,7 +7,10 @@ import sys
 
 import nnode
 
-NAMES = ["__version__", "diagnose", "fit", "load"]
+NAMES = [
+    "Calibration", "Calibrator", "Report", "Sequence", "Sequences", "__version__", "diagnose",
+    "fit", "load", "sequences",
+]  # fmt: skip
 
 
 def test_completion_finds_the_public_names_without_loading_torch() -> None:

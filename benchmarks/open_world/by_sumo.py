@@ -222,8 +222,9 @@ def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]
     right, table = SCENES[scene], recorded(scene, seed)
     start = time.monotonic()
     options = DiscoverOptions(page=False, animation=False)
-    report = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
-    nearest = report.get("nearest", report)
+    given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
+    report = given.plain()
+    nearest = report if given.nearest is None else given.nearest.plain()
     first = report["laws"]["ranking"][0]["name"]
     names = [effect["name"] for effect in nearest["effects"]]
     alone = set(names) == set(right.right) or (

@@ -49,11 +49,12 @@ def diagnosed_case(law: str, seed: int, asked: str, **size: Any) -> dict[str, An
     table, parameters = measured(LawCase(law, seed, **size))
     start = time.monotonic()
     options = DiscoverOptions(page=False, animation=False)
-    report = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
+    given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
+    report = given.plain()
     ranking = report["laws"]["ranking"]
     own = next((one for one in ranking if one["name"] == law), None)
     first = ranking[0]["name"]
-    nearest = report.get("nearest", report)
+    nearest = report if given.nearest is None else given.nearest.plain()
     row: dict[str, Any] = {
         "law": law, "seed": seed, "asked": asked, "parameters": parameters, "first": first,
         "behind": None if own is None else own["behind"],

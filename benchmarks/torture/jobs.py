@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.torture.child import Child, script
+from nnode.app.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare
@@ -212,7 +213,7 @@ def _small_diagnosis() -> None:
 
     whole = discover.diagnose_table
 
-    def small(*given: Any, options: Any, **more: Any) -> dict[str, Any]:
+    def small(*given: Any, options: Any, **more: Any) -> Report:
         options.effects, options.max_effects, options.step = ["relative_speed"], 1, 0.2
         return whole(*given, options=options, **more)
 

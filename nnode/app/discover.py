@@ -1,4 +1,4 @@
-"""What a model lacks: ``scripts/discover.py``."""
+"""What a model lacks: the command ``discover``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import signal
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -18,17 +18,19 @@ from nnode.app.base_laws import candidates, compared, law_options
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, shell_override
-from nnode.app.python_inputs import Table, model_options, table_options
-from nnode.app.train import brief, set_threads
+from nnode.app.python_inputs import Table, data_of, model_options, table_options
+from nnode.app.report import Report
+from nnode.app.training import brief, set_threads
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
+from nnode.data.sequences import Sequences
 from nnode.discover.able import check_model
 from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
-from nnode.discover.inputs import Inputs, read_inputs
+from nnode.discover.inputs import Inputs, inputs_of, read_inputs, with_faulty
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.report.files import (
     CHECKPOINT,
@@ -49,6 +51,7 @@ from nnode.files import write_text
 from nnode.models import System, build_model
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import load_own
+from nnode.program import scripts, typed
 from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
@@ -94,7 +97,8 @@ def discover(config: DictConfig, folder: Path) -> None:
             plain = plain_config(config)
             options = cast(DiscoverOptions, OmegaConf.to_object(config.discover))
             data = cast(DataOptions, OmegaConf.to_object(config.data))
-            job = _job(plain["model"], data, plain["data"], plain["groups"], options, folder)
+            read = partial(read_inputs, data, folder / "data")
+            job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
             with Stages("diagnosis", STAGES) as stages:
                 found = _diagnose(job, stages)
                 stages.begin("drawing")
@@ -127,8 +131,8 @@ def discover(config: DictConfig, folder: Path) -> None:
 
 
 def diagnose_table(
-    data: Table,
-    domain: str,
+    data: Table | Sequences,
+    domain: str | None = None,
     *,
     model: str | Mapping[str, Any] = "lin",
     walls: str | Path | None = None,
@@ -136,46 +140,50 @@ def diagnose_table(
     folder: str | Path | None = None,
     seed: int = 0,
     options: DiscoverOptions | None = None,
-) -> dict[str, Any]:
+) -> Report:
     """Diagnose a model on a tidy table.
 
     Args:
-        data: CSV or Parquet, or a data frame; see ``docs/data.md``.
-        domain: ``traffic`` or ``crowd``.
+        data: CSV or Parquet, or a data frame, see ``docs/data.md``; or :func:`nnode.sequences`.
+        domain: ``traffic`` or ``crowd``; None: as the columns show.
         model: a name as in ``conf/model``, or options of the model; ``term`` says which, what is
             left out has its default.
         walls: CSV with x1, y1, x2, y2, m.
         leader: of a traffic model.
-        folder: receives what the script writes; None writes and draws nothing.
+        folder: receives what the command writes, and a data frame as a table; None writes and
+            draws nothing.
         seed: of the diagnosis; wins over that of ``options``.
         options: further options of the diagnosis.
-
-    Returns:
-        The content of ``report.json``; ``nearest``: that of the law that comes nearest, where it
-        is another one.
 
     Raises:
         NNodeError: see :func:`discover`.
     """
     own = model_options(model, leader)
     chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
+    place = None if folder is None else Path(folder)
     groups = {"model": str(own["name"]), "data": "table"}
-    with TemporaryDirectory(prefix="nnode-") as scratch:
-        place = Path(scratch) if folder is None else Path(folder)
-        table = table_options(data, domain, walls, place)
-        job = _job(own, table, _plain(table), groups, chosen, place)
-        found = _diagnose(job)
-        report = plain_report(found.diagnosis)
-        other = _nearest(job, found)
+    if isinstance(data, Sequences):
+        told = data_of(data)
+        groups["data"] = str(told.name)
+    else:
+        told = table_options(data, domain, walls, place)
+
+    def read() -> Inputs:
+        return inputs_of(Sequences.of(data, with_faulty(told)), told)
+
+    job = _job(own, told, _plain(told), groups, chosen, read)
+    found = _diagnose(job)
+    report = Report(diagnosis=found.diagnosis, model=found.extended)
+    other = _nearest(job, found)
+    if other is not None:
+        second = _diagnose(other)
+        nearest = Report(diagnosis=second.diagnosis, model=second.extended)
+        report = replace(report, nearest=nearest)
+    if place is not None:
         if other is not None:
-            second = _diagnose(other)
-            report["nearest"] = plain_report(second.diagnosis)
-        if folder is not None:
-            if other is not None:
-                beside = place / NEAREST
-                drawn = _drawn(other, second, beside) if chosen.page else None
-                _write(other, second, beside, drawn)
-            _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
+            beside = place / NEAREST
+            _write(other, second, beside, _drawn(other, second, beside) if chosen.page else None)
+        _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
     return report
 
 
@@ -192,7 +200,7 @@ def _job(
     plain_data: dict[str, Any],
     groups: dict[str, str],
     options: DiscoverOptions,
-    folder: Path,
+    read: Callable[[], Inputs],
 ) -> Job:
     start = time.monotonic()
     load_own()
@@ -205,7 +213,7 @@ def _job(
     check_options(options, system.domain, system.order)  # type: ignore[arg-type]
     check_model(system)
     candidates(str(model["name"]), system, options)
-    inputs = read_inputs(data, folder / "data")
+    inputs = read()
     if data.prepared is None:  # a folder is taken as it is
         # what the extended model is trained and tested on are the sequences without a fault
         plain_data = {**plain_data, "faults": Faults.drop.value}
@@ -306,14 +314,17 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
     name, group = config["model"]["name"], config["groups"]["data"]
     place = shlex.quote(str(folder / MODEL))
-    train = ["python scripts/train.py", f"model={name}", f"data={group}"]
+    # an installed package's own folder is no place for a user's files
+    own = [] if scripts() else ["--config-dir conf"]
+    train = ["python scripts/train.py", *own, f"model={name}", f"data={group}"]
     options = changes("data", config["data"], group_defaults("data", group))
-    return [
+    lines = [
         f"python scripts/evaluate.py {checkpoint}",
         f"python scripts/plot_forces.py {checkpoint}",
-        f"cp {place} conf/model/{name}.yaml",
+        "mkdir -p conf/model && " * bool(own) + f"cp {place} conf/model/{name}.yaml",
         " ".join([*train, *options]),
     ]
+    return [typed(line) for line in lines]
 
 
 def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:

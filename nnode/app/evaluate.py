@@ -12,7 +12,7 @@ from rich.table import Table
 
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import merge_saved
-from nnode.app.train import build_solver, set_threads, source_hashes, straight_loader, stream
+from nnode.app.training import build_solver, set_threads, source_hashes, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.distributed import World

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import merge_saved, path_given, saved_groups
 from nnode.app.evaluate import choose
-from nnode.app.train import build_solver, set_threads, straight_loader, stream
+from nnode.app.training import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.distributed import World

@@ -1,18 +1,25 @@
-"""What is handed over in Python in place of a configuration: a table, and a model by its name."""
+"""What is handed over in Python in place of a configuration: tables, and choices by their names."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Sequence as ListLike
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pandas as pd
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
 
-from nnode.data.options import TableOptions
+from nnode.calibrate.options import TrainerOptions
+from nnode.data.options import DataOptions, TableOptions
+from nnode.data.prepare import FORMATS
+from nnode.data.sequences import Sequences, columns, seen_options
 from nnode.errors import ConfigError
 from nnode.models.field import FIELD, NEURONS
 from nnode.models.field_crowd import PEOPLE
+from nnode.program import configuration
 
 #: Models by the names that ``conf/model`` gives them.
 MODELS: dict[str, dict[str, Any]] = {
@@ -34,12 +41,17 @@ MODELS: dict[str, dict[str, Any]] = {
 Table = str | Path | pd.DataFrame
 
 
-def model_options(model: str | Mapping[str, Any], leader: str) -> dict[str, Any]:
+def model_options(
+    model: str | Mapping[str, Any],
+    leader: str | None = None,
+    effects: ListLike[str | Mapping[str, Any]] = (),
+) -> dict[str, Any]:
     """A model's options with the defaults of its schema.
 
     Args:
         model: a name as in ``conf/model``, or options with their ``term``.
-        leader: of a traffic model that does not say so itself.
+        leader: of a traffic model that does not say so itself; None: its default.
+        effects: in place of those that the options name.
 
     Raises:
         ConfigError: an unknown name, term or option.
@@ -52,15 +64,49 @@ def model_options(model: str | Mapping[str, Any], leader: str) -> dict[str, Any]
     if schema is None:
         known = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
         raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(known)}")
-    if hasattr(schema, "leader"):
+    if hasattr(schema, "leader") and leader is not None:
         given.setdefault("leader", leader)
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(schema), given)
-    except Exception as error:  # omegaconf's own errors share no narrower class
-        raise ConfigError(f"model: {str(error).splitlines()[0]}") from error
-    found = OmegaConf.to_container(merged, enum_to_str=True)
+    if effects:
+        given["effects"] = list(effects)
+    found = OmegaConf.to_container(merged("model", schema, given), enum_to_str=True)
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
+
+
+def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
+    """Options of a schema with the values that are given.
+
+    Raises:
+        ConfigError: an option that there is not, or a value of another type.
+    """
+    try:
+        return cast(DictConfig, OmegaConf.merge(OmegaConf.structured(schema), *given))
+    except Exception as error:  # omegaconf's own errors share no narrower class
+        raise ConfigError(f"{section}: {str(error).splitlines()[0]}") from error
+
+
+def choice(
+    group: str, chosen: str | Mapping[str, Any], more: Mapping[str, Any] | None = None
+) -> DictConfig:
+    """Options of a solver, an optimiser or the trainer.
+
+    Args:
+        chosen: a name, or options with their ``name``; of the trainer options alone.
+        more: further options.
+
+    Raises:
+        ConfigError: an unknown name or option.
+    """
+    from nnode.config import SCHEMAS
+
+    given = {"name": chosen} if isinstance(chosen, str) else dict(chosen)
+    if group == "trainer":
+        return merged(group, TrainerOptions, given)
+    known = {key.removesuffix("_schema"): of for (own, key), of in SCHEMAS.items() if own == group}
+    name = str(given.get("name", ""))
+    if name not in known:
+        raise ConfigError(f"{group}={name} is unknown, expected one of {', '.join(known)}")
+    return merged(group, known[name], given, more or {})
 
 
 def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
@@ -76,16 +122,80 @@ def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
     return {"name": model, **MODELS[model]}
 
 
-def table_options(data: Table, domain: str, walls: str | Path | None, folder: Path) -> TableOptions:
-    """A table as a data set; one that is no file yet becomes one in ``folder``."""
-    if isinstance(data, pd.DataFrame):
+def sequences(
+    table: pd.DataFrame | str | Path | None = None, *, data: str | None = None, **options: Any
+) -> Sequences:
+    """Trajectories of a table, or of a data set that nnode knows, as a list of sequences.
+
+    Args:
+        table: a data frame, or the path of one; None for data sets that say where they are.
+        data: how it is read, a name as in ``conf/data``: ``table``, ``pairs``, ``vehicles``,
+            ``esimas``, ...; None: as the columns show, in SI units.
+        options: of those data, as on the command line behind ``data.``: ``columns={...}``,
+            ``walls="walls.csv"``, ``recording="1-1_1"``, ``faults="keep"``, ...
+
+    Raises:
+        NNodeError: unknown data or options, or a table that does not fit; with the row.
+    """
+    given = dict(options)
+    if data is None:
+        seen = seen_options(table)
+        data = seen.name
+        if isinstance(seen, TableOptions):
+            given.setdefault("domain", seen.domain)
+    return Sequences.of(table, data_options(data, given, in_memory=table is not None))
+
+
+def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False) -> DataOptions:
+    """Options of a data set by its name in ``conf/data``.
+
+    Args:
+        given: those that are not left as they are there.
+        in_memory: whether the table is handed over, so that no path has to be given.
+
+    Raises:
+        ConfigError: an unknown data set or option, or one that must be given.
+    """
+    from nnode.config import SCHEMAS
+
+    known = {path.stem: path for path in (configuration() / "data").glob("*.yaml")}
+    if data not in known:
+        near = get_close_matches(data, known, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(
+            f"data={data} is unknown, expected one of {', '.join(sorted(known))}{hint}"
+        )
+    own = cast(DictConfig, OmegaConf.load(known[data]))
+    schema = SCHEMAS["data", str(own.pop("defaults")[0])]
+    found = merged("data", schema, own, given)
+    if in_memory and OmegaConf.is_missing(found, "path"):
+        found.path = ""
+    try:
+        return cast(DataOptions, OmegaConf.to_object(found))
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"data.{error.full_key} is not set; give it a value") from None
+
+
+def data_of(given: Sequences) -> DataOptions:
+    """The options that sequences were read with; of others those of a table without a path."""
+    reader, told = given.manifest.get("reader"), given.manifest.get("options")
+    schema = next((kind for kind in FORMATS if kind.__name__ == reader), None)
+    if schema is None or told is None:
+        return TableOptions(domain=given.domain, path="")
+    return cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
+
+
+def table_options(
+    data: Table, domain: str | None, walls: str | Path | None, folder: Path | None
+) -> TableOptions:
+    """A tidy table as a data set; a data frame becomes a file where there is a folder for it."""
+    path = "" if isinstance(data, pd.DataFrame) else str(Path(data).expanduser().absolute())
+    if isinstance(data, pd.DataFrame) and folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / "table.parquet"
+        path = str((folder / "table.parquet").absolute())
         data.to_parquet(path, index=False)
-    else:
-        path = Path(data)
+    if domain is None:
+        domain = "crowd" if "y" in columns(data) else "traffic"
     return TableOptions(
-        domain=domain,
-        path=str(path.absolute()),
-        walls=None if walls is None else str(Path(walls).absolute()),
+        domain=domain, path=path, walls=None if walls is None else str(Path(walls).absolute())
     )

@@ -72,6 +72,17 @@ class Checkpoint:
         return system
 
 
+def copied(value: Any) -> Any:
+    """Deep copy of nested state with detached tensors, on the CPU so that any machine reads it."""
+    if isinstance(value, Tensor):
+        return value.detach().cpu().clone()
+    if isinstance(value, dict):
+        return {key: copied(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(copied(item) for item in value)
+    return value
+
+
 def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """Write ``path`` so that at every moment it is either the old file or the new one.
 

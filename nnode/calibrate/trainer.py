@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from nnode.calibrate.checkpoint import Checkpoint, copied, load_checkpoint, save_checkpoint
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import evaluate
@@ -65,7 +65,8 @@ class Trainer:
         train: loader whose batch sampler is an :class:`EpochSampler`.
         heldout: loader of the held-out sequences, or None.
         options: see :class:`TrainerOptions`.
-        folder: ``checkpoints/`` and ``tensorboard/`` are written here.
+        folder: ``checkpoints/`` and ``tensorboard/`` are written here; None: nothing is written,
+            and Ctrl-C ends the run at once.
         provenance: goes into the checkpoints.
         figure: draws the model for TensorBoard.
         world: the processes that train together; by default those that were joined.
@@ -79,7 +80,7 @@ class Trainer:
         train: DataLoader[Any],
         heldout: DataLoader[Any] | None,
         options: TrainerOptions,
-        folder: Path,
+        folder: Path | None,
         provenance: Provenance,
         figure: Callable[[System], Figure] | None = None,
         world: World | None = None,
@@ -95,19 +96,27 @@ class Trainer:
         self.sum, self.gradient_norm = 0.0, 0.0  # over the mini-batches of this epoch
         self.best, self.best_epoch, self.stale = float("inf"), -1, 0
         self.seconds = 0.0
-        self._pending_best: Checkpoint | None = None
+        self._best: Checkpoint | None = None
+        self._best_saved = True
         self._guard = InterruptGuard()
         self._clock = self._saved = time.monotonic()
 
     @property
     def last_path(self) -> Path:
         """The newest checkpoint."""
+        assert self.folder is not None
         return self.folder / "checkpoints" / "last.pt"
 
     @property
     def best_path(self) -> Path:
         """The checkpoint of least monitored cost."""
-        return self.folder / "checkpoints" / "best.pt"
+        return self.last_path.with_name("best.pt")
+
+    def best_checkpoint(self) -> Checkpoint:
+        """The state of least monitored cost; of a run gone on with perhaps one on the disk."""
+        if self._best is None and self.folder is not None and self.best_path.is_file():
+            return load_checkpoint(self.best_path)
+        return self.checkpoint() if self._best is None else self._best
 
     # -- state ---------------------------------------------------------------------------
 
@@ -133,8 +142,8 @@ class Trainer:
             manifest=self.provenance.manifest,
             split=self.provenance.split,
             free_speed=self.provenance.free_speed,
-            model=_copy(dict(self.model.state_dict())),
-            optimizer=_copy(self.optimizer.state_dict()),
+            model=copied(dict(self.model.state_dict())),
+            optimizer=copied(self.optimizer.state_dict()),
             progress={name: getattr(self, name) for name in self._COUNTERS},
             history=list(self.history),
         )
@@ -165,11 +174,11 @@ class Trainer:
 
     def save(self) -> None:
         """Write the best checkpoint, if there is a new one, then the last."""
-        if self.world.first:
-            if self._pending_best is not None:
-                save_checkpoint(self._pending_best, self.best_path)
+        if self.world.first and self.folder is not None:
+            if self._best is not None and not self._best_saved:
+                save_checkpoint(self._best, self.best_path)
             save_checkpoint(self.checkpoint(), self.last_path)
-        self._pending_best = None
+        self._best_saved = True
         self._saved = time.monotonic()
 
     # -- one step --------------------------------------------------------------------------
@@ -284,7 +293,7 @@ class Trainer:
         monitored = row.get(f"cost/{self.options.monitor.value}", row["cost/train"])
         if monitored < self.best - self.options.min_delta:
             self.best, self.best_epoch, self.stale = monitored, self.epoch, 0
-            self._pending_best = self.checkpoint()
+            self._best, self._best_saved = self.checkpoint(), False
         else:
             self.stale += 1
 
@@ -309,12 +318,13 @@ class Trainer:
             log.warning("trainer.monitor=heldout, but no sequence is held out: watching train")
         fresh = self.step == 0 and not self.history
         logbook = None
-        if self.world.first:
+        if self.world.first and self.folder is not None:
             logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
         self._clock = time.monotonic()
         finished = False
         try:
-            with InterruptGuard() as self._guard:
+            self._guard = InterruptGuard()
+            with self._guard if self.folder is not None else nullcontext():
                 if fresh:
                     self._start(logbook)
                 reporter = None
@@ -387,14 +397,3 @@ class Trainer:
             f"everything up to here is in {self.last_path}",
             number,
         )
-
-
-def _copy(value: Any) -> Any:
-    """Deep copy of nested state with detached tensors, on the CPU so that any machine reads it."""
-    if isinstance(value, Tensor):
-        return value.detach().cpu().clone()
-    if isinstance(value, dict):
-        return {key: _copy(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(_copy(item) for item in value)
-    return value

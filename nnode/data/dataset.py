@@ -12,8 +12,12 @@ from torch.utils.data import DataLoader
 
 from nnode.data.options import LoaderOptions
 from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequences import Sequences
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
+
+#: What sequences are taken from.
+Source = Store | Sequences
 
 
 class SequenceDataset(torch.utils.data.Dataset[Sequence]):
@@ -22,14 +26,14 @@ class SequenceDataset(torch.utils.data.Dataset[Sequence]):
     Nothing is kept in memory, so that a data set may be larger than it.
 
     Args:
-        store: the prepared data.
+        store: the prepared data, or sequences in memory.
         indices: positions in the store, such as ``Split.train``; None takes all.
 
     Raises:
         DataError: a position that the store does not have.
     """
 
-    def __init__(self, store: Store, indices: Iterable[int] | None = None) -> None:
+    def __init__(self, store: Source, indices: Iterable[int] | None = None) -> None:
         self.store = store
         self.indices = _positions(store, indices)
 
@@ -138,7 +142,7 @@ def make_loader(
         DataError: an empty data set.
     """
     if not len(dataset):
-        raise DataError(f"{dataset.store.folder}: there is no sequence to load")
+        raise DataError(f"{_called(dataset.store)}: there is no sequence to load")
     if options.workers < 0:
         raise ConfigError(f"data.loader.workers={options.workers}: expected at least 0")
     return DataLoader(
@@ -151,6 +155,10 @@ def make_loader(
         # Its own generator: a loader would otherwise advance the global one at every epoch.
         generator=torch.Generator().manual_seed(seed),
     )
+
+
+def _called(store: Source) -> str:
+    return str(store.folder) if isinstance(store, Store) else "the data set"
 
 
 def _collate_share(sequences: list[Sequence]) -> Batch | None:
@@ -167,14 +175,14 @@ def load_all(store: Store, indices: Iterable[int] | None = None) -> Batch:
     return collate(store[i] for i in _positions(store, indices))
 
 
-def _positions(store: Store, indices: Iterable[int] | None) -> ListLike[int]:
+def _positions(store: Source, indices: Iterable[int] | None) -> ListLike[int]:
     if indices is None:
         return range(len(store))
     positions = list(indices)
     for i in positions:
         if not 0 <= i < len(store):
             raise DataError(
-                f"{store.folder} has sequences 0 to {len(store) - 1}, asked for number {i}; the "
+                f"{_called(store)} has sequences 0 to {len(store) - 1}, asked for number {i}; the "
                 "split belongs to other data"
             )
     return positions

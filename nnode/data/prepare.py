@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
@@ -33,6 +35,7 @@ from nnode.data.options import (
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent
 from nnode.data.quality import Fault, find_faults
+from nnode.data.readers.columns import Table
 from nnode.data.readers.esimas import esimas_files, read_esimas
 from nnode.data.readers.highd import highd_files, read_highd
 from nnode.data.readers.juelich import juelich_files, read_juelich
@@ -41,7 +44,8 @@ from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.openacc import openacc_files, read_openacc
 from nnode.data.readers.pairs import pair_files, read_pairs
 from nnode.data.readers.sumo import read_sumo, sumo_files
-from nnode.data.readers.table import TABLE, WALLS, read_table, table_files
+from nnode.data.readers.table import TABLE as TIDY
+from nnode.data.readers.table import WALLS, read_table, table_files
 from nnode.data.readers.vehicles import read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.store import Store, write_store
@@ -60,7 +64,7 @@ NOT_PREPARATION = frozenset({"source", "download", "prepared", "split", "loader"
 #: Least number of dimensions of a domain's positions, which is also the greatest.
 DIMENSIONS = {"traffic": 1, "crowd": 2}
 
-_Files = dict[str, Path]
+_Files = dict[str, Any]  # paths; of tables in memory nnode.data.readers.columns.Table
 
 
 #: Draws the faulty ones of some sequences: sequences, faults by name, domain, path of the PNG.
@@ -87,7 +91,7 @@ FORMATS: dict[type[DataOptions], Format] = {
     NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
     JuelichOptions: Format(juelich_files, _each(read_juelich)),
     TableOptions: Format(
-        table_files, lambda files, options: read_table(files[TABLE], options, files.get(WALLS))
+        table_files, lambda files, options: read_table(files[TIDY], options, files.get(WALLS))
     ),
     WalkwayOptions: Format(
         walkway_files,
@@ -130,24 +134,51 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
         files = layout.files(replace(options, download=downloads))
         read = layout.read(files, options)
         stages.begin("looking for faults")
-        return _prepared(options, folder, files, read, stages, draw)
+        judged = judge(options, files, read, stages)
+    with _drawn(folder, judged, draw):
+        store = write_store(folder, judged.kept, judged.manifest)
+    log.info("%d of %d sequences kept in %s", len(judged.kept), len(read), folder)
+    return store
 
 
-def _prepared(
-    options: DataOptions,
-    folder: Path,
-    files: _Files,
-    read: list[Sequence],
-    stages: Stages,
-    draw: Draw | None,
-) -> Store:
-    """Judge the sequences and write the store."""
+@dataclass(frozen=True)
+class Judged:
+    """What became of the sequences that were read.
+
+    Attributes:
+        domain: of the data.
+        every: all sequences, people who come and go left out.
+        faults: of every sequence by its name.
+        kept: those that stay, with agents named once in a recording.
+        manifest: see :func:`prepare`.
+    """
+
+    domain: Domain
+    every: list[Sequence]
+    faults: dict[str, list[Fault]]
+    kept: list[Sequence]
+    manifest: dict[str, Any]
+
+
+def judge(
+    options: DataOptions, files: _Files, read: list[Sequence], stages: Stages | None = None
+) -> Judged:
+    """Look for faults and sort out what the options do not keep.
+
+    Args:
+        files: what was read.
+        stages: are told how far it is.
+
+    Raises:
+        NNodeError: see :func:`prepare`.
+    """
     domain = _domain(options, read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
     faults = {}
     for number, s in enumerate(sequences):
         faults[s.name] = find_faults(s, domain)
-        stages.within(number / len(sequences))
+        if stages is not None:
+            stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on
@@ -164,17 +195,22 @@ def _prepared(
         "identifiers": notes,
         "domain": domain,
         "dt": _interval(kept),
-        "files": {key: {"name": path.name, "sha256": sha256(path)} for key, path in files.items()},
+        "files": {key: _of_file(source) for key, source in files.items()},
         "counts": {"read": len(read), "kept": len(kept), "dropped": len(dropped)},
         "recordings": by_recording(read, kept, faults),
         "dropped": dropped,
         "dropped_agents": absent,
         "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
     }
-    with _drawn(folder, sequences, faults, domain, draw):
-        store = write_store(folder, kept, manifest)
-    log.info("%d of %d sequences kept in %s", len(kept), len(read), folder)
-    return store
+    return Judged(domain, sequences, faults, kept, manifest)
+
+
+def _of_file(source: Path | Table) -> dict[str, str]:
+    """Name and SHA-256 of what was read."""
+    if isinstance(source, Table):
+        rows = pd.util.hash_pandas_object(source.frame, index=False).to_numpy()
+        return {"name": source.path.name, "sha256": hashlib.sha256(rows.tobytes()).hexdigest()}
+    return {"name": source.name, "sha256": sha256(source)}
 
 
 def open_data(options: DataOptions, folder: Path | str) -> Store:
@@ -307,14 +343,9 @@ def _interval(sequences: list[Sequence]) -> float:
 
 
 @contextmanager
-def _drawn(
-    folder: Path,
-    sequences: list[Sequence],
-    faults: dict[str, list[Fault]],
-    domain: Domain,
-    draw: Draw | None,
-) -> Iterator[None]:
+def _drawn(folder: Path, judged: Judged, draw: Draw | None) -> Iterator[None]:
     """Draw beside the folder's present plots, and put them in place after the body succeeds."""
+    sequences, faults = judged.every, judged.faults
     partial = folder / f".{PLOTS}.{os.getpid()}.partial"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -329,7 +360,7 @@ def _drawn(
                 own = [s for s in sequences if s.recording == recording]
                 if any(faults[s.name] for s in own):
                     name = recording.replace(os.sep, "_") + ".png"
-                    draw(own, faults, domain, partial / name)
+                    draw(own, faults, judged.domain, partial / name)
         yield
         shutil.rmtree(folder / PLOTS, ignore_errors=True)
         if any(partial.iterdir()):

@@ -21,6 +21,7 @@ import numpy as np
 
 from nnode.data.clusters import Index, by_recording, clusters, identified, relation
 from nnode.data.options import SplitMode, SplitOptions
+from nnode.data.sequences import Sequences
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
@@ -55,7 +56,7 @@ class Split:
         return asdict(self)
 
 
-def split(sequences: Store | Index, options: SplitOptions) -> Split:
+def split(sequences: Store | Sequences | Index, options: SplitOptions) -> Split:
     """Divide the sequences of a store; a pure function of its arguments.
 
     Args:
@@ -68,7 +69,7 @@ def split(sequences: Store | Index, options: SplitOptions) -> Split:
         DataError: nothing would be left to train on or to hold out, or the source publishes no
             division where one is asked for.
     """
-    index: Index = sequences.index if isinstance(sequences, Store) else sequences
+    index: Index = sequences.index if isinstance(sequences, Store | Sequences) else sequences
     share, gap, mode = options.heldout, options.gap, SplitMode(options.mode)
     if not 0 <= share < 1:
         raise ConfigError(f"data.split.heldout={share}: expected a share from 0 to below 1")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
+from nnode.data.dataset import Source
 from nnode.data.options import DataOptions, Faults
 from nnode.data.prepare import open_data
 from nnode.data.quality import Fault
@@ -52,13 +53,30 @@ def read_inputs(options: DataOptions, folder: Path) -> Inputs:
         DataError: fewer than three sequences are left, or no vehicle follows another.
         NNodeError: see :func:`nnode.data.prepare.open_data`.
     """
+    return inputs_of(open_data(with_faulty(options), folder), options)
+
+
+def with_faulty(options: DataOptions) -> DataOptions:
+    """Options that read faulty sequences as well, which the report tells of."""
     if options.prepared is None and options.faults is Faults.drop:
-        options = replace(options, faults=Faults.keep)
-    store = open_data(options, folder)
+        return replace(options, faults=Faults.keep)
+    return options
+
+
+def inputs_of(store: Source, options: DataOptions) -> Inputs:
+    """Part what is sound from what is faulty.
+
+    Args:
+        store: what was read, on the disk or in memory.
+        options: of these data.
+
+    Raises:
+        DataError: fewer than three sequences are left, or no vehicle follows another.
+    """
     names = {field.name for field in fields(Fault)}
     faults: dict[str, list[Fault]] = {}
     reported = []
-    for entry in store.manifest["faults"]:
+    for entry in store.manifest.get("faults", []):
         plain = {key: value for key, value in entry.items() if key in names}
         fault = Fault(**{**plain, "agents": tuple(entry["agents"])})
         faults.setdefault(fault.sequence, []).append(fault)
@@ -66,7 +84,8 @@ def read_inputs(options: DataOptions, folder: Path) -> Inputs:
         reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
     everything = list(store)
     sound = [s for s in everything if s.name not in faults]
-    _check_enough(sound, faults, store.manifest["counts"]["read"], options)
+    read = store.manifest.get("counts", {}).get("read", len(everything))
+    _check_enough(sound, faults, read, options)
     return Inputs(
         domain=cast(Domain, options.domain),
         sequences=sound,

@@ -150,7 +150,7 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
     return model
 
 
-def add_effects(model: System, chosen: Sequence[Options]) -> None:
+def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
     """Give a model effects of the catalogue, each in its place in the sum.
 
     Args:

@@ -19,6 +19,7 @@ from nnode.app.python_inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions
+from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report import page
 from nnode.errors import ConfigError
@@ -212,7 +213,11 @@ def test_effects_can_be_given_on_the_command_line() -> None:
 
 def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
     full = model_options(model, "measured")
-    return app._job(full, data, {}, {}, DiscoverOptions(**options), Path("nowhere"))
+
+    def never() -> Inputs:
+        pytest.fail("data were read")
+
+    return app._job(full, data, {}, {}, DiscoverOptions(**options), never)
 
 
 def test_model_and_data_of_two_domains_are_refused() -> None:
@@ -259,7 +264,7 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
     report = app.diagnose_table(
         table, "crowd", model={"term": "social_force", "B": 0.3, "walls": False}, walls=walls,
         seed=3,
-    )  # fmt: skip
+    ).plain()  # fmt: skip
     assert report["verdict"] == "named"
     assert report["model"] == "social_force"
     assert report["effects"][0]["coefficients"]["w_y"]["value"] == pytest.approx(0.35)
@@ -273,9 +278,9 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path) -> None:
     report = app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
         options=DiscoverOptions(page=False),
-    )  # fmt: skip
+    ).plain()  # fmt: skip
     names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert names == {"checkpoints", "data", "model.yaml", "report.json"}
+    assert names == {"checkpoints", "model.yaml", "report.json"}
     assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
 
@@ -286,7 +291,7 @@ def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
     frame.to_csv(table, index=False)
-    report = app.diagnose_table(table, "traffic", model={"term": "lin"})
+    report = app.diagnose_table(table, "traffic", model={"term": "lin"}).plain()
     assert report["verdict"] == "named"
     faults = {(fault["sequence"], *fault["agents"]) for fault in report["data_faults"]}
     assert ("lane/1", "v1-1") in {fault[:2] for fault in faults}
@@ -299,7 +304,7 @@ def test_the_slow_zone_of_made_up_platoons_is_named(tmp_path: Path) -> None:
     report = app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
         options=DiscoverOptions(effects=["speed_zone", "relative_speed"]),
-    )  # fmt: skip
+    ).plain()  # fmt: skip
     assert report["verdict"] == "named"
     (effect,) = report["effects"]
     assert effect["name"] == "speed_zone"

@@ -15,6 +15,7 @@ from benchmarks.config import register
 from nnode.app.cli.flags import read_command_line
 from nnode.app.cli.run import check_overrides
 from tests.app.conftest import examples
+from tests.app.following import table
 from tests.discover.platoons import platoons
 from tests.docs.test_tutorials import ROOT, blocks
 
@@ -61,18 +62,39 @@ def test_your_own_data_in_ten_lines(tmp_path: Path) -> None:
         for time, places in zip(one.time, one.x[..., 0], strict=True)
         for i, x in enumerate(places)
     ]
-    table = pd.DataFrame(rows, columns=["platoon", "t", "car", "pos"])
-    table.to_csv(tmp_path / "mine.csv", index=False)
-    done = subprocess.run(
-        [sys.executable, "-c", text],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "lin, calibrated: cost of a training sequence" in done.stdout
-    assert re.search(r"^  v0 = \d+\.\d+ m/s$", done.stdout, re.M)
+    drives = pd.DataFrame(rows, columns=["platoon", "t", "car", "pos"])
+    drives.to_csv(tmp_path / "mine.csv", index=False)
+    said = in_a_folder(text, tmp_path)
+    assert "lin, calibrated\n  cost of a training sequence" in said
+    assert re.search(r"^  v0 = \d+(\.\d+)? m/s$", said, re.M)
     assert (tmp_path / "law.png").stat().st_size > 10_000
     assert (tmp_path / "runs" / "mine" / "report.html").is_file()
+
+
+@pytest.mark.thorough
+def test_the_lines_with_scikit_learn(tmp_path: Path) -> None:
+    pytest.importorskip("sklearn")
+    (text,) = (t for lang, t in blocks(README) if lang == "python" and "cross_val_score" in t)
+    table(platoons=8, seconds=10.0).to_csv(tmp_path / "platoons.csv", index=False)
+    script = f"{text}\nassert len(simulated) == 8 * 101 * 3\nprint(list(idm.parameters_))"
+    said = in_a_folder(script, tmp_path)
+    assert re.search(r"^idm.T +1\.\d+ +1\.\d+ +1\.\d+ +s ", said, re.M)
+    assert "['estimate', 'lower', 'upper', 'unit'" in said
+    scores = re.findall(r"-\d+\.\d+", said.partition("\n[")[2].partition("]")[0])
+    assert len(scores) == 4
+    chain = re.search(r"`(nnode\.Calibrator\(.*?\.score\(table\))`", README.read_text())
+    assert chain is not None
+    code = (
+        f"import nnode\nimport pandas as pd\ntable = pd.read_csv('platoons.csv')\nprint({chain[1]})"
+    )
+    assert -1 < float(in_a_folder(code, tmp_path)) < 0
+
+
+def in_a_folder(code: str, folder: Path) -> str:
+    """What code prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False,
+        env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": ""},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout

@@ -1,12 +1,11 @@
-"""What ``scripts/<name>.py --help`` prints: purpose, examples, choices, options, where results go.
+"""What ``--help`` behind a command prints: purpose, examples, choices, options, where results go.
 
-Nothing is written twice: the words are the script's docstring, the first comments of the files
+Nothing is written twice: the words are the command's docstring, the first comments of the files
 in ``conf/``, and the comments beside the fields of the options' dataclasses.
 """
 
 from __future__ import annotations
 
-import ast
 import inspect
 import re
 import shutil
@@ -20,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.choices import choices, own_groups
 from nnode.app.cli.overrides import show_composed
+from nnode.program import words
 
 #: Characters of a line, and those before what explains an option.
 WIDTH, LEFT = 100, 34
@@ -37,14 +37,13 @@ def help_text(overrides: list[str], folder: Path, name: str, extra: Path | None 
     """The help of a script, with the values that checked overrides give.
 
     Args:
-        folder: ``conf/``; ``scripts/`` is beside it.
+        folder: ``conf/``.
         extra: a folder with groups of the user's own.
     """
     config = show_composed(overrides, folder, name, extra)
-    words = script_words(folder.parent / "scripts" / f"{name}.py")
     chosen = dict(config.hydra.runtime.choices)
     groups = [g for g in own_groups(folder, name) if chosen.get(g) or g == "experiment"]
-    parts = [words]
+    parts = [words(name, folder)]
     for group in groups:
         found = choices(folder, group) + (choices(extra, group) if extra else [])
         lines = [
@@ -70,11 +69,6 @@ _GROUPS = {
     "experiment": "several choices and options at once",
     "study": "which part of the paper",
 }
-
-
-def script_words(path: Path) -> str:
-    """A script's docstring."""
-    return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
 
 
 def _run_folder(folder: Path, name: str) -> tuple[str, str]:

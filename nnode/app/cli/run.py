@@ -26,6 +26,7 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
 from nnode.files import disk_words
+from nnode.program import begin, configuration
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
@@ -38,10 +39,10 @@ def run(
     *,
     parallel: bool = False,
 ) -> None:
-    """Run ``job(config, folder)`` as ``scripts/<name>.py``; ends the process on errors.
+    """Run ``job(config, folder)`` as the command ``name``; ends the process on errors.
 
     Args:
-        name: the script, and its configuration ``conf/<name>.yaml``.
+        name: the command, and its configuration ``conf/<name>.yaml``.
         job: does the work; writes only into ``folder``.
         inject: looks at the overrides given by the user and returns further ones that go
             before them.
@@ -53,7 +54,8 @@ def run(
     register()
     # on a full disk the log cannot be written either, which shall not bury the run's own words
     logging.raiseExceptions = False
-    folder = Path(sys.argv[0]).resolve().parent.parent / "conf"
+    begin()
+    folder = configuration()
     try:
         if parallel:
             join()
@@ -78,7 +80,10 @@ def _arguments(
 ) -> list[str]:
     """Check the command line and complete it in place; returns its overrides."""
     if not folder.is_dir():
-        raise ConfigError(f"no configuration folder {folder}; run scripts/{name}.py in place")
+        raise ConfigError(
+            f"no configuration folder {folder}; run scripts/{name}.py in place, or install nnode "
+            "again"
+        )
     line = read_command_line(sys.argv[1:])
     if "--version" in line.flags:
         print(f"nnode {VERSION}")

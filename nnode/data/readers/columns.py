@@ -17,25 +17,38 @@ _EXACT = 2.0**53
 
 
 class Table:
-    """A CSV or Parquet table whose cells are asked for by meaning.
+    """A table whose cells are asked for by meaning.
 
     Args:
-        path: the table; ``.parquet`` or ``.pq`` is read as Parquet, all else as CSV.
+        source: a file, ``.parquet`` or ``.pq`` read as Parquet, all else as CSV; or a data frame.
         names: of the columns of a CSV without a line of names.
         csv: further options of :func:`pandas.read_csv`.
+
+    Attributes:
+        path: of the file; a data frame, which has none, is called ``table``.
 
     Raises:
         DataError: no such file, an empty one, or one that is not of its format.
     """
 
-    def __init__(self, path: Path, names: list[str] | None = None, **csv: Any) -> None:
-        self.path = path
+    def __init__(
+        self, source: Path | pd.DataFrame, names: list[str] | None = None, **csv: Any
+    ) -> None:
+        if isinstance(source, pd.DataFrame):
+            self.path, self.by_line = Path("table"), False
+            self._take(source.reset_index(drop=True))
+        else:
+            self.path = source
+            self._read(source, names, csv)
+
+    def _read(self, path: Path, names: list[str] | None, csv: dict[str, Any]) -> None:
         self._first = (2 if names is None else 1) + int(csv.get("skiprows", 0))
-        self.parquet = path.suffix.lower() in (".parquet", ".pq")
+        parquet = path.suffix.lower() in (".parquet", ".pq")
+        self.by_line = not parquet
         if not path.is_file():
             raise DataError(f"there is no table {path}; set data.path, or data.source, to it")
         try:
-            if self.parquet:
+            if parquet:
                 frame = pd.read_parquet(path).reset_index(drop=True)
             else:
                 # Blank lines are kept at first, so that row numbers are those of the file.
@@ -46,7 +59,7 @@ class Table:
         except pd.errors.EmptyDataError as error:
             raise DataError(f"{path} is empty; expected a line of column names and rows") from error
         except Exception as error:  # a damaged file leads to almost any error
-            kind = "Parquet" if self.parquet else "comma-separated"
+            kind = "Parquet" if parquet else "comma-separated"
             said = str(error).strip().removeprefix("Error tokenizing data. C error: ")
             raise DataError(f"{path} cannot be read as a {kind} table: {said}") from error
         if not isinstance(frame.index, pd.RangeIndex):
@@ -54,10 +67,13 @@ class Table:
                 f"{path}: there are more cells in its rows than names in its first line; give "
                 "every column a name"
             )
-        frame.columns = [str(name).strip() for name in frame.columns]
-        self.frame = frame.dropna(how="all")
+        self._take(frame)
+
+    def _take(self, frame: pd.DataFrame) -> None:
+        self.frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
+        self.frame = self.frame.dropna(how="all")
         if self.frame.empty:
-            raise DataError(f"{path} has no rows below its columns {self._listing()}")
+            raise DataError(f"{self.path} has no rows below its columns {self._listing()}")
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -153,7 +169,7 @@ class Table:
     def row(self, i: int) -> str:
         """Where the i-th row stands in the file, in words."""
         index = int(self.frame.index[i])
-        return f"row {index + 1}" if self.parquet else f"line {index + self._first}"
+        return f"line {index + self._first}" if self.by_line else f"row {index + 1}"
 
     def _listing(self) -> str:
         return ", ".join(self.frame.columns) or "none"
@@ -170,3 +186,8 @@ class Table:
         if mapped:
             return text + f"; set data.columns.{key}={example}"
         return text + f"; rename the column that holds it to {key!r}"
+
+
+def opened(source: Path | str | Table) -> Table:
+    """A table by its path; one that is open already is taken as it is."""
+    return source if isinstance(source, Table) else Table(Path(source))

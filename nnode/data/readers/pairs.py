@@ -7,7 +7,7 @@ bumper to bumper in place of the leader's length, that follows from it and from 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from nnode.data.options import Gaps, PairOptions
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import (
     check_known,
     one_of,
@@ -83,7 +83,7 @@ def pair_files(options: PairOptions) -> dict[str, Path]:
     return files
 
 
-def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
+def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[Sequence]:
     """Read pairs.
 
     Args:
@@ -109,7 +109,7 @@ def read_pairs(files: dict[str, Path], options: PairOptions) -> list[Sequence]:
         pair
         for key, path in files.items()
         if key != INDEX
-        for pair in _pairs(key, Table(path), options, listed.get(key, {}))
+        for pair in _pairs(key, opened(path), options, listed.get(key, {}))
     ]
     if asked is not None:
         check_known(asked, [pair.words["run"] for pair in pairs])
@@ -175,11 +175,11 @@ def _unit(option: str, value: Any, path: Path, units: dict[str, float]) -> float
     raise ConfigError(f"data.{option}={value}: no pattern fits {path.name}")
 
 
-def _listed(path: Path | None) -> dict[str, dict[str, str]]:
+def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
     """What an index tells of every file, by the file's path."""
     if path is None:
         return {}
-    table = Table(path)
+    table = opened(path)
     names = table.choose(("path",), _WORDS)
     cells = {name: table.names(column, empty=True) for name, column in names.items()}
     files = cells.pop("path")

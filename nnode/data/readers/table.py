@@ -8,7 +8,7 @@ import numpy as np
 
 from nnode.data.exits import destinations, exits_of, read_exits
 from nnode.data.options import TableOptions
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import check_known, table_path, wanted
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
@@ -35,11 +35,14 @@ def table_files(options: TableOptions) -> dict[str, Path]:
     return files
 
 
-def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> list[Sequence]:
+def read_table(
+    source: Path | Table, options: TableOptions, walls: Path | None = None
+) -> list[Sequence]:
     """Read a table.
 
     Args:
-        path: CSV or Parquet with the columns that :class:`TableOptions` lists.
+        source: CSV or Parquet, or a table that is open, with the columns that
+            :class:`TableOptions` lists.
         options: ``domain`` and ``recording`` are read.
         walls: CSV or Parquet with a segment per row, x1, y1, x2, y2 (m).
 
@@ -54,9 +57,9 @@ def read_table(path: Path, options: TableOptions, walls: Path | None = None) -> 
             agent twice at one time, unequal time steps, or values that change within a
             sequence although they belong to an agent.
     """
-    path = Path(path)
     crowd = _is_crowd(options)
-    table = Table(path)
+    table = opened(source)
+    path = table.path
     names = table.choose(_REQUIRED, _OPTIONAL)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"

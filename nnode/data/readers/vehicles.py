@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nnode.data.options import LaneOptions, VehicleTableOptions
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.recordings import one_of, positive, table_path
 from nnode.data.sequence import Sequence
@@ -31,11 +31,11 @@ def vehicle_files(options: LaneOptions) -> dict[str, Path]:
     return {path.stem: path}
 
 
-def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
+def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> list[Sequence]:
     """Read a table and cut it into sequences, see :func:`nnode.data.readers.platoons.cut_vehicles`.
 
     Args:
-        path: CSV or Parquet.
+        source: CSV or Parquet, or a table that is open.
         options: columns, units, lanes, time grid and the way of cutting.
 
     Raises:
@@ -43,11 +43,11 @@ def read_vehicles(path: Path, options: VehicleTableOptions) -> list[Sequence]:
         DataError: columns or cells that are missing or hold no number (names the row), one
             vehicle twice at one time, or no sequence at all.
     """
-    path = Path(path)
     if options.direction not in (1, -1):
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     check_cutting(options)
-    return cut_vehicles({path.stem: _rows(Table(path), options)}, options)
+    table = opened(source)
+    return cut_vehicles({table.path.stem: _rows(table, options)}, options)
 
 
 def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:

@@ -21,6 +21,7 @@ from nnode.files import write_text
 from nnode.models import FeedForward, System, build_model
 from nnode.models.effects import CATALOGUE
 from nnode.models.extend import effects_of
+from nnode.program import scripts, typed
 
 REPORT = "report.json"
 MODEL = "model.yaml"
@@ -228,9 +229,10 @@ def has_network(system: System) -> bool:
 
 def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
     """A model's options as a file for ``conf/model``."""
-    name = options["name"]
+    name, own = options["name"], "" if scripts() else "--config-dir conf "
     lines = [
-        f"# Made by scripts/discover.py. Copy it to conf/model/{name}.yaml, then: model={name}",
+        f"# Made by {typed('python scripts/discover.py')}. "
+        f"Copy it to conf/model/{name}.yaml, then: {own}model={name}",
     ]
     if networks:
         lines.append(f"# The weights of the network are in {CHECKPOINT} only: these would be new.")

@@ -15,9 +15,10 @@ from hydra.core.global_hydra import GlobalHydra
 from benchmarks import config as benchmark_config
 from nnode.app.cli.choices import choices, own_groups
 from nnode.app.cli.flags import read_command_line
-from nnode.app.cli.help import help_text, remarks, script_words
+from nnode.app.cli.help import help_text, remarks
 from nnode.app.cli.run import check_overrides
 from nnode.config import SCHEMAS
+from nnode.program import words
 from tests.app.conftest import ROOT, Script, environment, examples
 
 CONF = ROOT / "conf"
@@ -47,14 +48,15 @@ def test_help_names_purpose_groups_choices_options_and_results(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_every_example_has_options_that_exist(name: str) -> None:
-    commands = examples(script_words(ROOT / "scripts" / f"{name}.py"))
+def test_every_example_has_options_that_exist(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv("NNODE_SCRIPTS", str(ROOT))
+    commands = examples(words(name, CONF))
     assert commands
     for command in commands:
-        words = shlex.split(command)
-        place = next(i for i, word in enumerate(words) if word.startswith("scripts/"))
-        assert words[place] == f"scripts/{name}.py"
-        line = read_command_line(words[place + 1 :])
+        parts = shlex.split(command)
+        place = next(i for i, part in enumerate(parts) if part.startswith("scripts/"))
+        assert parts[place] == f"scripts/{name}.py"
+        line = read_command_line(parts[place + 1 :])
         check_overrides(line.overrides, CONF, name, sweep=line.sweeps)
 
 

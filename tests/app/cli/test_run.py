@@ -11,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from nnode.app.cli.flags import read_command_line
 from nnode.app.cli.run import check_overrides
 from nnode.app.cli.typed import shell_override
-from nnode.app.train import build_solver
+from nnode.app.training import build_solver
 from nnode.calibrate.options import FusedOptions
 from nnode.config import register
 from nnode.errors import ConfigError

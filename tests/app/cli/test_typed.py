@@ -94,8 +94,9 @@ def test_only_what_differs_is_told() -> None:
     ],
 )  # fmt: skip
 def test_the_printed_training_reads_the_data_of_the_diagnosis(
-    model: str, given: list[str], tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, model: str, given: list[str], tmp_path: Path
 ) -> None:
+    monkeypatch.setenv("NNODE_SCRIPTS", str(CONF.parent))
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("discover", [f"model={model}", *given], return_hydra_config=True)
         HydraConfig.instance().set_config(config)
@@ -112,6 +113,17 @@ def test_the_printed_training_reads_the_data_of_the_diagnosis(
     with initialize_config_dir(str(CONF), version_base="1.3"):
         read = compose("train", [f"++{o}" if o in free else o for o in overrides])
     assert OmegaConf.to_container(read.data, resolve=True, enum_to_str=True) == told["data"]
+
+
+def test_the_installed_program_finds_a_model_in_a_folder_of_the_user_s(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("NNODE_SCRIPTS", raising=False)
+    data = {**group_defaults("data", "table"), "path": "drive.csv", "domain": "traffic"}
+    config = {"model": {"name": "mine"}, "data": data, "groups": {"data": "table"}}
+    *_, copy, train = _commands(config, tmp_path)
+    assert copy == f"mkdir -p conf/model && cp {tmp_path}/model.yaml conf/model/mine.yaml"
+    assert train.startswith("nnode train --config-dir conf model=mine data=table data.")
 
 
 def test_without_a_configuration_the_schema_tells_the_defaults() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -19,7 +20,7 @@ from nnode.errors import ConfigError, DataError
 CALLS: list[dict[str, Any]] = []
 
 
-def stand_in(path: Path, domain: str, **given: Any) -> dict[str, Any]:
+def stand_in(path: Path, domain: str, **given: Any) -> SimpleNamespace:
     """Names relative speed whatever there is, and sees no data with faults."""
     assert {p.name for p in path.parent.iterdir()} <= {"trajectories.csv", "walls.csv"}
     CALLS.append({"domain": domain, **given})
@@ -28,7 +29,7 @@ def stand_in(path: Path, domain: str, **given: Any) -> dict[str, Any]:
     if table["x"].groupby([table["sequence"], table["agent"]]).diff().abs().max() > 6.5:
         raise DataError("too far within one step")
     kappa = {"value": 0.4, "low": 0.0, "high": 1.0, "unit": "1"}
-    return {
+    report = {
         "verdict": "named",
         "effects": [
             {"name": "relative_speed", "coefficients": {"kappa": kappa}, "alternatives": []}
@@ -41,6 +42,7 @@ def stand_in(path: Path, domain: str, **given: Any) -> dict[str, Any]:
         "split": {"open": names[1:], "sealed": names[:1]},
         "seconds": {"name": 0.1},
     }
+    return SimpleNamespace(plain=lambda: report)
 
 
 @pytest.fixture(autouse=True)

@@ -50,7 +50,7 @@ def unconfirmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unconfirmed")
     report = diagnose_table(
         table(turned()), "traffic", model="lin", folder=folder / "run", options=OPTIONS
-    )
+    ).plain()
     pd.Series(report).to_pickle(folder / "report.pkl")
     return folder
 

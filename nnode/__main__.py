@@ -1,0 +1,55 @@
+"""The program ``nnode``: one command for each script of a checkout."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from difflib import get_close_matches
+from importlib import import_module
+
+from nnode.program import COMMANDS, PROGRAM, configuration, running, words
+from nnode.version import VERSION
+
+
+def main() -> None:
+    """Run the command that the command line names; ends the process where there is none such."""
+    given = sys.argv[1:]
+    names = sorted(path.stem for path in COMMANDS.glob("[a-z]*.py"))
+    name = given[0] if given else "--help"
+    if name in ("-h", "--help"):
+        print(_help(names))
+    elif name == "--version":
+        print(f"{PROGRAM} {VERSION}")
+    elif name in names:
+        del sys.argv[1]
+        running(name)
+        import_module(f"nnode.app.commands.{name}").main()
+    else:
+        near = get_close_matches(name, names, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        said = f"error: there is no command {name}, expected one of {', '.join(names)}{hint}"
+        print(said, file=sys.stderr)
+        sys.exit(2)
+
+
+def _help(names: list[str]) -> str:
+    conf = configuration()
+    rows = []
+    for name in names:
+        about = textwrap.wrap(words(name, conf).splitlines()[0], 82)
+        rows += [f"  {name:<14}{about[0]}", *(f"{'':<16}{line}" for line in about[1:])]
+    return "\n".join(
+        [
+            "Calibrate interacting particle systems to measured trajectories, and diagnose them.",
+            "",
+            f"{PROGRAM} COMMAND [NAME=VALUE ...]",
+            *rows,
+            "",
+            f"{PROGRAM} COMMAND --help shows examples, choices and all options; {PROGRAM} "
+            "--version the version.",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,283 @@
+"""What a calibration found, as an object: the command writes it, Python hands it over."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nnode.app.training import straight_loader, stream
+from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
+from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.trainer import Trainer
+from nnode.data.clusters import clusters
+from nnode.data.dataset import Source
+from nnode.errors import ConfigError
+from nnode.files import xarray
+from nnode.models import System
+from nnode.models.term import short_names
+from nnode.plots import force_figure
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+_BOUND = {"low": "lower", "high": "upper"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """A calibrated model, and what the data say of it.
+
+    Attributes:
+        model: a torch module, with the parameters of the best evaluation.
+        parameters: a row per physical parameter, by its address such as ``idm.T``: ``estimate``,
+            ``lower`` and ``upper`` ends of its interval of 95 % by clusters (NaN where there is
+            none: models without exact tangents, or at a bound), ``unit``, ``at_bound`` (``low``,
+            ``high`` or empty) and ``identified`` (None where there are no intervals).
+        correlation: of the estimates, by address; None without intervals.
+        clusters: number of independent clusters behind the intervals; None without.
+        cost: mean cost of a training sequence, at the best evaluation; ``cost_start`` at the first.
+        cost_heldout: that of a held-out sequence; NaN where none is held out. ``heldout_start``.
+        cost_unit: of all costs.
+        epoch: of the best evaluation.
+        n_iter: epochs that were done.
+        history: one row per evaluation: epoch, costs, parameters.
+        uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
+        seconds: that the training took.
+        checkpoint: enough to build the model again, with options, division of the data, versions.
+    """
+
+    model: System
+    parameters: pd.DataFrame
+    correlation: pd.DataFrame | None
+    clusters: int | None
+    cost: float
+    cost_start: float
+    cost_heldout: float
+    heldout_start: float
+    cost_unit: str
+    epoch: int
+    n_iter: int
+    history: pd.DataFrame
+    uncompiled: str
+    seconds: float
+    checkpoint: Checkpoint
+
+    @property
+    def name(self) -> str:
+        """Of the model."""
+        return str(self.checkpoint.config["model"]["name"])
+
+    def summary(self) -> str:
+        """Costs, and parameters with units and intervals, a line each."""
+        unit = self.cost_unit
+        lines = [f"cost of a training sequence: {self.cost_start:.4g} -> {self.cost:.4g} {unit}"]
+        if np.isfinite(self.cost_heldout):
+            before, after = self.heldout_start, self.cost_heldout
+            lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        short = short_names(map(str, self.parameters.index))
+        rows = _rows(self.parameters).items()
+        return "\n".join([*lines, *(f"{short[name]} = {_words(row)}" for name, row in rows)])
+
+    def plot(self) -> Figure:
+        """The calibrated speed curve, or the force between two people."""
+        return force_figure(self.model)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """:attr:`parameters` with their addresses as a column, for a file."""
+        return self.parameters.rename_axis("parameter").reset_index()
+
+    def to_xarray(self) -> Dataset:
+        """Parameters and their correlation along ``parameter``, costs along ``epoch``.
+
+        Needs xarray: ``pip install 'nnode[xarray]'``.
+        """
+        names = [str(name) for name in self.parameters.index]
+        found = {
+            key: ("parameter", self.parameters[key].to_numpy(dtype=float))
+            for key in ("estimate", "lower", "upper")
+        }
+        if self.correlation is not None:
+            table = self.correlation.loc[names, names].to_numpy(dtype=float)
+            found["correlation"] = (("parameter", "other"), table)  # type: ignore[assignment]
+        for key in (key for key in self.history if str(key).startswith("cost/")):
+            found[str(key).replace("/", "_")] = ("epoch", self.history[key].to_numpy(dtype=float))
+        coords = {
+            "parameter": names,
+            "unit": ("parameter", self.parameters["unit"].to_list()),
+            "epoch": self.history["epoch"].to_numpy(dtype=int),
+        } | ({} if self.correlation is None else {"other": names})
+        return xarray().Dataset(found, coords, {"model": self.name, "cost_unit": self.cost_unit})
+
+    def save(self, path: str | Path) -> Path:
+        """Write a checkpoint that :func:`nnode.load` and the commands read.
+
+        Raises:
+            ConfigError: the model was built by hand, so that no options describe it.
+            WriteError: no room, or not allowed.
+        """
+        if not self.checkpoint.config["model"].get("term"):
+            raise ConfigError(
+                f"{self.name} was built by hand, and no options describe it: keep its "
+                "state_dict() with torch.save, and the code that builds it"
+            )
+        save_checkpoint(self.checkpoint, Path(path))
+        return Path(path)
+
+    def plain(self, paths: dict[str, str]) -> dict[str, Any]:
+        """The content of ``result.json``."""
+        config = self.checkpoint.config
+        rows = _rows(self.parameters)
+        heldout = self.cost_heldout if np.isfinite(self.cost_heldout) else None
+        found: dict[str, Any] = {
+            "summary": {
+                "model": config["model"]["name"],
+                "data": config["data"]["name"],
+                "recording": config["data"]["recording"],
+                "seed": config["seed"],
+                "cost_start": self.cost_start,
+                "cost_train": self.cost,
+                "cost_heldout": heldout,
+                "epoch": self.epoch,
+                **{name: row["estimate"] for name, row in rows.items()},
+                "seconds": round(self.seconds, 1),
+            },
+            "parameters": {name: _as_json(row) for name, row in rows.items()},
+        }
+        if self.correlation is not None:
+            found["correlation"] = {
+                name: {other: _number(value) for other, value in row.items()}
+                for name, row in _rows(self.correlation).items()
+            }
+            found["clusters"] = self.clusters
+        found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
+        rows_of = self.history.to_dict("records")
+        # what was not measured at an evaluation is not there
+        history = [{key: v for key, v in row.items() if v == v} for row in rows_of]
+        return {**found, "paths": paths, "history": history}
+
+    def __repr__(self) -> str:
+        lines = self.summary().splitlines()
+        return "\n".join([f"{self.name}, calibrated", *(f"  {line}" for line in lines)])
+
+    def _repr_html_(self) -> str:
+        lines = [line for line in self.summary().splitlines() if line.startswith("cost")]
+        shown = self.parameters[["estimate", "lower", "upper", "unit"]]
+        if self.clusters is None:
+            shown = shown[["estimate", "unit"]]
+        table = shown.to_html(float_format="{:.4g}".format, na_rep="–", border=0)
+        rows = _rows(self.parameters).items()
+        notes = [f"{name}: {_remark(row)}" for name, row in rows if _remark(row)]
+        words = [f"{self.name}, calibrated", *lines]
+        foot = "".join(f"<p>{escape(note)}</p>" for note in notes)
+        return "<p>" + "<br>".join(map(escape, words)) + f"</p>{table}{foot}"
+
+
+def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
+    """What a training came to, when it has ended.
+
+    Args:
+        trainer: its loader's sequences are those of ``store``.
+        seconds: that it took.
+    """
+    history, checkpoint = trainer.history, trainer.best_checkpoint()
+    first = history[0]
+    best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
+    model = copy.deepcopy(trainer.model).cpu()
+    model.load_state_dict(checkpoint.model)
+    found = _intervals(trainer, model, store)
+    known = found.get("parameters", {})
+    # an epoch of an older checkpoint that was resumed may know its parameters by other names
+    rows = {
+        name: _row(best[f"parameters/{name}"], unit, known.get(name))
+        for name, (_, unit) in model.physical().items()
+        if f"parameters/{name}" in best
+    }
+    columns = ["estimate", "lower", "upper", "unit", "at_bound", "identified"]
+    correlation = found.get("correlation")
+    return Calibration(
+        model=model,
+        parameters=pd.DataFrame.from_dict(rows, orient="index", columns=columns),
+        correlation=None if correlation is None else pd.DataFrame.from_dict(correlation, "index"),
+        clusters=found.get("clusters"),
+        cost=best["cost/train"],
+        cost_start=first["cost/train"],
+        cost_heldout=best.get("cost/heldout", float("nan")),
+        heldout_start=first.get("cost/heldout", float("nan")),
+        cost_unit=trainer.options.cost.unit,
+        epoch=trainer.best_epoch,
+        n_iter=trainer.epoch,
+        history=pd.DataFrame(history),
+        uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
+        seconds=seconds,
+        checkpoint=checkpoint,
+    )
+
+
+def _intervals(trainer: Trainer, model: System, store: Source) -> dict[str, Any]:
+    """Intervals of the best parameters, of models that have exact tangents; otherwise none."""
+    if not isinstance(trainer.optimizer, GaussNewton):
+        return {}
+    # compiled code takes a second to import
+    from nnode.calibrate.gauss_newton import TangentCost
+    from nnode.calibrate.intervals import intervals
+    from nnode.solvers.fused import FusedSolver
+
+    assert isinstance(trainer.solver, FusedSolver)
+    places = {entry["name"]: i for i, entry in enumerate(store.index)}
+    indices = [places[name] for name in trainer.provenance.split["train"]]
+    (batch,) = stream(straight_loader(store, indices, 0))
+    double = copy.deepcopy(model).double()
+    cost = TangentCost(double, batch, trainer.solver, trainer.options.cost)
+    return intervals(cost, cost.row(double), clusters(store.index)[indices])
+
+
+def _row(value: float, unit: str, known: dict[str, Any] | None) -> tuple[Any, ...]:
+    """A line of the table of parameters."""
+    own = {"low": None, "high": None, "at_bound": None, "identified": None, **(known or {})}
+    ends = [float("nan") if own[end] is None else own[end] for end in ("low", "high")]
+    return value, *ends, unit, own["at_bound"] or "", own["identified"]
+
+
+def _rows(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """A table's rows by name."""
+    columns = [str(name) for name in table]
+    values = zip(*(table[name].to_list() for name in table), strict=True)
+    return {
+        str(name): dict(zip(columns, row, strict=True))
+        for name, row in zip(table.index, values, strict=True)
+    }
+
+
+def _remark(row: dict[str, Any]) -> str:
+    """What is wrong with an estimate."""
+    if row["at_bound"]:
+        return f"at the {_BOUND[row['at_bound']]} bound of what is admissible"
+    return "" if row["identified"] in (None, True) else "not identified by these data"
+
+
+def _words(row: dict[str, Any]) -> str:
+    """An estimate with its interval, and what is wrong with it."""
+    text = f"{row['estimate']:.4g} {row['unit']}"
+    if np.isfinite(row["lower"]):
+        text += f"  [{row['lower']:.4g}, {row['upper']:.4g}]"
+    remark = _remark(row)
+    return f"{text}, {remark}" if remark else text
+
+
+def _as_json(row: dict[str, Any]) -> dict[str, Any]:
+    found = {"low": _number(row["lower"]), "high": _number(row["upper"])}
+    found |= {"value": row["estimate"], "unit": row["unit"]}
+    if row["identified"] is not None:
+        found |= {"at_bound": row["at_bound"] or None, "identified": row["identified"]}
+    return found
+
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and np.isfinite(value) else None

@@ -1,0 +1,22 @@
+"""A run's results in the formats of other programs.
+
+Examples:
+  # all that fit the run's model
+  python scripts/export.py run=RUN
+  # the social force's parameters for JuPedSim, a law's for SUMO
+  python scripts/export.py run=RUN to=jupedsim
+  python scripts/export.py run=RUN 'to=[pedpy,parquet]' trajectories=simulated part=heldout
+
+Results: the files, and what of the model has no counterpart there; docs/exchange.md. Data are those
+of the run where none are chosen.
+"""
+
+from __future__ import annotations
+
+from nnode.app.cli.run import run
+from nnode.app.export import export, groups_of_run
+
+
+def main() -> None:
+    """Run this command on the options of the command line."""
+    run("export", export, groups_of_run)

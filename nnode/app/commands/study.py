@@ -1,0 +1,23 @@
+"""Redo the paper's studies on the real recordings; ends with one page beside its printed numbers.
+
+Examples:
+  python scripts/study.py study=traffic
+  # shows within a minute that all works; no figures to cite
+  python scripts/study.py study=crowd study.quick=true
+  # pairs and platoons that the study cannot download: a folder with ngsim_pairs, openacc, tgsim
+  NNODE_DATA=FOLDER python scripts/study.py study=following
+  python scripts/study.py study=traffic study.workers=8 hydra.run.dir=runs/study/mine
+
+Results: study.html, the same in Markdown, and a CSV of every table and of all parameters. The same
+command goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+from nnode.app.cli.run import run
+from nnode.app.study import study
+
+
+def main() -> None:
+    """Run this command on the options of the command line."""
+    run("study", study)

@@ -1,0 +1,33 @@
+"""Calibrate a model to measured trajectories.
+
+Examples:
+  # one recording of the paper's, its four-neuron network
+  python scripts/train.py model=n4 data=esimas data.recording=1-1_1
+  # compiled kernels and L-BFGS: a hundred times faster
+  python scripts/train.py model=lin data=esimas solver=fused optimizer=lbfgs
+  # the field's laws, by Gauss and Newton's method on exact tangents
+  python scripts/train.py model=idm data=ngsim_pairs trainer.cost=spacing
+  # your own table: columns sequence, time, agent, x; in SI units
+  python scripts/train.py model=lin data=table data.path=mine.csv data.domain=traffic
+  # sweeps: every model with every seed, one after the other, or on all cores
+  python scripts/train.py -m model=lin,log,n2 seed=1,2,3
+  python scripts/train.py -m hydra/launcher=cores model=lin,log,n2
+  # mini-batches shared by two processes
+  torchrun --nproc-per-node=2 scripts/train.py model=n4 data=esimas data.recording=1-1_1
+  # go on with a run that was stopped
+  python scripts/train.py resume=RUN/checkpoints/last.pt hydra.run.dir=RUN
+
+Results: result.json, checkpoints/best.pt and last.pt, and curves for TensorBoard. A sweep ends
+with sweep.csv. Ctrl-C saves, and says how to go on.
+"""
+
+from __future__ import annotations
+
+from nnode.app.cli.run import run
+from nnode.app.cli.saved import train_groups
+from nnode.app.train import train
+
+
+def main() -> None:
+    """Run this command on the options of the command line."""
+    run("train", train, train_groups, parallel=True)

@@ -1,0 +1,289 @@
+"""Calibrate in Python: an estimator as scikit-learn's are, which is not needed for it."""
+
+from __future__ import annotations
+
+import copy
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as ListLike
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from html import escape
+from pathlib import Path
+from typing import Any, Self
+
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.app.calibration import Calibration, calibrated
+from nnode.app.python_inputs import choice, data_of, model_options, sequences
+from nnode.app.training import build_solver, check, model_of, set_threads, trainer_of
+from nnode.calibrate.options import Device
+from nnode.data.sequences import Sequences
+from nnode.errors import ConfigError, NotFittedError
+from nnode.exchange.trajectories import simulated
+from nnode.models import System
+from nnode.models.build import add_effects
+from nnode.models.field import FIELD
+from nnode.solvers import Solver
+
+#: Sequences that are simulated at once.
+_TOGETHER = 32
+
+
+@dataclass(eq=False, repr=False)
+class Calibrator:
+    """Calibrates a model to trajectories; scikit-learn's conventions, with or without it.
+
+    A sample is a sequence: what is fitted, predicted and scored is a tidy table, or
+    :func:`nnode.sequences` of one, which scikit-learn's splitters can divide:
+    ``cross_val_score(Calibrator("idm"), X, groups=X.groups, cv=GroupKFold(5))``. All work is done
+    on the CPU; the command can take a GPU.
+
+    Args:
+        model: a name as in ``conf/model``; options with their ``term``; or a
+            :class:`nnode.models.System`, which is copied.
+        effects: beside it, names or ``{"name": ..., parameter: value}``.
+        leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
+        cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
+        optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the
+            command does, Gauss and Newton's method for the field's laws, else L-BFGS (where the
+            command has the paper's stochastic descent).
+        solver: ``fused`` (compiled) or ``torchdiffeq``; None: fused.
+        method: of stepping; None: the solver's choice.
+        dt: s, step; None: the solver's choice.
+        epochs: at most; methods that end by themselves do.
+        heldout: share of the sequences of a fit that it does not see, to watch their cost.
+        seed: of start values, of the order of mini-batches and of the division.
+
+    Attributes:
+        result_: the whole :class:`nnode.app.calibration.Calibration`.
+        model_: the calibrated model, a torch module.
+        parameters_: data frame with ``estimate``, ``lower``, ``upper`` and ``unit``.
+        cost_: mean cost of a training sequence.
+        n_iter_: epochs that were done.
+        history_: data frame, a row per evaluation.
+    """
+
+    model: str | Mapping[str, Any] | System = "idm"
+    effects: ListLike[str | Mapping[str, Any]] = ()
+    leader: str | None = None
+    cost: str = "integral"
+    optimizer: str | Mapping[str, Any] | None = None
+    solver: str | None = None
+    method: str | None = None
+    dt: float | None = None
+    epochs: int = 200
+    heldout: float = 0.0
+    seed: int = 0
+
+    def fit(self, X: Any, y: object = None, groups: object = None) -> Self:
+        """Calibrate.
+
+        Args:
+            X: a data frame or the path of a table, :func:`nnode.sequences`, or a list of
+                :class:`nnode.data.sequence.Sequence`.
+            y: not used.
+            groups: not used; clusters are found from who is in the sequences.
+
+        Raises:
+            NNodeError: a table, a model or options that do not fit; the message says what to do.
+        """
+        given = Sequences.of(X)
+        config = self._config(given)
+        check(config)
+        with _threads():
+            model = self._built(config, given)
+            solver = build_solver(OmegaConf.to_object(config.solver))  # type: ignore[arg-type]
+            plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
+            assert isinstance(plain, dict)
+            told = {str(key): value for key, value in plain.items()}
+            trainer = trainer_of(config, model, solver, given, plain=told)
+            start = time.monotonic()
+            trainer.fit()
+            self.result_: Calibration = calibrated(trainer, given, time.monotonic() - start)
+        self._solver: Solver = solver
+        self.model_: System = self.result_.model
+        self.parameters_: pd.DataFrame = self.result_.parameters
+        self.cost_: float = self.result_.cost
+        self.n_iter_: int = self.result_.n_iter
+        self.history_: pd.DataFrame = self.result_.history
+        return self
+
+    def predict(self, X: Any) -> Sequences:
+        """Simulate every sequence from its measured start.
+
+        Returns:
+            The simulated trajectories, at the times and of the agents of ``X``;
+            ``.to_dataframe()`` is their tidy table with the keys of the one that was given.
+
+        Raises:
+            NotFittedError: before :meth:`fit`.
+            NNodeError: a table that does not fit, or a simulation that blows up.
+        """
+        if not hasattr(self, "result_"):
+            raise _unfitted()
+        given, model, solver = Sequences.of(X), self.model_, self._solver
+        dtype = next(model.parameters()).dtype
+        with _threads():
+            set_threads(None, model.domain)
+            items = simulated(lambda b: solver(model, b), given, size=_TOGETHER, dtype=dtype)
+            return Sequences(items, {"simulated": self.result_.name})
+
+    def score(self, X: Any, y: object = None) -> float:
+        """Minus the root mean square distance (m) of simulated from measured positions.
+
+        Over all agents and samples after the first, as ``nnode evaluate`` prints it; higher is
+        better. A leader that drives as it was measured counts, without error.
+        """
+        given = Sequences.of(X)
+        return self.predict(given).score(given)
+
+    # -- what scikit-learn asks of an estimator ------------------------------------------------
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """The arguments of the constructor by name; ``deep`` changes nothing."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def set_params(self, **params: Any) -> Self:
+        """Change arguments of the constructor.
+
+        Raises:
+            ConfigError: one that there is not.
+        """
+        known = list(self.get_params())
+        for name, value in params.items():
+            if name not in known:
+                near = get_close_matches(name, known, n=1)
+                hint = f"; did you mean {near[0]}?" if near else ""
+                raise ConfigError(
+                    f"a Calibrator has no parameter {name}, it has {', '.join(known)}{hint}"
+                )
+            setattr(self, name, value)
+        return self
+
+    def __sklearn_tags__(self) -> Any:
+        from sklearn.utils import InputTags, Tags, TargetTags
+
+        return Tags(
+            estimator_type=None,
+            target_tags=TargetTags(required=False),
+            input_tags=InputTags(two_d_array=False),
+            no_validation=True,
+        )
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "result_")
+
+    def __repr__(self) -> str:
+        usual = {field.name: field.default for field in fields(self)}
+        changed = {
+            k: v for k, v in self.get_params().items() if v is not usual[k] and v != usual[k]
+        }
+        return f"Calibrator({', '.join(f'{k}={v!r}' for k, v in changed.items())})"
+
+    def _repr_html_(self) -> str:
+        head = f"<p><code>{escape(repr(self))}</code></p>"
+        return head + (self.result_._repr_html_() if hasattr(self, "result_") else "")
+
+    # -- from arguments to a configuration -----------------------------------------------------
+
+    def _config(self, given: Sequences) -> DictConfig:
+        """The same configuration as the command's."""
+        field = isinstance(self.model, str) and self.model in FIELD
+        solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
+        optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
+        trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
+        trainer["device"] = Device.cpu.value
+        data = OmegaConf.structured(data_of(given))
+        data.split.heldout = self.heldout
+        if isinstance(self.model, System):
+            model: dict[str, Any] = {"name": type(self.model).__name__, "term": ""}
+        else:
+            model = model_options(self.model, self.leader, self.effects)
+        return OmegaConf.create(
+            {
+                "model": model,
+                "data": data,
+                "solver": solver,
+                "optimizer": optimizer,
+                "trainer": choice("trainer", trainer),
+                "seed": int(self.seed),
+                "groups": {
+                    "model": model["name"],
+                    "data": str(data.name),
+                    "solver": str(solver.name),
+                    "optimizer": str(optimizer.name),
+                },
+            }
+        )
+
+    def _built(self, config: DictConfig, given: Sequences) -> System:
+        """The model with its start values."""
+        if not isinstance(self.model, System):
+            return model_of(config)
+        model = copy.deepcopy(self.model)
+        if model.domain != given.domain:
+            raise ConfigError(
+                f"this is a {model.domain} model, and these are {given.domain} data; choose both "
+                "of one domain"
+            )
+        add_effects(model, self.effects)
+        set_threads(None, model.domain)
+        return model
+
+
+def _unfitted() -> NotFittedError:
+    """The error of what is asked too early, of scikit-learn's kind as well where that is loaded."""
+    theirs = sys.modules.get("sklearn.exceptions")
+    kinds = (NotFittedError,) if theirs is None else (NotFittedError, theirs.NotFittedError)
+    error: NotFittedError = type("NotFittedError", kinds, {})(
+        "this Calibrator is not fitted yet; call fit(table) first"
+    )
+    return error
+
+
+@contextmanager
+def _threads() -> Iterator[None]:
+    """Give torch its threads back at the end."""
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def fit(
+    data: pd.DataFrame | str | Path,
+    domain: str | None = None,
+    *,
+    model: str | Mapping[str, Any] | System = "lin",
+    walls: str | Path | None = None,
+    leader: str | None = None,
+    epochs: int = 100,
+    heldout: float = 0.2,
+    seed: int = 0,
+) -> Calibration:
+    """Calibrate a model to a table in one call: :class:`Calibrator`, without the estimator.
+
+    Args:
+        data: CSV or Parquet, or a data frame, with ``sequence, time, agent, x`` and, where they
+            exist, ``y`` and more, SI units; see ``docs/data.md``.
+        domain: ``traffic`` or ``crowd``; None: as the columns show.
+        walls: CSV with x1, y1, x2, y2, m.
+        model: see :class:`Calibrator`, as for the following.
+        leader: what the first vehicle does.
+        epochs: at most.
+        heldout: share of the sequences that the calibration does not see.
+        seed: of start values and of the division.
+
+    Raises:
+        NNodeError: a table, a model or options that do not fit; the message says what to do.
+    """
+    options = {"domain": domain, "walls": None if walls is None else str(walls)}
+    given = sequences(data, **{key: value for key, value in options.items() if value is not None})
+    calibrator = Calibrator(model, leader=leader, epochs=epochs, heldout=heldout, seed=seed)
+    return calibrator.fit(given).result_

@@ -1,0 +1,227 @@
+"""From options to a training: what the command and :class:`nnode.Calibrator` both put together."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch.utils.data import DataLoader
+
+from nnode.calibrate.checkpoint import Checkpoint
+from nnode.calibrate.distributed import World
+from nnode.calibrate.evaluate import best_common_speed
+from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
+from nnode.calibrate.options import (
+    FusedOptions,
+    SolverOptions,
+    TorchdiffeqOptions,
+    TrainerOptions,
+)
+from nnode.calibrate.trainer import Provenance, Trainer
+from nnode.data.dataset import SequenceDataset, Source, make_loader
+from nnode.data.options import DataOptions, LoaderOptions
+from nnode.data.sequence import Batch
+from nnode.data.split import Split, split
+from nnode.errors import ConfigError
+from nnode.models import InteractionForce, System, build_model
+from nnode.plots import force_figure
+from nnode.solvers import Solver, TorchdiffeqSolver, substeps
+
+log = logging.getLogger(__name__)
+
+#: Parts of a split, as checkpoints name them.
+PARTS = ("train", "heldout", "dropped")
+
+
+def build_solver(options: SolverOptions, device: torch.device | None = None) -> Solver:
+    """The solver that the options describe.
+
+    Raises:
+        ConfigError: unknown options, or a compiled solver asked to work on a GPU.
+    """
+    if isinstance(options, FusedOptions):
+        if device is not None and device.type != "cpu":
+            raise ConfigError(
+                f"solver=fused works on the CPU, the device is {device}; set the device to cpu, "
+                "or take solver=torchdiffeq"
+            )
+        from nnode.solvers import FusedSolver  # loads Numba, which takes a second
+
+        return FusedSolver(options.dt, options.threads, options.cutoff, options.cutoff_error)
+    assert isinstance(options, TorchdiffeqOptions)
+    return TorchdiffeqSolver(
+        options.method, options.gradient.value, options.dt, options.rtol, options.atol
+    )
+
+
+def stream(
+    loader: DataLoader[Any],
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Iterator[Batch]:
+    """The mini-batches of a loader, in the precision and on the device asked for."""
+    return (batch.to(device, dtype) for batch in loader)
+
+
+def straight_loader(
+    store: Source, indices: list[int], size: int, world: World | None = None
+) -> DataLoader[Any]:
+    """A loader that visits sequences in order; this process's shares where a world is given."""
+    options = LoaderOptions(batch_size=size, shuffle=False)
+    rank, number = (world.rank, world.size) if world else (0, 1)
+    return make_loader(SequenceDataset(store, indices), options, seed=0, rank=rank, size=number)
+
+
+def set_threads(threads: int | None, domain: str) -> None:
+    """Torch's threads; by default one for traffic, whose tensors are too small to share."""
+    if threads is not None and threads < 1:
+        raise ConfigError(f"trainer.threads={threads} must be at least 1, or null")
+    if threads is not None or domain == "traffic":
+        torch.set_num_threads(threads or 1)
+
+
+def check(config: DictConfig) -> None:
+    """Refuse options of the trainer that are out of their range.
+
+    Raises:
+        ConfigError: with the option.
+    """
+    trainer = config.trainer
+    for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
+        if trainer[name] < low:
+            raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}")
+    if trainer.save_every < 0:
+        raise ConfigError(f"trainer.save_every={trainer.save_every} must be at least 0 s")
+    if trainer.patience is not None and trainer.patience < 1:
+        raise ConfigError(f"trainer.patience={trainer.patience} must be at least 1, or null")
+
+
+def model_of(config: DictConfig) -> System:
+    """The model, if it is of the data's domain; torch's threads are set for it."""
+    model = build_model(config.model, int(config.seed), getattr(torch, config.trainer.dtype.value))
+    domain = str(config.data.domain)
+    if domain in ("traffic", "crowd") and domain != model.domain:
+        raise ConfigError(
+            f"model={config.model.name} is a {model.domain} model, data={config.data.name} are "
+            f"{domain} data; choose both of one domain"
+        )
+    set_threads(config.trainer.threads, domain)
+    return model
+
+
+def trainer_of(
+    config: DictConfig,
+    model: System,
+    solver: Solver,
+    store: Source,
+    *,
+    plain: dict[str, Any],
+    folder: Path | None = None,
+    checkpoint: Checkpoint | None = None,
+    world: World | None = None,
+) -> Trainer:
+    """A trainer of a model on some sequences.
+
+    Args:
+        config: ``data``, ``optimizer``, ``trainer`` and ``seed`` are read.
+        model, solver: see :class:`nnode.calibrate.trainer.Trainer`.
+        store: the sequences, on the disk or in memory.
+        plain: the configuration as checkpoints hold it.
+        folder: receives checkpoints and curves; None: nothing is written.
+        checkpoint: of a run that is gone on with; its division of the data is kept.
+        world: the processes that train together.
+
+    Raises:
+        NNodeError: data that are not those of the checkpoint, or options that do not fit.
+    """
+    world = world or World()
+    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
+    optimizer_options: Any = OmegaConf.to_object(config.optimizer)
+    if needs_full_batch(optimizer_options.name):
+        data.loader.batch_size = 0
+    seed = int(config.seed)
+    _check_same_data(store, checkpoint)
+    parts = _parts(store, data, checkpoint)
+    loader = make_loader(
+        SequenceDataset(store, parts.train),
+        data.loader,
+        seed=seed,
+        rank=world.rank,
+        size=world.size,
+    )
+    heldout = (
+        straight_loader(store, parts.heldout, data.loader.batch_size, world)
+        if parts.heldout
+        else None
+    )
+    n = substeps(store[0].dt, config.solver.dt, model)
+    log.info(
+        "%s: %d sequences train, %d held out, %d dropped between; %d steps per sample",
+        data.name, len(parts.train), len(parts.heldout), len(parts.dropped), n,
+    )  # fmt: skip
+    free_speed = None
+    if model.domain == "traffic" and world.first:
+        free_speed = best_common_speed(
+            stream(straight_loader(store, parts.train, data.loader.batch_size))
+        )
+    names = [entry["name"] for entry in store.index]
+    return Trainer(
+        model,
+        solver,
+        build_optimizer(model, optimizer_options, seed),
+        loader,
+        heldout,
+        options,
+        folder,
+        Provenance(
+            config=plain,
+            manifest=brief(store.manifest),
+            split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in PARTS},
+            free_speed=free_speed,
+        ),
+        # a law of people of one's own has no force that could be drawn by itself
+        None if model.domain == "crowd" and model.find(InteractionForce) is None else force_figure,
+        world,
+    )
+
+
+def brief(manifest: dict[str, Any]) -> dict[str, Any]:
+    """A manifest without its long lists, small enough to travel in every checkpoint."""
+    return {
+        key: value
+        for key, value in manifest.items()
+        if not isinstance(value, list) or len(value) <= 50
+    }
+
+
+def source_hashes(manifest: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of every raw file that a data set was prepared from."""
+    return {name: file["sha256"] for name, file in manifest.get("files", {}).items()}
+
+
+def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> Split:
+    """Which sequences train; a resumed run keeps what its checkpoint trained on and held out."""
+    places = {entry["name"]: i for i, entry in enumerate(store.index)}
+    known = {} if checkpoint is None else checkpoint.split
+    if not known or not {name for names in known.values() for name in names} <= set(places):
+        return split(store, data.split)
+    train, heldout, dropped = (
+        sorted(places[name] for name in known.get(part, [])) for part in PARTS
+    )
+    return Split(train=train, heldout=heldout, dropped=dropped, mode="checkpoint", note="as it was")
+
+
+def _check_same_data(store: Source, checkpoint: Checkpoint | None) -> None:
+    if checkpoint is None:
+        return
+    if source_hashes(store.manifest) != source_hashes(checkpoint.manifest):
+        raise ConfigError(
+            "the data are not those of the checkpoint: the hashes of the source files differ; "
+            "point data.source= at the files it was trained on"
+        )

@@ -1,0 +1,274 @@
+"""Sequences in memory: a list to index, divide and look at, measured or simulated."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Sequence as ListLike
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+from platformdirs import user_cache_path
+
+from nnode.data._arrow import to_table
+from nnode.data.clusters import clusters, index_of
+from nnode.data.options import (
+    DataOptions,
+    LaneOptions,
+    PairOptions,
+    TableOptions,
+    VehicleTableOptions,
+)
+from nnode.data.prepare import FORMATS, judge
+from nnode.data.readers.columns import Table
+from nnode.data.readers.recordings import table_path
+from nnode.data.readers.table import TABLE, WALLS
+from nnode.data.sequence import Domain, Sequence
+from nnode.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+#: Units of the columns of :meth:`Sequences.to_dataframe`.
+UNITS = {"time": "s", "x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "length": "m"}
+
+#: Sequences that a notebook shows.
+_SHOWN = 8
+
+
+class Sequences:
+    """Measured or simulated trajectories, one :class:`Sequence` after another.
+
+    A sequence is a sample in the words of scikit-learn: ``X[3]`` is one sequence, ``X[:5]``,
+    ``X[[0, 2]]`` and ``X[mask]`` are several. :attr:`groups` are what its splitters call groups.
+
+    Args:
+        items: of one domain, with unique names.
+        manifest: where they come from.
+
+    Attributes:
+        manifest: as given.
+        index: per sequence what splits and clusters need to know, see
+            :func:`nnode.data.clusters.index_of`.
+
+    Raises:
+        DataError: no sequence, two of one name, or lanes beside crowds.
+    """
+
+    def __init__(self, items: Iterable[Sequence], manifest: Mapping[str, Any] | None = None):
+        self._items = tuple(items)
+        self.manifest = dict(manifest or {})
+        wrong = [item for item in self._items if not isinstance(item, Sequence)]
+        if wrong or not self._items:
+            what = f"an entry of type {type(wrong[0]).__name__}" if wrong else "nothing"
+            raise DataError(
+                f"expected a data frame, the path of a table, or sequences, found {what}; "
+                "nnode.sequences(table) makes them"
+            )
+        names = [item.name for item in self._items]
+        twice = sorted({name for name in names if names.count(name) > 1}) if names else []
+        if twice:
+            raise DataError(f"two sequences are named {twice[0]}; names must be unique")
+        if len({item.x.shape[2] for item in self._items}) > 1:
+            raise DataError("sequences of lanes and of crowds cannot stand in one list")
+        self.index = index_of(self._items)
+
+    @classmethod
+    def of(cls, source: Any, options: DataOptions | None = None) -> Sequences:
+        """Sequences from whatever holds them, faulty ones sorted out as the options say.
+
+        Args:
+            source: sequences; a data frame; the path of a table; None: what the options name.
+            options: of the data; by default those of the format that the columns show: a tidy
+                table (``sequence, time, agent, x``), pairs (``time, x_follower, x_leader``) or
+                vehicles (``vehicle, time, x``), all in SI units, see ``docs/data.md``.
+
+        Raises:
+            NNodeError: what is no such table; with the row, or what was expected.
+        """
+        if isinstance(source, cls):
+            return source
+        if not isinstance(source, pd.DataFrame | str | Path) and source is not None:
+            if not isinstance(source, Iterable):
+                raise DataError(
+                    f"expected a data frame, the path of a table, or sequences, found "
+                    f"{type(source).__name__}"
+                )
+            return cls(source)
+        if options is None:
+            options = seen_options(source)
+        if source is not None and not isinstance(source, pd.DataFrame):
+            if not hasattr(options, "path"):
+                raise ConfigError(f"data={options.name} is no table: leave the path out")
+            options = replace(options, path=str(Path(source).expanduser()))  # type: ignore[call-arg]
+        files = _files(options, source if isinstance(source, pd.DataFrame) else None)
+        judged = judge(options, files, FORMATS[type(options)].read(files, options))
+        return cls(judged.kept, judged.manifest)
+
+    @property
+    def domain(self) -> Domain:
+        """``traffic`` or ``crowd``."""
+        return "traffic" if self._items[0].x.shape[2] == 1 else "crowd"
+
+    @property
+    def groups(self) -> np.ndarray:
+        """``(S,)`` number of the cluster of each sequence: those that share an agent are one."""
+        return clusters(self.index)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[Sequence]:
+        return iter(self._items)
+
+    @overload
+    def __getitem__(self, key: int) -> Sequence: ...
+    @overload
+    def __getitem__(self, key: slice | ListLike[int] | np.ndarray) -> Sequences: ...
+    def __getitem__(self, key: Any) -> Sequence | Sequences:
+        if isinstance(key, int | np.integer):
+            return self._items[key]
+        if isinstance(key, slice):
+            return Sequences(self._items[key], self.manifest)
+        places = np.arange(len(self))[np.asarray(key)]
+        return Sequences((self._items[i] for i in places), self.manifest)
+
+    def score(self, measured: Any) -> float:
+        """How near these trajectories are to measured ones: minus the root mean square distance, m.
+
+        Over all agents and all samples after the first, where a simulation starts: the RMSE that
+        ``nnode evaluate`` prints, so that higher is better and 0 the best.
+
+        Args:
+            measured: sequences, or a table, with the same sequences and agents.
+
+        Raises:
+            DataError: they are others.
+        """
+        own = {item.name: item for item in self._items}
+        total, number = 0.0, 0
+        for other in Sequences.of(measured):
+            mine = own.get(other.name)
+            if mine is None or mine.x.shape != other.x.shape:
+                raise DataError(
+                    f"sequence {other.name} is not among the simulated ones, or has other agents "
+                    "or times; score what was predicted from the same table"
+                )
+            away = ((mine.x - other.x)[1:] ** 2).sum(-1)
+            total, number = total + float(away.sum()), number + away.size
+        return -float(np.sqrt(total / max(number, 1)))
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """A tidy table in SI units, one row per sequence, time and agent.
+
+        Columns are those that ``data=table`` reads, with speeds ``vx``, ``vy`` where they are
+        known. ``sequence``, ``time`` and ``agent`` are the keys of the table that was read.
+        """
+        tables = [to_table(item).to_pandas().dropna(axis=1, how="all") for item in self._items]
+        found = pd.concat(tables, ignore_index=True)
+        run = found["recording"] + "/"
+        pairs = zip(found["sequence"], run, strict=True)
+        found["sequence"] = [name.removeprefix(prefix) for name, prefix in pairs]
+        for key in ("sequence", "agent"):
+            if all(re.fullmatch(r"0|[1-9]\d{0,17}", name) for name in found[key].unique()):
+                found[key] = found[key].astype("int64")
+        goals = [key for key in found if str(key).startswith("dest_")]
+        return found.drop(columns=goals) if self.domain == "traffic" else found
+
+    def to_xarray(self) -> Dataset:
+        """Positions, and speeds where they are known, with sequence, sample and agent as axes.
+
+        Shorter sequences are filled up with NaN. Needs xarray: ``pip install 'nnode[xarray]'``.
+        """
+        from nnode.files import xarray
+
+        axes = "xy"[: self._items[0].x.shape[2]]
+        shape = (len(self), max(s.n_samples for s in self), max(s.n_agents for s in self))
+        values = {f"{kind}{axis}": np.full(shape, np.nan) for kind in ("", "v") for axis in axes}
+        time, agent = np.full(shape[:2], np.nan), np.full(shape[::2], "", dtype=object)
+        for number, s in enumerate(self._items):
+            part = (number, slice(s.n_samples), slice(s.n_agents))
+            for d, axis in enumerate(axes):
+                values[axis][part] = s.x[..., d]
+                if s.v is not None:
+                    values[f"v{axis}"][part] = s.v[..., d]
+            time[number, : s.n_samples] = s.time
+            agent[number, : s.n_agents] = s.agents or [str(i) for i in range(s.n_agents)]
+        known = {key: value for key, value in values.items() if np.isfinite(value).any()}
+        dims = ("sequence", "sample", "place")
+        return xarray().Dataset(
+            {key: (dims, value, {"units": UNITS[key]}) for key, value in known.items()},
+            coords={
+                "sequence": [s.name for s in self._items],
+                "time": (dims[:2], time, {"units": "s"}),
+                "agent": (dims[::2], agent),
+            },
+        )
+
+    def _about(self) -> str:
+        number = int(self.groups.max()) + 1
+        kind = "vehicles in lanes" if self.domain == "traffic" else "people"
+        return (
+            f"{len(self)} sequence{'s' * (len(self) > 1)} of {kind}, {number} "
+            f"cluster{'s' * (number > 1)} of those that share an agent"
+        )
+
+    def __repr__(self) -> str:
+        return f"<nnode.Sequences: {self._about()}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (s.name, s.n_agents, s.n_samples, s.dt, s.time[0], s.time[-1])
+            for s in self._items[:_SHOWN]
+        ]
+        heads = ["sequence", "agents", "samples", "step (s)", "from (s)", "to (s)"]
+        table = pd.DataFrame(rows, columns=heads).to_html(index=False, border=0)
+        more = f"<p>and {len(self) - _SHOWN} more</p>" if len(self) > _SHOWN else ""
+        return f"<p>{escape(self._about())}</p>{table}{more}"
+
+
+def columns(source: pd.DataFrame | str | Path) -> set[str]:
+    """Names of a table's columns."""
+    if isinstance(source, pd.DataFrame):
+        return {str(name).strip() for name in source.columns}
+    path = Path(source).expanduser()
+    if path.suffix.lower() in (".parquet", ".pq") and path.is_file():
+        return set(pq.read_schema(path).names)
+    return {str(name).strip() for name in Table(path).frame.columns}
+
+
+def seen_options(source: pd.DataFrame | str | Path | None) -> DataOptions:
+    """Options of the format that the columns of a table show; a tidy one where none is seen."""
+    if source is None:
+        raise ConfigError("there is no table: give one, or name a data set, as in data='esimas'")
+    names = columns(source)
+    if {"x_follower", "x_leader"} <= names:
+        return PairOptions(path="")
+    if "vehicle" in names and "sequence" not in names:
+        return VehicleTableOptions(path="")
+    return TableOptions(domain="crowd" if "y" in names else "traffic", path="")
+
+
+def _files(options: DataOptions, frame: pd.DataFrame | None) -> dict[str, Any]:
+    """What a format reads: files, or a table in memory."""
+    if frame is None:
+        cache = str(user_cache_path("nnode") / "raw")
+        return FORMATS[type(options)].files(replace(options, download=options.download or cache))
+    table = Table(frame)
+    if isinstance(options, TableOptions):
+        walls = options.walls
+        return {TABLE: table} | (
+            {} if walls is None else {WALLS: table_path(options, "walls", walls)}
+        )
+    if type(options) is VehicleTableOptions or isinstance(options, PairOptions):
+        return {table.path.stem: table}
+    kind = "lanes of another program" if isinstance(options, LaneOptions) else "files"
+    raise ConfigError(
+        f"data={options.name} are {kind} and no data frame; give their path, or rename the columns "
+        "and take data='table', 'pairs' or 'vehicles'"
+    )

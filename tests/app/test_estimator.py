@@ -1,0 +1,243 @@
+"""Calibrating in Python: what is found, what is said of it, and that the command finds the same."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import nnode
+from nnode.app.python_inputs import named
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.evaluate import evaluate
+from nnode.data.sequence import collate
+from nnode.errors import ConfigError, DataError, NotFittedError
+from nnode.models import Linear, Traffic
+from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
+from tests.app.conftest import Script
+from tests.app.following import TRUE, pairs, table
+
+
+@pytest.fixture(scope="module")
+def tidy() -> pd.DataFrame:
+    return table(platoons=5, seconds=8.0)
+
+
+@pytest.fixture(scope="module")
+def fitted(tidy: pd.DataFrame) -> nnode.Calibrator:
+    return nnode.Calibrator("lin", leader="measured", epochs=4).fit(tidy)
+
+
+def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
+    found = nnode.Calibrator("idm").fit(pairs(number=6, seconds=30.0))
+    for name, value in TRUE.items():
+        row = found.parameters_.loc[f"idm.{name}"]
+        assert row["estimate"] == pytest.approx(value, rel=1e-4)
+        assert row["lower"] <= value * (1 + 1e-4)
+        assert row["upper"] >= value * (1 - 1e-4)
+    assert found.parameters_.unit["idm.T"] == "s"
+    assert found.result_.clusters == 6
+    assert found.score(pairs(number=2, seconds=20.0, seed=5)) == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "options"),
+    [
+        ({"model": "idm"}, ["model=idm"]),
+        (
+            {"model": "lin", "optimizer": "adadelta", "solver": "torchdiffeq", "epochs": 2,
+             "dt": 0.05, "effects": ["relative_speed"]},
+            ["model=lin", "solver.dt=0.05", "trainer.max_epochs=2",
+             "model.effects=[relative_speed]"],
+        ),
+        (
+            {"model": "ovm", "optimizer": "lbfgs", "cost": "gap", "epochs": 3},
+            ["model=ovm", "optimizer=lbfgs", "trainer.cost=gap", "trainer.max_epochs=3"],
+        ),
+    ],
+    ids=["idm", "lin", "ovm"],
+)  # fmt: skip
+def test_the_command_finds_the_same_to_the_last_digits(
+    script: Script, tmp_path: Path, tidy: pd.DataFrame, given: dict[str, Any], options: list[str]
+) -> None:
+    tidy.to_parquet(tmp_path / "table.parquet")
+    done = script(
+        "train", *options, "data=table", f"data.path={tmp_path / 'table.parquet'}",
+        "data.domain=traffic", "seed=3", f"hydra.run.dir={tmp_path}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    written = json.loads((tmp_path / "result.json").read_text())
+    found = nnode.Calibrator(**given, heldout=0.2, seed=3).fit(tidy)
+    ours = found.result_.plain(written["paths"])
+    assert set(ours) == set(written)
+    del ours["summary"]["seconds"], written["summary"]["seconds"]
+    assert _numbers(ours) == pytest.approx(_numbers(written), rel=1e-12, abs=0, nan_ok=True)
+    assert found.cost_ == pytest.approx(written["summary"]["cost_train"], rel=1e-12)
+    assert found.n_iter_ == written["history"][-1]["epoch"]
+    assert found.result_.summary() in done.stdout
+
+
+def _numbers(value: Any, name: str = "") -> dict[str, float]:
+    """All numbers of nested mappings and lists, by where they stand."""
+    if isinstance(value, dict):
+        return {
+            k: v for key, item in value.items() for k, v in _numbers(item, f"{name}/{key}").items()
+        }
+    if isinstance(value, list):
+        return {
+            k: v for i, item in enumerate(value) for k, v in _numbers(item, f"{name}/{i}").items()
+        }
+    return {name: float(value)} if isinstance(value, int | float) else {}
+
+
+def test_a_prediction_has_the_keys_of_its_table(
+    tidy: pd.DataFrame, fitted: nnode.Calibrator
+) -> None:
+    told = fitted.predict(tidy).to_dataframe()
+    both = tidy.merge(told, on=["sequence", "time", "agent"], suffixes=("", "_simulated"))
+    assert len(both) == len(tidy) == len(told)
+    start, leader = both[both.time == 0.0], both[both.agent % 10 == 2]
+    assert (start.x == start.x_simulated).all()
+    assert (leader.x == leader.x_simulated).all()  # leader="measured"
+    assert (both.x - both.x_simulated).abs().max() > 0.1
+
+
+def test_the_score_is_the_error_that_an_evaluation_tells(
+    tidy: pd.DataFrame, fitted: nnode.Calibrator
+) -> None:
+    measured = nnode.sequences(tidy)
+    solver, model = fitted._solver, fitted.model_
+    metrics = evaluate(lambda b: solver(model, b), [collate(measured)], Convention.integral)
+    assert fitted.score(tidy) == pytest.approx(-metrics.rmse, rel=1e-9)
+    assert fitted.predict(tidy).score(tidy) == fitted.score(measured)
+    assert nnode.sequences(tidy).score(tidy) == 0.0
+    with pytest.raises(DataError, match="score what was predicted from the same table"):
+        fitted.predict(measured[:2]).score(tidy)
+
+
+def test_a_fit_leaves_its_arguments_and_torch_as_they_were(tidy: pd.DataFrame) -> None:
+    before, threads = tidy.copy(), torch.get_num_threads()
+    torch.set_num_threads(2)
+    model = Traffic([Linear(v0=30.0, L=5.0)], leader="measured").double()
+    calibrator = nnode.Calibrator(model, epochs=2)
+    assert calibrator.fit(tidy) is calibrator
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+    pd.testing.assert_frame_equal(tidy, before)
+    assert calibrator.model is model
+    assert float(model.physical()["lin.v0"][0]) == pytest.approx(30.0)
+    by_name = nnode.Calibrator("lin", leader="measured", epochs=2).fit(tidy)
+    assert calibrator.parameters_.estimate.to_dict() == by_name.parameters_.estimate.to_dict()
+    with pytest.raises(ConfigError, match="was built by hand"):
+        calibrator.result_.save("never.pt")
+
+
+def test_the_same_fit_twice_is_the_same_also_of_a_copy(
+    tidy: pd.DataFrame, fitted: nnode.Calibrator
+) -> None:
+    again = nnode.Calibrator(**fitted.get_params()).fit(list(nnode.sequences(tidy)))
+    assert again.parameters_.equals(fitted.parameters_)
+    copied = pickle.loads(pickle.dumps(fitted))
+    assert copied.score(tidy) == fitted.score(tidy)
+    assert copied.get_params() == fitted.get_params()
+
+
+def test_each_sequence_is_predicted_by_itself(tidy: pd.DataFrame, fitted: nnode.Calibrator) -> None:
+    every = nnode.sequences(tidy)
+    whole = {s.name: s.x for s in fitted.predict(every)}
+    for part in (every[[3, 1]], every[4:]):
+        for s in fitted.predict(part):
+            assert s.x == pytest.approx(whole[s.name], rel=1e-12)
+
+
+def test_results_are_shown_and_kept(
+    tidy: pd.DataFrame, fitted: nnode.Calibrator, tmp_path: Path
+) -> None:
+    run = nnode.Calibrator("idm", epochs=30).fit(tidy).result_
+    assert re.search(r"idm, calibrated\n  cost of a training sequence: .* m² s\n", repr(run))
+    assert re.search(r"<td>\d+\.\d+</td>\s*<td>s</td>", run._repr_html_())
+    assert "lower" in run._repr_html_()
+    assert "lower" not in fitted._repr_html_()  # no intervals without tangents
+    assert repr(fitted) == "Calibrator(model='lin', leader='measured', epochs=4)"
+    frame = run.to_dataframe()
+    assert list(frame.columns[:5]) == ["parameter", "estimate", "lower", "upper", "unit"]
+    curve = run.plot().axes[0].lines[0].get_xydata()
+    assert np.isfinite(np.asarray(curve)).all()
+    again = nnode.load(run.save(tmp_path / "idm.pt"))
+    for name, (value, _) in again.physical().items():
+        assert float(value) == run.parameters.estimate[name]
+
+
+def test_results_are_labelled_arrays(tidy: pd.DataFrame) -> None:
+    pytest.importorskip("xarray")
+    found = nnode.Calibrator("idm").fit(tidy)
+    told = found.result_.to_xarray()
+    assert float(told.estimate.sel(parameter="idm.T")) == found.parameters_.estimate["idm.T"]
+    own = told.correlation.sel(parameter="idm.T", other="idm.T")
+    assert float(own) == pytest.approx(1.0)
+    assert told.cost_train.sizes["epoch"] == len(found.history_)
+    paths = found.predict(tidy).to_xarray()
+    assert paths.x.dims == ("sequence", "sample", "place")
+    assert paths.x.attrs["units"] == "m"
+
+
+def test_what_is_asked_too_early_or_does_not_exist_is_refused(tidy: pd.DataFrame) -> None:
+    with pytest.raises(NotFittedError, match=r"call fit\(table\) first"):
+        nnode.Calibrator().predict(tidy)
+    for wrong, message in (
+        ({"model": "idn"}, "model=idn is unknown"),
+        ({"optimizer": "newton"}, "optimizer=newton is unknown, expected one of adadelta"),
+        ({"solver": "fast"}, "solver=fast is unknown"),
+        ({"cost": "gaps"}, "trainer: .*gaps"),
+        ({"epochs": -1}, "trainer.max_epochs=-1 must be at least 0"),
+        ({"leader": "none"}, "model: .*none"),
+        ({"model": "sf"}, "model=sf is a crowd model"),
+        ({"effects": ["inerta"]}, "did you mean inertia"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            nnode.Calibrator(**wrong).fit(tidy)
+    with pytest.raises(ConfigError, match="did you mean optimizer"):
+        nnode.Calibrator().set_params(optimiser="lbfgs")
+    with pytest.raises(DataError, match="agent"):
+        nnode.fit(tidy.drop(columns="agent"), "traffic")
+    with pytest.raises(DataError, match="row 8: column 'x' holds nothing"):
+        nnode.Calibrator().fit(tidy.assign(x=tidy.x.where(tidy.index != 7)))
+    for nothing in (3, [], np.zeros((3, 2))):
+        with pytest.raises(DataError, match="expected a data frame"):
+            nnode.Calibrator().fit(nothing)
+
+
+def test_people_are_calibrated_as_well() -> None:
+    rows = [
+        (run, 0.2 * k, f"{run}/{i}", (-1) ** i * (0.4 * k * 0.9 - 2.0 + 0.2 * run), 0.6 * i)
+        for run in range(3) for k in range(8) for i in range(3)
+    ]  # fmt: skip
+    walk = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
+    found = nnode.Calibrator("sf", epochs=2).fit(walk)
+    assert list(found.parameters_.unit) == ["N", "kg/s²", "kg/(m s)"]
+    assert found.cost_ <= found.history_["cost/train"].iloc[0]
+    assert {"x", "y", "vx", "vy"} <= set(found.predict(walk).to_dataframe())
+
+
+def test_one_call_calibrates_with_some_held_out(tidy: pd.DataFrame) -> None:
+    run = nnode.fit(tidy, "traffic", model="idm")
+    assert len(run.checkpoint.split["heldout"]) == 1
+    assert run.cost_heldout < run.heldout_start
+    assert "cost of a held-out sequence" in run.summary()
+
+
+def test_models_bear_the_names_of_the_configuration() -> None:
+    files = {p.stem for p in (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")}
+    own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
+    assert own | set(FIELD) | set(PEOPLE) == files
+    assert all(named(name)["name"] == name for name in files)
+    with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of lin, log"):
+        named("lwr")

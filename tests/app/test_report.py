@@ -1,0 +1,80 @@
+"""A diagnosis in Python is an object to look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import nnode
+from nnode.app import discover as app
+from nnode.models.extend import effects_of
+from tests.app.following import table
+from tests.discover import stand_in
+from tests.discover.platoons import platoons
+from tests.discover.recorded import lane
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> nnode.Report:
+    """Of results made by hand."""
+    monkeypatch.setattr(app, "diagnose", stand_in.diagnose)
+    return nnode.diagnose(lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3))
+
+
+def test_what_was_named_is_a_table(found: nnode.Report) -> None:
+    assert found.verdict == "named"
+    rows = found.to_dataframe()
+    assert set(rows.effect) == {effect.name for effect in [*found.effects, *found.leads]}
+    first = found.effects[0]
+    (name, value), *_ = first.coefficients.items()
+    row = rows[(rows.effect == first.name) & (rows.coefficient == name)].iloc[0]
+    assert (row.estimate, row.lower, row.upper, row.unit) == (
+        value.value, value.low, value.high, value.unit,
+    )  # fmt: skip
+    assert row.named
+    assert [effect.name for effect in effects_of(found.model)] == [e.name for e in found.effects]
+    assert found.plain()["verdict"] == "named"
+
+
+def test_a_notebook_shows_the_sentence_and_the_table(found: nnode.Report) -> None:
+    page = found._repr_html_()
+    assert "<b>named</b>: The model lin lacks" in page
+    assert f"<td>{found.effects[0].name}</td>" in page
+    assert repr(found).startswith("named: The model lin lacks")
+
+
+def test_coefficients_are_a_labelled_array(found: nnode.Report) -> None:
+    pytest.importorskip("xarray")
+    told = found.to_xarray()
+    row = found.to_dataframe().iloc[0]
+    assert float(told.estimate.sel(coefficient=f"{row.effect}.{row.coefficient}")) == row.estimate
+    assert told.attrs["verdict"] == "named"
+
+
+def test_nothing_missing_is_an_empty_table() -> None:
+    rows = [
+        (number, time, f"{number}/{i}", x)
+        for number, one in enumerate(platoons(number=14, seconds=8.0))
+        for k, time in enumerate(one.time)
+        for i, x in enumerate(one.x[k, :, 0])
+    ]
+    frame = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
+    found = nnode.diagnose(frame, "traffic", model="lin")
+    assert found.verdict == "none"
+    assert found.effects == []
+    assert found.to_dataframe().empty
+    assert "<table" not in found._repr_html_()
+
+
+@pytest.mark.usefixtures("found")
+def test_sequences_and_data_frames_are_diagnosed_alike(tmp_path: Path) -> None:
+    tidy = table(platoons=4, seconds=4.0)
+    of_frame = nnode.diagnose(tidy).plain()
+    of_sequences = nnode.diagnose(nnode.sequences(tidy, faults="keep")).plain()
+    assert of_frame["split"] == of_sequences["split"]
+    written = nnode.diagnose(tidy, folder=tmp_path / "run", options=app.DiscoverOptions(page=False))
+    assert written.plain()["split"] == of_frame["split"]
+    # a data frame is kept as a table, for the commands that the report tells
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "run" / "table.parquet"), tidy)

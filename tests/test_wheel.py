@@ -1,0 +1,201 @@
+"""The wheel works alone: built, installed into an empty environment, used far from the checkout."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+import venv
+import zipfile
+from collections.abc import Callable
+from email import message_from_string
+from pathlib import Path
+
+import pytest
+
+from tests.app.following import TRUE, pairs
+from tests.discover.platoons import platoons
+
+ROOT = Path(__file__).parents[1]
+SOURCES = ("nnode", "conf", "setup.py", "pyproject.toml", "README.md", "LICENSE")
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy, so that the checkout stays as it is."""
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            ignore = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(ROOT / name, folder / "source" / name, ignore=ignore)
+        else:
+            shutil.copy(ROOT / name, folder / "source")
+    built = subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
+         "--no-index", "--wheel-dir", str(folder), str(folder / "source")],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stdout + built.stderr
+    (found,) = folder.glob("nnode-*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def alone(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Run a program of an environment that has the wheel and, lent, what the wheel depends on."""
+    place = tmp_path_factory.mktemp("environment")
+    venv.create(place / "venv", with_pip=False)
+    python = place / "venv" / "bin" / "python"
+    lent = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
+    (site,) = (place / "venv" / "lib").glob("python*/site-packages")
+    # of a folder that is named in such a file no .pth file is read, so that no checkout is lent
+    (site / "lent.pth").write_text("\n".join(lent))
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps",
+         "--no-index", "--ignore-installed", str(wheel)],
+        cwd=place, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    work = place / "work"
+    work.mkdir()
+
+    def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [str(python.parent / program), *arguments], cwd=work, capture_output=True, text=True,
+            env={**env, "OMP_NUM_THREADS": "1", "NNODE_DATA": "", "MPLBACKEND": "agg"}, check=False,
+        )  # fmt: skip
+
+    return run
+
+
+@pytest.mark.thorough
+def test_the_package_comes_from_the_wheel(alone: Run) -> None:
+    done = alone("python", "-c", "import nnode, os; print(os.getcwd(), nnode.__file__)")
+    folder, file = map(Path, done.stdout.split())
+    assert ROOT not in (*folder.parents, *file.parents)
+    assert "site-packages" in file.parts
+
+
+@pytest.mark.thorough
+def test_the_program_lists_its_commands(alone: Run) -> None:
+    done = alone("nnode", "--help")
+    assert done.returncode == 0, done.stderr
+    commands = {path.stem for path in (ROOT / "nnode" / "app" / "commands").glob("[a-z]*.py")}
+    assert set(re.findall(r"^  (\w+)  ", done.stdout, re.M)) == commands
+    assert "scripts" not in done.stdout
+    wrong = alone("nnode", "trian")
+    assert wrong.returncode == 2
+    assert "did you mean train?" in wrong.stderr
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "name", ["train", "discover", "study", "evaluate", "export", "plot_forces", "prepare_data"]
+)
+def test_a_command_takes_what_its_script_takes(alone: Run, name: str) -> None:
+    installed = alone("nnode", name, "--help")
+    assert installed.returncode == 0, installed.stderr
+    script = subprocess.run(
+        [sys.executable, f"scripts/{name}.py", "--help"], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "NNODE_DATA": ""}, check=False,
+    )  # fmt: skip
+    said = re.sub(r"python scripts/(\w+)\.py", r"nnode \1", script.stdout)
+    said = re.sub(r"(torchrun \S+) scripts/(\w+)\.py", r"\1 -m nnode \2", said)
+    assert installed.stdout == said
+
+
+@pytest.mark.thorough
+def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Run) -> None:
+    work = Path(alone("python", "-c", "import os; print(os.getcwd())").stdout.strip())
+    rows = ["sequence,time,agent,x"]
+    for number, one in enumerate(platoons(number=4, seconds=6.0)):
+        for time, places in zip(one.time, one.x[..., 0], strict=True):
+            rows += [f"{number},{time},{number}/{i},{x}" for i, x in enumerate(places.tolist())]
+    (work / "mine.csv").write_text("\n".join(rows))
+    done = alone(
+        "nnode", "train", "model=lin", "model.leader=measured", "solver=fused", "optimizer=lbfgs",
+        "data=table", "data.path=mine.csv", "data.domain=traffic", "trainer.max_epochs=3",
+        "hydra.run.dir=run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    result = json.loads((work / "run" / "result.json").read_text())
+    assert result["summary"]["cost_train"] < result["summary"]["cost_start"]
+    done = alone("nnode", "evaluate", "checkpoint=run/checkpoints/best.pt", "hydra.run.dir=e")
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((work / "e" / "metrics.json").read_text())
+    assert metrics["J"] == pytest.approx(result["summary"]["cost_heldout"], rel=1e-9)
+    done = alone(
+        "nnode", "train", "resume=run/checkpoints/last.pt", "trainer.max_epochs=5",
+        "hydra.run.dir=run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads((work / "run" / "result.json").read_text())["history"][-1]["epoch"] == 5
+
+
+#: In an environment without what is optional.
+ESTIMATOR = """
+import sys
+sys.modules.update(dict.fromkeys(("sklearn", "xarray")))
+import nnode
+import pandas as pd
+table = pd.read_csv("pairs.csv")
+one = nnode.Calibrator(model="idm").fit(table)
+print(one.parameters_.estimate["idm.T"], one.predict(table).score(table))
+try:
+    one.result_.to_xarray()
+except nnode.errors.ConfigError as error:
+    print(error)
+assert "sklearn" not in {name for name, module in sys.modules.items() if module}
+"""
+
+
+@pytest.mark.thorough
+def test_the_estimator_works_without_scikit_learn(alone: Run) -> None:
+    work = Path(alone("python", "-c", "import os; print(os.getcwd())").stdout.strip())
+    pairs(number=4, seconds=20.0).to_csv(work / "pairs.csv", index=False)
+    done = alone("python", "-c", ESTIMATOR)
+    assert done.returncode == 0, done.stderr
+    found, said = done.stdout.splitlines()
+    T, score = map(float, found.split())
+    assert pytest.approx(TRUE["T"], rel=1e-3) == T
+    assert -1e-3 < score <= 0
+    assert "pip install 'nnode[xarray]'" in said
+
+
+@pytest.mark.thorough
+def test_an_index_can_show_what_the_wheel_says_of_itself(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        told = message_from_string(archive.read(name).decode())
+        names = archive.namelist()
+    assert told["Description-Content-Type"] == "text/markdown"
+    assert told["License-Expression"] == "MIT"
+    assert told.get_all("Project-URL")
+    page = str(told.get_payload())
+    assert "# nnode" in page
+    targets = re.findall(r"\]\(([^)]+)\)", page)
+    assert [target for target in targets if not target.startswith(("https://", "#"))] == []
+    assert not [n for n in names if n.startswith(("benchmarks", "scripts", "tests", "setup"))]
+    assert not [n for n in names if "benchmark" in n or "torture" in n]
+    shipped = {n for n in names if n.startswith("nnode/conf/")}
+    ours = {f"nnode/conf/{p.relative_to(ROOT / 'conf')}" for p in (ROOT / "conf").rglob("*.yaml")}
+    assert {n for n in ours if "benchmark" not in n and "torture" not in n} == shipped
+
+
+def test_pictures_and_links_lead_into_a_repository_where_it_is_known() -> None:
+    described = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")["described"]
+    text = (
+        "a [page](docs/a.md#b), [paper](https://x)\n\n![alt](docs/p.png)\n\n*What it shows.*\n\nb"
+    )
+    assert described(text, None) == "a page, [paper](https://x)\n\nb"
+    assert described(text, "https://host/us/it") == (
+        "a [page](https://host/us/it/blob/HEAD/docs/a.md#b), [paper](https://x)\n\n"
+        "![alt](https://host/us/it/raw/HEAD/docs/p.png)\n\n*What it shows.*\n\nb"
+    )
