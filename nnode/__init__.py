@@ -10,14 +10,16 @@ from nnode.version import VERSION as __version__
 if TYPE_CHECKING:
     from nnode.app.discover import diagnose_table as diagnose
     from nnode.app.notebook import fit
+    from nnode.app.replay import replay
     from nnode.calibrate.checkpoint import load
 
-__all__ = ["__version__", "diagnose", "fit", "load"]
+__all__ = ["__version__", "diagnose", "fit", "load", "replay"]
 
 #: Where each name comes from: imported on first use, a short command should not wait for torch.
 _HOMES = {
     "diagnose": ("nnode.app.discover", "diagnose_table"),
     "fit": ("nnode.app.notebook", "fit"),
+    "replay": ("nnode.app.replay", "replay"),
     "load": ("nnode.calibrate.checkpoint", "load"),
 }
 

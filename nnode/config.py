@@ -84,6 +84,7 @@ class EvaluateConfig:
     solver: Any = MISSING
     device: Device = Device.auto
     part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
+    replay: bool = True  # replay.html: measured and simulated agents side by side
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -103,12 +104,22 @@ def zones(d: Diagnosis) -> list[Zone]:
 
 
 def _zone(effect: NamedEffect) -> Zone | None:
-    """Where or when an effect acts: its interval [a, b], or around its place."""
-    at = {name: c.value for name, c in effect.coefficients.items()}
+    found = effect.coefficients
+    at = {name: c.value for name, c in found.items()}
+    return zone_of(effect.name, at, found["a"].unit if "a" in found else "")
+
+
+def zone_of(name: str, at: Mapping[str, float], unit: str) -> Zone | None:
+    """Where or when an effect acts: its interval [a, b], or around its place.
+
+    Args:
+        name: of the effect.
+        at: its parameters.
+        unit: of a and b, where it has these: m or s.
+    """
     if {"x_o", "y_o", "B_o"} <= set(at):
-        return Zone(effect.name, circle=(at["x_o"], at["y_o"], at["B_o"]))
-    if {"a", "b"} <= set(at):
+        return Zone(name, circle=(at["x_o"], at["y_o"], at["B_o"]))
+    if {"a", "b"} <= set(at) and unit in ("m", "s"):
         ends = (at["a"], at["b"])
-        unit = effect.coefficients["a"].unit
-        return Zone(effect.name, x=ends) if unit == "m" else Zone(effect.name, t=ends)
+        return Zone(name, x=ends) if unit == "m" else Zone(name, t=ends)
     return None

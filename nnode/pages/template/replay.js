@@ -274,7 +274,7 @@ class Replay {
     for (let x = Math.ceil(from / step) * step; x <= to; x += step) {
       this.line(u(x), p.top + p.high, u(x), p.top + p.high + (p.labels ? 4 : -5));
       const edge = u(x) - p.left < 14 || p.left + p.wide - u(x) < 22;
-      if (p.labels && !edge) pen.fillText(`${Number(x.toFixed(6))} m`, u(x), p.top + p.high + 15);
+      if (p.labels && !edge) pen.fillText(`${Number(x.toFixed(6))} m`.replace("-", "−"), u(x), p.top + p.high + 15);
     }
   }
 
