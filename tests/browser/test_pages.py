@@ -10,8 +10,12 @@ from typing import Any
 
 import pytest
 
+from nnode.app.check import blocks
+from nnode.data.check.examine import examine
 from nnode.discover.report.page import draw
+from nnode.pages.page import write_page
 from tests.browser.chromium import MISSING, Browser
+from tests.data.check.planted import cars, saved
 from tests.discover.conftest import Case, traffic  # noqa: F401  a fixture
 from tests.discover.report.test_page import CONFIG, with_faults
 
@@ -35,8 +39,11 @@ def pages(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     inputs, found = with_faults(traffic), deepcopy(traffic.found)
     found.diagnosis.data_faults = inputs.data_faults
     draw(inputs, found, traffic.options, CONFIG, ["python scripts/evaluate.py X"], folder)()
+    examined = examine(saved(cars(), folder))
+    write_page(blocks(examined, ["data=vehicles"]), folder, title="Check", stem="check")
     studies = {name: STUDIES / name / "study.html" for name in ("traffic", "crowd")}
-    return {"report": folder / "report.html", **studies}
+    own = {name: folder / f"{name}.html" for name in ("report", "check")}
+    return {**own, **studies}
 
 
 def opened(browser: Browser, page: Path, width: int) -> None:
@@ -48,7 +55,7 @@ def faults(browser: Browser, check: str) -> Any:
     return browser.evaluate(f"checks.{check}")
 
 
-PAGES = list(itertools.product(("report", "traffic", "crowd"), WIDTHS))
+PAGES = list(itertools.product(("report", "check", "traffic", "crowd"), WIDTHS))
 
 
 @pytest.mark.parametrize(("name", "width"), PAGES)
