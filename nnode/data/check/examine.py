@@ -104,7 +104,7 @@ def _native(raw: Raw) -> Examination:
     """A format whose reader knows its units."""
     source = source_of(raw)
     sequences = _read(source)
-    tracks = tracks_from(sequences)
+    tracks = tracks_from(sequences, cut=raw.native in _CUT)
     domain: Domain = "crowd" if tracks.x.shape[1] == 2 else "traffic"
     known = medians(tracks, domain)
     scale = replace(_SI, domain=domain)

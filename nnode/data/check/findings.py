@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -23,6 +24,8 @@ FRICTION = 9.81
 EDGE = 0.1
 #: Share of agents from which on something is told of all.
 FEW = 0.02
+#: Jumps at one time among which swaps are looked for.
+SOME = 30
 #: A step longer than so many usual ones is a hole.
 HOLE = 1.5
 
@@ -168,20 +171,11 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
 
 
 def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
-    """Speeds and accelerations over a second that nobody can have (m, s)."""
-    lag = max(1, round(1.0 / tracks.dt)) if tracks.dt > 0 else 1
-    moves = tracks.moves(lag)
-    limit = LIMITS[domain].max_speed
+    """Steps, and accelerations over a second, that nobody can have (m, s)."""
+    yield from _jumps(tracks, domain)
+    moves = tracks.moves(max(1, round(1.0 / tracks.dt)) if tracks.dt > 0 else 1)
     if not len(moves):
         return
-    fast = moves.size / moves.took > limit
-    if fast.any():
-        who = sorted({tracks.names[i] for i in tracks.agent[moves.first[fast]]})
-        yield Finding(
-            "speed", "error" if fast.mean() > 0.001 else "warning",
-            f"{fast.sum()} of {len(moves)} displacements are faster than {limit:g} m/s, of "
-            f"{_some(who)}: jumps, or identifiers that change hands",
-        )  # fmt: skip
     v = (tracks.x[moves.last] - tracks.x[moves.first]) / moves.took[:, None]
     # the next second of the same agent begins where this one ends
     next_ = np.searchsorted(moves.first, moves.last).clip(max=len(moves) - 1)
@@ -194,6 +188,36 @@ def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
             f"{FRICTION:g} m/s², what friction can give; 99 % are below "
             f"{np.percentile(a, 99):.3g} m/s²: the time scale or the positions are off",
         )  # fmt: skip
+
+
+def _jumps(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
+    """Steps that are too long, and pairs of agents that take each other's place in one."""
+    steps, limits = tracks.moves(1), LIMITS[domain]
+    fast = steps.size > limits.max_speed * steps.took + limits.noise
+    if not fast.any():
+        return
+    first, last = steps.first[fast], steps.last[fast]
+    reach = limits.reach + float(np.median(steps.size))
+    swaps = [
+        (i, j)
+        for at in np.unique(tracks.time[last])
+        for i, j in combinations(np.flatnonzero(tracks.time[last] == at)[:SOME], 2)
+        if np.linalg.norm(tracks.x[last[i]] - tracks.x[first[j]]) < reach
+        and np.linalg.norm(tracks.x[last[j]] - tracks.x[first[i]]) < reach
+    ]
+    who = sorted({tracks.names[i] for i in tracks.agent[first]})
+    text = (
+        f"{fast.sum()} of {len(steps)} steps are faster than {limits.max_speed:g} m/s, of "
+        f"{_some(who)}"
+    )
+    if swaps:
+        names = [tracks.names[tracks.agent[first[i]]] for i in swaps[0]]
+        text += (
+            f"; in {len(swaps)} pairs of them two agents take each other's place, first "
+            f"{names[0]} and {names[1]} at {tracks.time[last[swaps[0][0]]]:g} s: their identifiers "
+            "are swapped"
+        )
+    yield Finding("swap" if swaps else "jump", "error", text)
 
 
 def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:

@@ -23,8 +23,8 @@ from nnode.data.sequence import Domain
 
 #: Seconds by unit of time; frames last as long as their rate tells.
 TIME_UNITS = {"s": 1.0, "ms": 1e-3}
-#: Frame rates of cameras and of published files, 1/s.
-RATES = (2.5, 5.0, 10.0, 12.5, 15.0, 16.0, 20.0, 24.0, 25.0, 29.97, 30.0, 50.0, 60.0)
+#: Frame rates of cameras and of published files, 1/s, the usual ones first: they win ties.
+RATES = (25.0, 30.0, 10.0, 16.0, 15.0, 50.0, 60.0, 20.0, 24.0, 29.97, 12.5, 5.0, 2.5)
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def _times(frames: bool, rate: float | None) -> Iterator[tuple[str, float | None
     for unit in TIME_UNITS:
         yield unit, None
     if frames:
-        for each in sorted({*RATES, *([rate] if rate else [])}):
+        for each in dict.fromkeys([*([rate] if rate else []), *RATES]):
             yield "frame", each
 
 

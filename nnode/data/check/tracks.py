@@ -129,14 +129,19 @@ def tracks_of(
     return Tracks(code[order], list(map(str, names)), time[order], x[order], lanes=lanes, **own)
 
 
-def tracks_from(sequences: Iterable[Sequence]) -> Tracks:
-    """Sequences that a reader made, as rows: an agent without an identifier is one of its own."""
+def tracks_from(sequences: Iterable[Sequence], *, cut: bool) -> Tracks:
+    """Sequences that a reader made, as rows: an agent without an identifier is one of its own.
+
+    Args:
+        cut: whether positions begin anew in every sequence, so that everyone in it is one's own.
+    """
     parts: list[tuple[np.ndarray, ...]] = []
     every = list(sequences)
     for s in every:
         n, k = s.n_agents, s.n_samples
-        own = s.agents or tuple(f"{s.name}:{i}" for i in range(n))
-        names = np.array([f"{s.recording} {name}" for name in own], dtype=object)
+        own = s.agents or tuple(map(str, range(n)))
+        whose = s.name if cut or not s.agents else s.recording
+        names = np.array([f"{whose} {name}" for name in own], dtype=object)
         v = np.full((k, n), np.nan) if s.v is None else np.linalg.norm(s.v, axis=2)
         long = np.full(n, np.nan) if s.length is None else s.length
         lane = np.full(k * n, s.recording, dtype=object)

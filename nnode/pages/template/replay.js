@@ -161,14 +161,14 @@ class Replay {
     const [[x0, x1], [y0, y1]] = this.scene.view.box, all = this.sources();
     // above each other or beside each other, whichever shows more, all of it on one screen
     const fit = (columns, rows) => Math.min(
-      (wide - 8 * (columns - 1)) / columns / (x1 - x0), (680 - 44 * rows) / rows / (y1 - y0));
+      (wide - 8 * (columns - 1)) / columns / (x1 - x0), (680 - 58 * rows) / rows / (y1 - y0));
     const beside = fit(all.length, 1) > fit(1, all.length);
     const scale = beside ? fit(all.length, 1) : fit(1, all.length), high = scale * (y1 - y0);
     const list = all.map((source, i) => ({
-      ...source, left: beside ? i * (scale * (x1 - x0) + 8) : 0, top: 18 + (beside ? 0 : i * (high + 44)),
+      ...source, left: beside ? i * (scale * (x1 - x0) + 8) : 0, top: beside ? 32 : 18 + i * (high + 44),
       wide: scale * (x1 - x0), high, scale, at: [x0, y1], labels: true,
     }));
-    return { list, high: beside ? high + 44 : list.length * (high + 44) };
+    return { list, high: beside ? high + 58 : list.length * (high + 44) };
   }
 
   panel(p) {
@@ -176,8 +176,11 @@ class Replay {
     const u = (x) => p.left + (x - p.at[0]) * p.scale, v = (y) => p.top + (p.at[1] - y) * p.scale;
     pen.fillStyle = "#1a1a1a";
     pen.textAlign = "left";
-    const error = p.ghost ? `: ${this.away(p.x, this.time).toFixed(2)} m away` : "";
-    pen.fillText(p.title + error.replace("NaN m away", "nobody there"), p.left + 2, p.top - 5);
+    const away = p.ghost ? this.away(p.x, this.time) : NaN;
+    const said = !p.ghost ? "" : Number.isNaN(away) ? "nobody there" : `${away.toFixed(2)} m away`;
+    // narrow panels beside each other have room for two lines
+    const lines = p.top === 32 ? [p.title, said] : ["", p.title + (said && `: ${said}`)];
+    lines.forEach((line, i) => pen.fillText(line, p.left + 2, p.top - 19 + 14 * i, p.wide - 4));
     pen.save();
     pen.beginPath();
     pen.rect(p.left, p.top, p.wide, p.high);
