@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from nnode.app.discover import diagnose_table as diagnose
     from nnode.app.estimator import Calibrator, fit
     from nnode.app.python_inputs import sequences
+    from nnode.app.replay import replay
     from nnode.app.report import Report
     from nnode.calibrate.checkpoint import load
     from nnode.data.sequence import Sequence
@@ -27,6 +28,7 @@ __all__ = [
     "diagnose",
     "fit",
     "load",
+    "replay",
     "sequences",
 ]
 
@@ -39,6 +41,7 @@ _HOMES = {
     "Sequences": ("nnode.data.sequences", "Sequences"),
     "diagnose": ("nnode.app.discover", "diagnose_table"),
     "fit": ("nnode.app.estimator", "fit"),
+    "replay": ("nnode.app.replay", "replay"),
     "load": ("nnode.calibrate.checkpoint", "load"),
     "sequences": ("nnode.app.python_inputs", "sequences"),
 }

@@ -76,6 +76,15 @@ class PrepareConfig:
 
 
 @dataclass
+class CheckConfig:
+    """``scripts/check.py``: what a file holds and what is wrong with it."""
+
+    file: str = MISSING  # CSV, text of numbers, Parquet, or any other file that docs/data.md lists
+    domain: str | None = None  # traffic | crowd; null guesses
+    frame_rate: float | None = None  # 1/s, that the file is said to have; null: as it tells
+
+
+@dataclass
 class EvaluateConfig:
     """``scripts/evaluate.py``: errors of a checkpoint beside its baselines."""
 
@@ -84,6 +93,7 @@ class EvaluateConfig:
     solver: Any = MISSING
     device: Device = Device.auto
     part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
+    replay: bool = True  # replay.html: measured and simulated agents side by side
 
 
 @dataclass
@@ -127,6 +137,7 @@ class DiscoverConfig:
 SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "train_schema"): TrainConfig,
     (None, "prepare_data_schema"): PrepareConfig,
+    (None, "check_schema"): CheckConfig,
     (None, "evaluate_schema"): EvaluateConfig,
     (None, "export_schema"): ExportConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,

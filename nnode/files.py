@@ -87,13 +87,6 @@ def write_text(path: Path, text: str) -> Path:
     return path
 
 
-def write_bytes(path: Path, content: bytes) -> Path:
-    """Write a file as it is; returns its path."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
-    return path
-
-
 def write_json(path: Path, content: dict[str, Any], indent: int | None = 2) -> Path:
     """Write JSON; NaN and infinities are kept, as Python's own reader takes them."""
     text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=True)

@@ -70,7 +70,7 @@ def diagnose_case(
         }
         table, start, failure = Path(given) / TABLE, time.monotonic(), ""
         try:
-            options = DiscoverOptions(page=False, animation=False, structure=structure)
+            options = DiscoverOptions(page=False, replay=False, structure=structure, compare=[])
             report = discover.diagnose_table(table, what.domain, **told, options=options).plain()
         except NNodeError as error:
             report, failure = {"verdict": ERROR, "effects": []}, f"{type(error).__name__}: {error}"

@@ -221,7 +221,7 @@ def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]
 
     right, table = SCENES[scene], recorded(scene, seed)
     start = time.monotonic()
-    options = DiscoverOptions(page=False, animation=False)
+    options = DiscoverOptions(page=False, replay=False)
     given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
     report = given.plain()
     nearest = report if given.nearest is None else given.nearest.plain()

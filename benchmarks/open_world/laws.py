@@ -48,7 +48,7 @@ def diagnosed_case(law: str, seed: int, asked: str, **size: Any) -> dict[str, An
 
     table, parameters = measured(LawCase(law, seed, **size))
     start = time.monotonic()
-    options = DiscoverOptions(page=False, animation=False)
+    options = DiscoverOptions(page=False, replay=False)
     given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
     report = given.plain()
     ranking = report["laws"]["ranking"]

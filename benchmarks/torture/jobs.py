@@ -178,7 +178,7 @@ def jobs(raw: Path) -> list[Job]:
         Job("discover",
             ["model=lin", "model.leader=measured", "data=table", f"data.path={table}",
              "data.domain=traffic", "discover.effects=[relative_speed]",
-             "discover.max_effects=1", "discover.step=0.2", "discover.animation=false",
+             "discover.max_effects=1", "discover.step=0.2", "discover.replay=false",
              "discover.page=false"],
             _reported, lambda folder: 0.0, 23),
         Job("benchmark_discovery",

@@ -78,7 +78,7 @@ def _cutting(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
-    """Write ``metrics.json`` and print the model beside its baselines.
+    """Write ``metrics.json`` and ``replay.html``, and print the model beside its baselines.
 
     Raises:
         NNodeError: no such checkpoint, no such data, or data of another domain.
@@ -129,6 +129,14 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     )
     _print({name: found, **others}, f"{data.name}, {part}: {found.sequences} sequences", convention)
     print(f"metrics: {folder / 'metrics.json'}")
+    if config.replay:
+        from nnode.app.replay import write_replay  # loads Matplotlib, which takes a second
+
+        path = write_replay(
+            folder / "replay.html", store, indices, lambda batch: solver(model, batch), model, name,
+            dtype=dtype, device=device,
+        )  # fmt: skip
+        print(f"replay: {path}")
 
 
 def _print(rows: dict[str, Metrics], title: str, convention: Convention) -> None:

@@ -32,7 +32,7 @@ class DiscoverOptions:
     )
     step: float | None = None  # s, of the simulations that figures show; null takes the domain's
     page: bool = True  # report.html with figures, and figures in TensorBoard
-    animation: bool = True  # one sealed sequence as a moving picture in the page
+    replay: bool = True  # sealed sequences in a player on the page
 
 
 def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> list[str]:

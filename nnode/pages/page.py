@@ -16,8 +16,9 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from nnode.errors import ConfigError
-from nnode.files import write_bytes, write_text
+from nnode.files import write_text
 from nnode.pages import tables
+from nnode.pages.replay import ReplayBlock
 from nnode.plots.style import save
 
 #: Folder of the figures beside the page.
@@ -91,40 +92,22 @@ class FigureBlock:
 
 
 @dataclass
-class MovingBlock:
-    """An animated picture, and the file ``figures/<name>.gif``; it plays when it is asked for.
-
-    Attributes:
-        name: of the file; ``[text](#figure-<name>)`` refers to it.
-        content: the file.
-        width, height: in pixels.
-        caption, alt: as of a figure.
-    """
-
-    name: str
-    content: bytes
-    width: int
-    height: int
-    caption: str
-    alt: str
-
-
-@dataclass
 class Provenance:
     """How a page was made, by what: goes to the page's foot. Several add up."""
 
     facts: dict[str, str]
 
 
-Block = Heading | Text | TableBlock | FigureBlock | MovingBlock | Provenance
+Block = Heading | Text | TableBlock | FigureBlock | ReplayBlock | Provenance
 
 
 def write_page(
     blocks: list[Block], folder: Path, *, title: str, subtitle: str = "", stem: str = "study"
 ) -> list[Path]:
-    """Write ``<stem>.html``, ``<stem>.md``, a CSV per table and a PNG or GIF per figure.
+    """Write ``<stem>.html``, ``<stem>.md``, a CSV per table and a PNG per figure.
 
-    The HTML needs no other file and no network: style, figures and the tables' CSV are in it.
+    The HTML needs no other file and no network: style, figures, players and the tables' CSV are in
+    it.
     The Markdown refers to the CSV and PNG files beside it. Each file is replaced as a whole, the
     pages last.
 
@@ -149,9 +132,7 @@ def write_page(
                 paths.append(write_text(folder / f"{block.name}.csv", block.csv()))
             elif isinstance(block, FigureBlock):
                 paths.append(save(block.figure, folder / FIGURES / f"{block.name}.png"))
-            elif isinstance(block, MovingBlock):
-                paths.append(write_bytes(folder / FIGURES / f"{block.name}.gif", block.content))
-        markdown = write_text(folder / f"{stem}.md", _markdown(blocks, title, subtitle))
+        markdown = write_text(folder / f"{stem}.md", _markdown(blocks, title, subtitle, stem))
         html = write_text(folder / f"{stem}.html", _html(blocks, folder, title, subtitle))
     except OSError as error:
         raise ConfigError(
@@ -160,13 +141,30 @@ def write_page(
     return [html, markdown, *paths]
 
 
+def write_player(block: ReplayBlock, path: Path, *, title: str) -> Path:
+    """Write a page that holds a player alone; it needs no other file and no network.
+
+    Raises:
+        ConfigError: the path does not end in ``.html``, or cannot be written to.
+    """
+    if path.suffix.lower() != ".html":
+        raise ConfigError(f"a player is a page: expected a path ending in .html, got {path}")
+    _check([block])
+    try:
+        return write_text(path, _html([block], path.parent, title, ""))
+    except OSError as error:
+        raise ConfigError(
+            f"the player cannot be written to {path} ({error}); choose another folder"
+        ) from error
+
+
 def _check(blocks: list[Block]) -> None:
-    named = [b for b in blocks if isinstance(b, TableBlock | FigureBlock | MovingBlock)]
-    for kind in (TableBlock, FigureBlock, MovingBlock):
+    named = [b for b in blocks if isinstance(b, TableBlock | FigureBlock | ReplayBlock)]
+    for what, kind in (("tables", TableBlock), ("figures", FigureBlock | ReplayBlock)):
         names = Counter(block.name.casefold() for block in named if isinstance(block, kind))
         twice = [name for name, count in names.items() if count > 1]
         if twice:
-            raise ValueError(f"several of the page's {kind.__name__} are named {', '.join(twice)}")
+            raise ValueError(f"several of the page's {what} are named {', '.join(twice)}")
     for block in named:
         if not _NAME.fullmatch(block.name):
             raise ValueError(f"{block.name!r} cannot be used as a file name")
@@ -182,7 +180,7 @@ def _facts(blocks: list[Block]) -> dict[str, str]:
     return {name: fact for facts in found for name, fact in facts.items()}
 
 
-def _markdown(blocks: list[Block], title: str, subtitle: str) -> str:
+def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
     parts = [f"# {title}"]
     if subtitle:
         parts.append(subtitle)
@@ -196,11 +194,13 @@ def _markdown(blocks: list[Block], title: str, subtitle: str) -> str:
                 parts.append(f'<a id="table-{block.name}"></a>{block.caption.strip()}')
                 parts.append(_markdown_table(block))
                 parts.append(f"[{block.name}.csv]({block.name}.csv)")
-            case FigureBlock() | MovingBlock():
-                kind = "gif" if isinstance(block, MovingBlock) else "png"
+            case FigureBlock():
                 alt = re.sub(r"\s+", " ", block.alt).replace("[", "(").replace("]", ")").strip()
-                parts.append(f"![{alt}]({FIGURES}/{block.name}.{kind})")
+                parts.append(f"![{alt}]({FIGURES}/{block.name}.png)")
                 parts.append(f'<a id="figure-{block.name}"></a>{block.caption.strip()}')
+            case ReplayBlock():
+                place = f"[Player]({stem}.html#figure-{block.name})"
+                parts.append(f'<a id="figure-{block.name}"></a>{place}: {block.caption.strip()}')
     facts = _facts(blocks)
     if facts:
         parts.append("---")
@@ -263,16 +263,16 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
                         "height": height,
                     }
                 )
-            case MovingBlock():
+            case ReplayBlock():
+                data, said = block.data()
                 parts.append(
                     {
-                        "kind": "moving",
+                        "kind": "replay",
                         "name": block.name,
                         "caption": Markup(text.renderInline(block.caption.strip())),
                         "alt": block.alt.strip(),
-                        "gif": _base64(block.content),
-                        "width": block.width,
-                        "height": block.height,
+                        "data": Markup(data),
+                        "said": said,
                     }
                 )
     environment = Environment(

@@ -91,7 +91,7 @@ def run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     frame = pd.read_csv(table)
     frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
     frame.to_csv(table, index=False)
-    given = [*overrides(table, folder / "run"), "discover.animation=false"]
+    given = [*overrides(table, folder / "run"), "discover.replay=false"]
     done = script(CHAIN, str(folder), *given)
     assert done.returncode == 0, done.stdout + done.stderr
     (folder / "run" / "shown.txt").write_text(done.stdout.partition("== evaluate")[0])

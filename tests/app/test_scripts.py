@@ -73,6 +73,8 @@ def test_evaluate_beats_the_baselines_and_agrees_with_training(
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     result = json.loads((traffic / "result.json").read_text())["summary"]
     assert metrics["part"] == "heldout"
+    page = (tmp_path / "replay.html").read_text(encoding="utf-8")
+    assert page.count('"measured":[') == metrics["sequences"]
     assert metrics["J"] == pytest.approx(result["cost_heldout"], rel=1e-12)
     for baseline in metrics["baselines"].values():
         assert metrics["J"] < baseline["J"]

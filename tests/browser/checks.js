@@ -35,7 +35,7 @@
     const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
     while (walker.nextNode()) {
       const e = walker.currentNode.parentElement;
-      if (walker.currentNode.data.trim() && this.visible(e) && e.tagName !== "STYLE") found.add(e);
+      if (walker.currentNode.data.trim() && this.visible(e) && !["STYLE", "SCRIPT", "NOSCRIPT", "OPTION"].includes(e.tagName)) found.add(e);
     }
     return [...found];
   },
@@ -71,6 +71,8 @@
       faults.push(...[...table.querySelectorAll("th")].filter((e) => !e.scope).map((e) => `scope of ${this.name(e)}`));
       if (!table.closest("[aria-labelledby]")) faults.push("a table without a name");
     }
+    for (const e of document.querySelectorAll("canvas")) if ((e.getAttribute("aria-label") || "").length < 15) faults.push("a canvas without words");
+    for (const e of document.querySelectorAll("input, select, button")) if (!(e.innerText || e.closest("label")?.innerText || "").trim()) faults.push("a control without a name");
     for (const link of document.querySelectorAll("a")) if (!link.innerText.trim()) faults.push("a link without words");
     for (const part of ["main", "title"]) if (!document.querySelector(part)) faults.push(`no ${part}`);
     if (!document.documentElement.lang) faults.push("no language");
@@ -78,7 +80,7 @@
   },
 
   interactive() {
-    return [...document.querySelectorAll('a[href], button, summary, input, [tabindex="0"]')].filter((e) => this.visible(e));
+    return [...document.querySelectorAll('a[href], button, summary, input, select, [tabindex="0"]')].filter((e) => this.visible(e));
   },
   // what has the focus: its place among the interactive elements, and whether that is seen
   focus() {
@@ -91,7 +93,7 @@
   },
   // plain links may lead elsewhere; nothing else may
   elsewhere() {
-    const loaded = [...document.querySelectorAll("[src], link[href], object, iframe, script")];
+    const loaded = [...document.querySelectorAll("[src], link[href], object, iframe")];
     return loaded.filter((e) => !(e.src || "").startsWith("data:")).map((e) => e.outerHTML.slice(0, 100));
   },
 });

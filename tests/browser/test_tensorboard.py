@@ -9,14 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
 import pytest
 
 from nnode.calibrate.logbook import Logbook
-from tests.browser.chromium import PROGRAM, Browser
+from tests.browser.chromium import MISSING, Browser
 
 COSTS = [4.0, 2.0, 1.0]
 
@@ -66,10 +65,10 @@ def test_curves_are_served(address: str) -> None:
 KNOWN = r"Multiple instances of Three\.js|fallback to software WebGL"
 
 
-@pytest.mark.skipif(PROGRAM is None, reason="needs a Chromium")
-def test_the_page_shows_them_offline_without_errors(address: str, tmp_path: Path) -> None:
+@pytest.mark.skipif(bool(MISSING), reason=MISSING)
+def test_the_page_shows_them_offline_without_errors(address: str) -> None:
     asked(address, "data/plugin/scalars/tags")
-    with Browser(tmp_path) as browser:
+    with Browser() as browser:
         browser.open(address)
         end = time.monotonic() + 20
         while "cost" not in browser.evaluate("document.body.innerText"):

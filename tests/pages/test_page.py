@@ -253,7 +253,7 @@ def test_pages_that_cannot_be_are_refused(tmp_path: Path) -> None:
     frame = pd.DataFrame({"a": [1.0]})
     figure = new_figure(2.0, 2.0)
     wrong: dict[str, list[Block]] = {
-        "TableBlock are named t": [TableBlock("t", frame, "T."), TableBlock("T", frame, "T.")],
+        "tables are named t": [TableBlock("t", frame, "T."), TableBlock("T", frame, "T.")],
         "'a/b' cannot be used": [TableBlock("a/b", frame, "T.")],
         "figure f has no alternative": [FigureBlock("f", figure, "F.", " ")],
         "has level 1": [Heading("Title", 1)],

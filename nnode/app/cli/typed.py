@@ -53,15 +53,18 @@ def _name(key: object) -> str:
     return _SPECIAL.sub(r"\\\1", str(key))
 
 
-def group_defaults(section: str, group: str) -> dict[str, Any]:
+def group_defaults(section: str, group: str, script: str | None = None) -> dict[str, Any]:
     """What a configuration group has where nothing is said, ``???`` where something must be.
 
     Without Hydra these are its schema's values.
+
+    Args:
+        script: that has such groups, where the one that runs has not.
     """
     from nnode.config import SCHEMAS
 
     if in_hydra():
-        name = HydraConfig.get().job.config_name
+        name = script or HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:
         config = OmegaConf.structured(SCHEMAS[section, f"{group}_schema"])

@@ -7,8 +7,8 @@ Examples:
   python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
   python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt part=all
 
-Results: a table, and metrics.json. Data and solver are those of the training where none are
-chosen.
+Results: a table, metrics.json, and replay.html, in which agents move. Data and solver are those of
+the training where none are chosen.
 """
 
 from __future__ import annotations

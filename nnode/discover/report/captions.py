@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from nnode.data.sequence import Sequence
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.report.deviation import Deviation, deviation, simulate, smooth_velocity
+from nnode.discover.report.deviation import Deviation, deviation
 from nnode.discover.report.figures.maps import (
     approach_maps,
     neighbour_maps,
@@ -23,17 +22,16 @@ from nnode.discover.report.figures.marks import (
     place_curves,
     sealed_costs,
 )
-from nnode.discover.report.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
+from nnode.discover.report.figures.paths import film_strip, pair, rmse, trajectories
 from nnode.discover.report.files import amount, individual, interval
+from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
 from nnode.models import System
-from nnode.pages.page import FigureBlock, MovingBlock
+from nnode.pages.page import FigureBlock
+from nnode.pages.replay import ReplayBlock
 from nnode.plots.quality import faults_figure
 
 #: Faulty sequences and variables that are drawn.
 FAULTY, PLACES = 10, 9
-
-#: Seconds of a crowd's sequence that are shown: later, small errors have grown to other ways.
-SHOWN = 4.0
 
 #: Of maps of deviations.
 UNITS = {"traffic": "m/s", "crowd": "m/s²"}
@@ -48,7 +46,7 @@ class Figures:
     faults: list[FigureBlock] = field(default_factory=list)
     places: list[FigureBlock] = field(default_factory=list)
     unknown: list[FigureBlock] = field(default_factory=list)
-    paths: list[FigureBlock | MovingBlock] = field(default_factory=list)
+    paths: list[FigureBlock | ReplayBlock] = field(default_factory=list)
 
 
 def unit_of(system: System) -> str:
@@ -170,7 +168,7 @@ def _spread(map_: Deviation) -> str:
 
 
 def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, Deviation]:
-    titles = {"before": "as it was given", "after": "with the effects"}
+    titles = {"before": BEFORE, "after": AFTER}
     systems = {"before": found.base, "after": found.extended}
     if not found.diagnosis.effects:
         titles.pop("after")
@@ -180,45 +178,23 @@ def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, D
     }
 
 
-def telling(found: Found, sequences: list[Sequence]) -> Sequence | None:
-    """The sealed sequence that shows most: where most was gained, or else most is missed."""
-    rows = {str(row["name"]): row for row in found.diagnosis.sealed}
-    chosen = [sequences[i] for i in found.sealed]
-
-    def shown(s: Sequence) -> float:
-        row = rows.get(s.name)
-        if row is None:
-            return -np.inf
-        after = row["after"] if found.diagnosis.effects else 0.0
-        gain = float(row["before"]) - float(after)
-        return gain if np.isfinite(gain) else -np.inf
-
-    return max(chosen, key=shown) if chosen else None
-
-
 def _paths(
     inputs: Inputs, found: Found, options: DiscoverOptions
-) -> list[FigureBlock | MovingBlock]:
-    s = telling(found, inputs.sequences)
-    if s is None:
+) -> list[FigureBlock | ReplayBlock]:
+    every = scenes(inputs, found, options)
+    if not every:
         return []
-    if inputs.domain == "crowd":
-        keep = 1 + round(SHOWN / s.dt)
-        goal = s.x[-1] if s.destination is None else s.destination
-        s = replace(s, time=s.time[:keep], x=s.x[:keep], v=smooth_velocity(s)[:keep],
-                    destination=goal)  # fmt: skip
-    (before,) = simulate(found.base, [s], options.step)
-    (after,) = simulate(found.extended, [s], options.step)
-    if before is None or after is None:
-        return []
-    simulated = pair(before, after if found.diagnosis.effects else None)
+    s = every[0].sequence
+    simulated = pair(*every[0].simulated.values())
     errors = ", ".join(f"{one.title} {amount(rmse(s, one.x), 2)} m" for one in simulated)
     name = f"the sealed sequence {s.name}"
     unknown = "".join(
         f" Its agents' numbers are not known, so that {effect} does not act here."
         for effect in individual(found.extended)
     )
-    blocks: list[FigureBlock | MovingBlock] = [
+    moving = [player(found, every)] if options.replay else []
+    return [
+        *moving,
         FigureBlock(
             "trajectories",
             trajectories(s, simulated),
@@ -232,17 +208,3 @@ def _paths(
             f"Moments of {name}; root mean square error: {errors}.",
         ),
     ]
-    picture = moving_picture(s, simulated) if options.animation else None
-    if picture is not None:
-        content, width, height = picture
-        blocks.append(
-            MovingBlock(
-                "moving",
-                content,
-                width,
-                height,
-                f"The same as a moving picture, once, in {s.time[-1] - s.time[0]:.0f} s.",
-                f"Moving picture of {name}; root mean square error: {errors}.",
-            )
-        )
-    return blocks

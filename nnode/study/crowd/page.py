@@ -8,12 +8,16 @@ import pandas as pd
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.plots.study_crowd import horizon_costs
 from nnode.study.crowd import printed
-from nnode.study.crowd.data import ALL, GROUP, RECORDING
+from nnode.study.crowd.data import ALL, GROUP, RECORDING, sequences
 from nnode.study.crowd.fit import NAMES
 from nnode.study.crowd.page_conventions import conventions
 from nnode.study.crowd.page_forces import force_blocks, restart_blocks
 from nnode.study.crowd.results import LABELS, MODELS, SIMPLE, Crowd
+from nnode.study.replay import player, scenes, spread
 from nnode.study.statistics import Paired
+
+#: Models in the player, and how many sequences.
+SHOWN, FEW = ("sf", "nn"), 8
 
 
 def blocks(study: Crowd) -> list[Block]:
@@ -34,6 +38,7 @@ def blocks(study: Crowd) -> list[Block]:
         *_others(study),
         *restart_blocks(study),
         *force_blocks(study),
+        *_replay(study),
         TableBlock(
             "parameters",
             every.head(6),
@@ -364,3 +369,15 @@ def _others(study: Crowd) -> list[Block]:
             digits={**dict.fromkeys(map(str, table), 3), "people": 1, "speed": 2},
         ),
     ]
+
+
+def _replay(study: Crowd) -> list[Block]:
+    horizon = study.horizons[-1]
+    every = sequences(study.folder("main", horizon))
+    systems = {LABELS[m]: study.chosen(m, ALL, horizon).system for m in SHOWN}
+    what = (
+        f"Some sequences of {_seconds(horizon)} of the paper's recording, beside "
+        f"{' and '.join(systems)} as calibrated to all of them."
+    )
+    found = scenes(spread(every, FEW), systems)
+    return [Heading("Replay"), player("replay", found, what, len(every))]

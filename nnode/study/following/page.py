@@ -17,7 +17,11 @@ from nnode.study.following.page_platoons import leader_blocks, platoon_blocks
 from nnode.study.following.page_precision import precision_blocks
 from nnode.study.following.page_stability import stability_blocks
 from nnode.study.following.results import Study, interval
+from nnode.study.replay import player, scenes, spread
 from nnode.study.statistics import Paired
+
+#: Pairs in the player.
+FEW = 10
 
 
 def blocks(study: Study) -> list[Block]:
@@ -31,6 +35,7 @@ def blocks(study: Study) -> list[Block]:
         *stability_blocks(study),
         *platoon_blocks(study),
         *leader_blocks(study),
+        *_replay(study),
         _parameters(study),
         Provenance(
             {
@@ -254,6 +259,17 @@ def _test(study: Study) -> list[Block]:
 def _even(pair: Sequence) -> tuple[float, float]:
     """Mean speed of the follower, m/s, and mean gap, m."""
     return float(np.mean(pair.velocity()[:, 0])), float(gap_of(pair).mean())
+
+
+def _replay(study: Study) -> list[Block]:
+    pairs = study.pairs(test=True)
+    systems = {name: study.system(name) for name in dict.fromkeys((REFERENCE, study.best))}
+    what = (
+        f"Some of the test pairs, the leader as measured, beside {' and '.join(systems)} as "
+        "calibrated to all training pairs."
+    )
+    found = scenes(spread(pairs, FEW), systems)
+    return [Heading("Replay"), player("replay", found, what, len(pairs))]
 
 
 def _parameters(study: Study) -> Block:

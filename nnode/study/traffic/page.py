@@ -8,12 +8,13 @@ import pandas as pd
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.plots.study_traffic import law_panels, leader_speeds
 from nnode.plots.traffic import measured_gaps
+from nnode.study.replay import player, scenes, spread
 from nnode.study.statistics import average_interval
 from nnode.study.traffic import printed
 from nnode.study.traffic.faults import fault_blocks
 from nnode.study.traffic.heldout import heldout_blocks
 from nnode.study.traffic.optimizers import optimizer_blocks
-from nnode.study.traffic.problem import GAPS
+from nnode.study.traffic.problem import GAPS, system_of
 from nnode.study.traffic.results import (
     AVERAGE,
     KMH,
@@ -28,6 +29,9 @@ from nnode.study.traffic.results import (
     printed_lengths,
 )  # fmt: skip
 
+#: Models in the player, and how many sequences of each recording.
+SHOWN, FEW = ("lin", "n2"), 4
+
 
 def blocks(study: Study) -> list[Block]:
     """The page in its order."""
@@ -41,6 +45,7 @@ def blocks(study: Study) -> list[Block]:
         *heldout_blocks(study),
         *optimizer_blocks(study),
         *fault_blocks(study),
+        *_replay(study),
         TableBlock(
             "parameters",
             study.parameters().head(8),
@@ -293,6 +298,22 @@ def _laws(study: Study) -> list[Block]:
             full=long,
         ),
     ]
+
+
+def _replay(study: Study) -> list[Block]:
+    names = study.recordings("drop")
+    number, every = 0, []
+    for name in names:
+        sequences = study.sequences(name, "drop")
+        fits = {model: study.one("fit", name, model, "drop") for model in SHOWN}
+        systems = {model: system_of(model, one["parameters"]) for model, one in fits.items()}
+        every += scenes(spread(sequences, FEW), systems, study.options.dt)
+        number += len(sequences)
+    what = (
+        f"Some sequences without a fault of every recording, beside {' and '.join(SHOWN)} as "
+        "calibrated to them."
+    )
+    return [Heading("Replay"), player("replay", every, what, number)]
 
 
 def _speeds_by_gap(study: Study, suffix: str) -> dict[str, pd.DataFrame]:

@@ -37,6 +37,15 @@ def model_options(model: str, box: float | None = None) -> dict[str, Any]:
     return {**common, "term": "network_speed", "hidden": int(model[1:]), "box": box}
 
 
+def system_of(model: str, parameters: dict[str, Any]) -> System:
+    """A model with parameters as :func:`named` tells them."""
+    system = build_model(model_options(model), dtype=torch.float64)
+    with torch.no_grad():
+        for name, value in system.named_parameters():
+            value.copy_(torch.tensor(parameters[name.removeprefix("terms.0.")]))
+    return system
+
+
 @lru_cache(maxsize=4)
 def _recordings(folder: str) -> dict[str, list[Sequence]]:
     found: dict[str, list[Sequence]] = {}

@@ -6,13 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nnode.errors import ConfigError
-from nnode.pages.page import Block
+from nnode.pages.page import Block, Heading
 from nnode.study.options import WalkingStudyOptions
+from nnode.study.replay import player, scenes, spread
 from nnode.study.runner import Task, hash_of, run_tasks
 from nnode.study.walking import tasks
-from nnode.study.walking.data import RUNS, prepare_runs
-from nnode.study.walking.laws import DESIRED, LAWS
+from nnode.study.walking.data import RUNS, prepare_runs, sequences
+from nnode.study.walking.laws import DESIRED, LABELS, LAWS, filled, new_system
 from nnode.study.walking.page import Walking, blocks
 
 TITLE = "Walking: laws of people on two-way flows"
@@ -22,6 +25,10 @@ SUBTITLE = (
 )
 #: Relative times of the calibrations.
 _COSTS = {"alone": 1.0, "exponential": 4.0, "esf": 9.0, "ttc": 9.0, "gcfm": 5.0, "cfsm": 10.0}
+
+
+#: Sequences in the player.
+FEW = 10
 
 
 def groups(folds: int) -> list[list[str]]:
@@ -56,7 +63,31 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
             fingerprint=hash_of(stores),
             title=f"walking study, {horizon:g} s",
         )
-    return blocks(Walking(options, found))
+    study = Walking(options, found)
+    return [*blocks(study), *_replay(study, [str(store.folder) for store in stores.values()])]
+
+
+def _replay(study: Walking, folders: list[str]) -> list[Block]:
+    """The runs of the first group at the longest horizon, beside laws that did not see them."""
+    horizon, desired = study.options.horizons[-1], DESIRED[0]
+    held = groups(study.options.folds)[0]
+    seen = [s for folder in folders for s in sequences(folder) if s.recording in held]
+    known = [s for s in seen if s.preferred is not None and np.isfinite(s.preferred).all()]
+    if not known:
+        return []
+    best = min(list(LAWS)[1:], key=lambda law: study.error(law, desired, horizon))
+    systems = {}
+    for law in ("alone", best):
+        row = study.found[f"{law}-{desired}-{horizon:g}s-0"]["row"]
+        systems[LABELS[law]] = filled(new_system(law, desired), row)
+    what = (
+        f"Some sequences of {horizon:g} s of runs that were held out, in which everybody was "
+        f"measured before, beside {' and '.join(systems)}; where people want to go: *{desired}*."
+    )
+    return [
+        Heading("Replay"),
+        player("replay", scenes(spread(known, FEW), systems), what, len(seen)),
+    ]
 
 
 def _tasks(options: WalkingStudyOptions, horizon: float, folders: list[str]) -> list[Task]:

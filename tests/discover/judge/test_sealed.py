@@ -22,7 +22,7 @@ from nnode.models.extend import effects_of
 from tests.discover.platoons import platoons, relative_speed
 from tests.discover.test_diagnose import MANY, law
 
-OPTIONS = DiscoverOptions(effects=["relative_speed"], structure=False, animation=False)
+OPTIONS = DiscoverOptions(effects=["relative_speed"], structure=False, replay=False)
 KAPPA = 0.4
 
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
-from PIL import Image
 
 from nnode.data.sequence import Sequence
 from nnode.discover.report.deviation import Deviation
 from nnode.discover.report.figures import paths
 from nnode.discover.report.figures.maps import neighbour_maps, plane_maps, time_space_maps
 from nnode.discover.report.figures.marks import AFTER, BEFORE, sealed_costs
-from nnode.discover.report.figures.paths import film_strip, moving_picture, pair, rmse, trajectories
+from nnode.discover.report.figures.paths import film_strip, pair, rmse, trajectories
 
 
 def lane_map(scale: float) -> Deviation:
@@ -80,19 +77,3 @@ def test_trajectories_and_moments_of_a_platoon() -> None:
     measured, simulated = (np.asarray(line.get_xdata()) for line in last.lines)
     assert measured - simulated == pytest.approx(0.5 * s.time[-1])
     assert measured.mean() == pytest.approx(0.0)  # seen from the platoon's middle
-
-
-def test_a_moving_picture_takes_the_time_it_took(monkeypatch) -> None:
-    s = platoon()
-    made = moving_picture(s, pair(s.x, s.x))
-    assert made is not None
-    content, width, height = made
-    image = Image.open(io.BytesIO(content))
-    assert image.size == (width, height)
-    duration = 0
-    for k in range(image.n_frames):
-        image.seek(k)
-        duration += image.info["duration"]
-    assert duration == pytest.approx(1000 * s.time[-1], abs=250)
-    monkeypatch.setattr(paths, "BYTES", len(content) - 1)
-    assert moving_picture(s, pair(s.x, s.x)) is None

@@ -14,14 +14,16 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.inputs import Inputs
-from nnode.discover.report.captions import Figures, telling
+from nnode.discover.report.captions import Figures
 from nnode.discover.report.files import sentence
 from nnode.discover.report.page import draw, page_blocks
-from nnode.discover.result import Confirmation, DataFault
+from nnode.discover.report.replay import telling, zones
+from nnode.discover.result import Coefficient, Confirmation, DataFault
 from nnode.models import build_model
 from nnode.models.build import add_effects
 from nnode.pages.page import Heading, Text
 from tests.discover.conftest import Case
+from tests.discover.recorded import ZONE
 
 CONFIG = {"data": {"name": "table"}, "model": {"name": "lin_with_speed_zone"}}
 
@@ -88,7 +90,7 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
 def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
     names = {path.stem for path in (written / "figures").iterdir()}
     assert names == {
-        "coefficients", "faults", "map", "map_beside", "moments", "moving", "sealed",
+        "coefficients", "faults", "map", "map_beside", "moments", "sealed",
         "trajectories", "unknown", "where",
     }  # fmt: skip
     alts = re.findall(r'<img alt="([^"]*)"', (written / "report.html").read_text())
@@ -97,7 +99,6 @@ def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
     table = pd.read_csv(written / "coefficients.csv")
     assert list(table["coefficient"]) == ["alpha", "a", "b"]
     assert list(pd.read_csv(written / "data_faults.csv")["sequence"]) == ["lane/bad"]
-    assert (written / "figures" / "moving.gif").read_bytes()[:6] == b"GIF89a"
 
 
 def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> None:
@@ -110,7 +111,7 @@ def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> Non
 
 
 def test_a_crowd_s_page(crowd: Case, tmp_path: Path) -> None:
-    still = replace(crowd.options, animation=False)
+    still = replace(crowd.options, replay=False)
     draw(crowd.inputs, crowd.found, still, CONFIG, [], tmp_path)()
     page = (tmp_path / "report.html").read_text()
     assert "Mean of measured minus simulated acceleration by place" in page
@@ -178,10 +179,26 @@ def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
     rows = [{"name": names[0], "before": 5.0, "after": 4.5},
             {"name": names[1], "before": 4.0, "after": 1.0}]  # fmt: skip
     found.diagnosis = replace(found.diagnosis, sealed=rows)
-    chosen = telling(found, traffic.inputs.sequences)
-    assert chosen is not None
-    assert chosen.name == names[1]
+    assert [s.name for s in telling(found, traffic.inputs.sequences)] == names[::-1]
     found.diagnosis = replace(found.diagnosis, effects=[])
-    chosen = telling(found, traffic.inputs.sequences)
-    assert chosen is not None
-    assert chosen.name == names[0]
+    assert [s.name for s in telling(found, traffic.inputs.sequences)] == names
+
+
+def test_the_named_place_is_shaded_and_else_where_they_part(traffic: Case) -> None:
+    d = deepcopy(traffic.found.diagnosis)
+    a, b = ZONE
+    (zone,) = zones(d)
+    assert (zone.label, zone.t, zone.circle) == ("speed_zone", None, None)
+    assert zone.x == pytest.approx((a, b))
+    (zone,) = zones(replace(d, effects=[]))
+    assert (zone.label, zone.x) == ("where they part", (a, b))
+    assert zones(replace(d, effects=[], places=[])) == []
+    (effect,) = d.effects
+    at = {name: Coefficient(value, value, value, unit)
+          for name, value, unit in (("A_o", 1.0, "m/s²"), ("B_o", 0.6, "m"),
+                                    ("x_o", -1.0, "m"), ("y_o", 2.0, "m"))}  # fmt: skip
+    (zone,) = zones(replace(d, effects=[replace(effect, name="obstacle", coefficients=at)]))
+    assert zone.circle == (-1.0, 2.0, 0.6)
+    at = {name: Coefficient(value, value, value, "s") for name, value in (("a", 3.0), ("b", 9.0))}
+    (zone,) = zones(replace(d, effects=[replace(effect, coefficients=at)]))
+    assert (zone.t, zone.x) == ((3.0, 9.0), None)

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from nnode.pages.page import Block, FigureBlock, TableBlock, Text, write_page
+from nnode.pages.replay import ReplayBlock
 from nnode.study.crowd import conventions, tasks
 from nnode.study.crowd import page as crowd_page
 from nnode.study.crowd import page_forces as crowd_page_forces
@@ -59,6 +60,19 @@ def test_costs_are_in_both_units(tables: dict[str, pd.DataFrame], words: str) ->
     assert "Both printed costs lie above" not in words
     assert len(tables["crowd_conventions"]) == 30
     assert len(tables["crowd_conventions_networks"]) == 6
+
+
+def test_the_player_shows_the_longest_sequences(blocks: list[Block]) -> None:
+    (block,) = (b for b in blocks if isinstance(b, ReplayBlock))
+    scenes = list(block.scenes)
+    assert block.total == 24
+    assert len(scenes) == 8
+    for scene in scenes:
+        assert list(scene.simulated) == ["SF", "NN"]
+        assert scene.sequence.time[-1] - scene.sequence.time[0] == pytest.approx(2.0)
+        for x in scene.simulated.values():
+            np.testing.assert_array_equal(x[0], scene.sequence.x[0])
+            assert np.isfinite(x).all()
 
 
 def test_parameters_and_which_printed_ones_are_inside(

@@ -11,6 +11,7 @@ import pytest
 
 from nnode.data.store import Store, write_store
 from nnode.pages.page import Block, FigureBlock, Provenance, TableBlock, Text, write_page
+from nnode.pages.replay import ReplayBlock
 from nnode.study.options import TrafficStudyOptions
 from nnode.study.traffic import study as traffic
 from nnode.study.traffic import tasks
@@ -75,6 +76,17 @@ def test_averages_stand_beside_the_printed_ones(
     assert np.isnan(table.loc["lin", "weights in box"])
     least = min(away, key=lambda model: np.mean(COSTS[model]) + away[model])
     assert f"all five models reach a lower cost here than printed; the least is {least}'s" in words
+
+
+def test_the_player_shows_every_recording(blocks: list[Block]) -> None:
+    (block,) = (b for b in blocks if isinstance(b, ReplayBlock))
+    recordings = [scene.sequence.recording for scene in block.scenes]
+    assert list(dict.fromkeys(recordings)) == list(RECORDINGS)
+    scene = next(s for s in block.scenes if s.sequence.recording != invented.LEAST_IN)
+    time = scene.sequence.time - scene.sequence.time[0]
+    for model, speed in (("lin", invented.V0_LIN), ("n2", invented.V0)):
+        lead = scene.simulated[model][:, -1, 0]
+        np.testing.assert_allclose(lead - lead[0], speed * time, atol=1e-6)
 
 
 def test_a_wider_search_is_told_where_a_printed_cost_was_lower(words: str) -> None:

@@ -1,30 +1,23 @@
-"""One sequence as measured and as two models simulate it: paths, moments, a moving picture."""
+"""One sequence as measured and as two models simulate it: paths, moments."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from PIL import Image
 
 from nnode.data.sequence import Sequence
 from nnode.discover.report.figures.maps import draw_walls
 from nnode.discover.report.figures.marks import AFTER, BEFORE
-from nnode.plots.style import FONT, GREY, SMALL_FONT, dress, new_figure
+from nnode.plots.style import GREY, SMALL_FONT, dress, new_figure
 
 #: Moments of a film strip.
 MOMENTS = 5
-#: At most so many frames, colours and bytes has a moving picture, and so many dots in an inch.
-FRAMES, COLOURS, BYTES, DOTS = 60, 32, 1_000_000, 80
 
 _MEASURED: dict[str, Any] = {"color": GREY, "marker": "o"}
 
@@ -44,7 +37,7 @@ class Simulated:
     style: dict[str, Any]
 
 
-def pair(before: np.ndarray, after: np.ndarray | None) -> list[Simulated]:
+def pair(before: np.ndarray, after: np.ndarray | None = None) -> list[Simulated]:
     """The two simulations as they are drawn; one where nothing was added to the model."""
     found = [Simulated("as it was given", before, BEFORE)]
     return found if after is None else [*found, Simulated("with the effects", after, AFTER)]
@@ -153,45 +146,27 @@ def _planes(
     return figure, list(grid.ravel())
 
 
-@dataclass(frozen=True)
-class _Panel:
-    """A panel of moments: what moves in it, and what puts that where it is at sample k."""
-
-    artists: list[Artist]
-    show: Callable[[int], None]
-
-
-def _panel(ax: Axes, s: Sequence, one: Simulated) -> _Panel:
-    """A panel with measured and simulated agents, joined by lines."""
-    traffic = s.x.shape[2] == 1
-    joined = LineCollection([], colors="black", linewidths=0.7)
-    ax.add_collection(joined)
-    (real,) = ax.plot([], [], linestyle="", markersize=5.5, fillstyle="none", **_MEASURED)
-    (model,) = ax.plot([], [], linestyle="", markersize=5, alpha=0.85, **one.style)
-    # cars are shown from a car that drives along in their midst
-    frame = s.x.mean((1, 2)) if traffic else np.zeros(s.n_samples)
-    if traffic:
+def _moment(ax: Axes, s: Sequence, one: Simulated, k: int) -> None:
+    """Measured and simulated agents at sample k, joined by lines."""
+    if s.x.shape[2] == 1:
+        # cars are shown from a car that drives along in their midst, the scale that of all moments
+        frame = s.x.mean((1, 2))
         half = max(np.abs(x[..., 0] - frame[:, None]).max() for x in (s.x, one.x))
         ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
         ax.set_yticks([0, 1], ["simulated", "measured"])
+        real, model = (
+            np.stack([x[k, :, 0] - frame[k], np.full(x.shape[1], y)], 1)
+            for x, y in ((s.x, 1.0), (one.x, 0.0))
+        )
     else:
         low, high = _view(s)
         draw_walls(ax, s.walls)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-
-    def show(k: int) -> None:
-        if traffic:
-            ends = [
-                np.stack([x[k, :, 0] - frame[k], np.full(x.shape[1], y)], 1)
-                for x, y in ((s.x, 1.0), (one.x, 0.0))
-            ]
-        else:
-            ends = [s.x[k], one.x[k]]
-        real.set_data(*ends[0].T)
-        model.set_data(*ends[1].T)
-        joined.set_segments(list(np.stack(ends, 1)))
-
-    return _Panel([joined, real, model], show)
+        real, model = s.x[k], one.x[k]
+    joined = list(np.stack([real, model], 1))
+    ax.add_collection(LineCollection(joined, colors="black", linewidths=0.7))
+    ax.plot(*real.T, linestyle="", markersize=5.5, fillstyle="none", **_MEASURED)
+    ax.plot(*model.T, linestyle="", markersize=5, alpha=0.85, **one.style)
 
 
 def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
@@ -207,7 +182,7 @@ def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
     axes = figure.subplots(len(moments), len(simulated), sharex=True, sharey="col", squeeze=False)
     for row, k in zip(axes, moments, strict=True):
         for i, (ax, one) in enumerate(zip(row, simulated, strict=True)):
-            _panel(ax, s, one).show(int(k))
+            _moment(ax, s, one, int(k))
             last, seconds = k == moments[-1], s.time[k] - s.time[0]
             across = f"{seconds:.1f} s" if traffic else f"{seconds:.1f} s: y (m)"
             along = "position seen from the platoon's middle (m)" if traffic else "x (m)"
@@ -217,50 +192,3 @@ def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
                 ax.tick_params(labelleft=False)
     figure.legend(handles=_handles(simulated, False), **_LEGEND)
     return figure
-
-
-def moving_picture(sequence: Sequence, simulated: list[Simulated]) -> tuple[bytes, int, int] | None:
-    """The sequence as an animated GIF in the time it took, played once.
-
-    Returns:
-        Its bytes, and its width and height in pixels; None where it would exceed a megabyte.
-    """
-    s = sequence
-    every = -(-s.n_samples // FRAMES)
-    if s.x.shape[2] == 1:
-        figure = new_figure(6.4, 1.15 * len(simulated) + 0.75)
-        axes = list(figure.subplots(len(simulated), 1, sharex=True, squeeze=False)[:, 0])
-    else:
-        figure, axes = _planes(*_view(s), len(simulated), side=6.4)
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(DOTS)
-    panels = [_panel(ax, s, one) for ax, one in zip(axes, simulated, strict=True)]
-    for ax, one in zip(axes, simulated, strict=True):
-        if s.x.shape[2] == 1:
-            dress(ax, x="position seen from the platoon's middle (m)", y=one.title)
-        else:
-            dress(ax, x="x (m)", y="y (m)", title=one.title)
-        ax.label_outer()
-    clock = figure.suptitle("0.0 s", fontsize=FONT, x=0.02, ha="left")
-    moving: list[Artist] = [artist for panel in panels for artist in panel.artists]
-    for artist in (*moving, clock):
-        artist.set_animated(True)  # not part of the ground, which is drawn once
-    canvas.draw()
-    ground = canvas.copy_from_bbox(figure.bbox)
-    pictures = []
-    for k in range(0, s.n_samples, every):
-        for panel in panels:
-            panel.show(k)
-        clock.set_text(f"{s.time[k] - s.time[0]:.1f} s")
-        canvas.restore_region(ground)
-        for artist in (*moving, clock):
-            artist.draw(canvas.get_renderer())
-        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-        pictures.append(picture.quantize(COLOURS, dither=Image.Dither.NONE))
-    stream = io.BytesIO()
-    pictures[0].save(
-        stream, format="GIF", save_all=True, append_images=pictures[1:], optimize=True,
-        duration=max(20, round(1000 * every * s.dt)),
-    )  # fmt: skip
-    content = stream.getvalue()
-    return None if len(content) > BYTES else (content, *pictures[0].size)

@@ -1,0 +1,254 @@
+"""What a file of trajectories holds and what is wrong with it: ``scripts/check.py``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pandas as pd
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.app.cli.typed import changes, group_defaults
+from nnode.data.check.examine import Examination, examine, sure
+from nnode.data.check.findings import Finding
+from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
+from nnode.data.sequence import Domain
+from nnode.errors import ConfigError
+from nnode.machine import how_made
+from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
+
+#: Stands before what is printed of each level.
+_SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
+
+
+def check(config: DictConfig, folder: Path) -> None:
+    """Examine a file, print what was found, and write ``check.html`` into ``folder``.
+
+    Raises:
+        ConfigError: no such file, or an option out of its range.
+        DataError: a file that is no table of trajectories.
+    """
+    if config.domain not in (None, "traffic", "crowd"):
+        raise ConfigError(f"domain={config.domain}: expected traffic, crowd, or null to guess")
+    if config.frame_rate is not None and not 0 < config.frame_rate < float("inf"):
+        raise ConfigError(f"frame_rate={config.frame_rate}: expected a positive number, 1/s")
+    path = Path(config.file).expanduser()
+    found = examine(path, cast(Domain | None, config.domain), config.frame_rate)
+    lines = command(found)
+    print(summary(found, lines))
+    page = write_page(
+        [*blocks(found, lines), _made()], folder, title=f"Check of {path.name}",
+        subtitle=sentence(found), stem="check",
+    )[0]  # fmt: skip
+    print(f"page: {page}")
+
+
+def command(found: Examination) -> list[str]:
+    """The overrides, as they can be typed, with which scripts read the file."""
+    source = found.source
+    values = _plain(source.options)
+    defaults = group_defaults("data", source.group, "prepare_data")
+    own = _plain(type(source.options)())
+    # what was not found here stays as the group has it
+    kept = {k: v for k, v in values.items() if v != own[k] and k != "name"}
+    return [f"data={source.group}", *changes("data", kept, defaults)]
+
+
+def _plain(options: object) -> dict[str, object]:
+    plain = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def sentence(found: Examination) -> str:
+    """What there is, in a sentence."""
+    levels = [one.level for one in found.findings]
+    errors, looks = levels.count("error"), levels.count("warning")
+    wrong = f"{errors} error{'s' * (errors != 1)}, {looks} thing{'s' * (looks != 1)} to look at"
+    who = "people" if found.scale.domain == "crowd" else "vehicles"
+    return (
+        f"{len(set(found.tracks.agent.tolist()))} {who}, {len(found.tracks)} positions, sampled "
+        f"every {found.tracks.dt:.4g} s: {wrong}."
+    )
+
+
+def summary(found: Examination, lines: list[str]) -> str:
+    """The whole in plain text."""
+    text = [f"{found.path}: {sentence(found)}"]
+    if found.meanings:
+        known = ", ".join(f"{m} = {one.column}" for m, one in found.meanings.items())
+        text.append(f"columns: {known}")
+        text.append(f"units: {_units(found)} ({sure(_probability(found))})")
+    else:
+        text.append(f"format: {found.raw.native}, whose reader knows its units")
+    text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
+    if found.source.convert:
+        text += ["", "no reader takes the file as it is; in Python:", *found.source.convert]
+    text += ["", "to read it:", "  python scripts/prepare_data.py " + " ".join(lines)]
+    return "\n".join(text)
+
+
+def _units(found: Examination) -> str:
+    scale = found.scale
+    clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
+    speeds = f", speeds in {scale.speed}" if found.tracks.speed is not None else ""
+    return f"{scale.domain}, positions in {scale.position}, times in {clock}{speeds}"
+
+
+def _probability(found: Examination) -> float:
+    """Of the units, whatever the rate of frames."""
+    best = found.scale
+    return sum(
+        one.probability
+        for one in found.scales
+        if (one.domain, one.position, one.time, one.speed)
+        == (best.domain, best.position, best.time, best.speed)
+    )
+
+
+def blocks(found: Examination, lines: list[str]) -> list[Block]:
+    """The page: what is wrong, how to read it, what it holds."""
+    return [
+        Heading("What was found"),
+        *_findings(found.findings),
+        Heading("To read it"),
+        Text(_usage(found, lines)),
+        *_columns(found),
+        *_units_blocks(found),
+        Heading("What it holds"),
+        *_figures(found),
+    ]
+
+
+def _findings(findings: list[Finding]) -> list[Block]:
+    rows = [{"": one.level, "what": one.kind, "in words": one.text} for one in findings]
+    if not rows:
+        return [Text("Nothing.")]
+    table = pd.DataFrame(rows).set_index("")
+    caption = (
+        "*error*: results would be wrong. *warning*: look at it before you go on. *note*: to know."
+    )
+    return [TableBlock("findings", table, caption)]
+
+
+def _usage(found: Examination, lines: list[str]) -> str:
+    text = ""
+    if found.source.convert:
+        made = "\n".join(found.source.convert)
+        text = (
+            f"No reader takes the file as it is. In Python:\n\n```python\n{made}\n```\n\nThen:\n\n"
+        )
+    words = " \\\n    ".join(lines)
+    return (
+        f"{text}```sh\npython scripts/prepare_data.py {words}\n```\n\nThe same options go to "
+        "`scripts/train.py` and `scripts/discover.py`."
+    )
+
+
+def _columns(found: Examination) -> list[Block]:
+    if not found.meanings or found.raw.table is None:
+        return []
+    frame = found.raw.table.frame
+    how = {
+        "named": "has the name of its meaning", "like": "by its name",
+        "holds": "by what it holds",
+    }  # fmt: skip
+    by = {one.column: (meaning, one) for meaning, one in found.meanings.items()}
+    rows = {}
+    for column in map(str, frame.columns):
+        meaning, one = by.get(column, ("not used", None))
+        cells = frame[column]
+        values = pd.to_numeric(cells, errors="coerce")
+        numeric = bool(values.notna().any())
+        rows[column] = {
+            "meaning": meaning,
+            "because": "" if one is None else how[one.sure],
+            "least": f"{values.min():.6g}" if numeric else "",
+            "greatest": f"{values.max():.6g}" if numeric else "",
+            "different": int(cells.nunique()),
+            "empty": int(cells.isna().sum()),
+        }
+    table = pd.DataFrame(rows).T.rename_axis("column")
+    return [Heading("Columns"), TableBlock("columns", table, "What each column is taken for.")]
+
+
+def _units_blocks(found: Examination) -> list[Block]:
+    scale, known = found.scale, found.known
+    usual = USUAL[scale.domain]
+    values = {
+        "speed of those that move (m/s)": (known.speed * scale.metres / scale.seconds, "speed"),
+        "distance to the nearest (m)": (known.nearest * scale.metres, "nearest"),
+        "length (m)": (known.length * scale.metres, "length"),
+        "sway (1/s)": (known.sway / scale.seconds, "sway"),
+        "sampling interval (s)": (known.dt * scale.seconds, INTERVAL),
+        "speed by positions over speed in the file": (
+            known.ratio * scale.metres / (scale.per_second * scale.seconds), AGREE,
+        ),
+    }  # fmt: skip
+    rows = {}
+    for name, (value, where) in values.items():
+        range_ = usual.get(where) if isinstance(where, str) else where
+        if np.isfinite(value) and isinstance(range_, Range):
+            rows[name] = {
+                "here": value,
+                "usual": f"{range_.low:g} to {range_.high:g}",
+                "source": range_.source,
+            }
+    blocks: list[Block] = [
+        Heading("Units and time scale"),
+        Text(f"Taken: {_units(found)}: {sure(_probability(found))}."),
+        TableBlock("medians", pd.DataFrame(rows).T, "Medians in SI units, and what is usual."),
+    ]
+    if len(found.scales) > 1:
+        table = pd.DataFrame(
+            [
+                {"of": s.domain, "positions": s.position, "times": s.time, "frames/s": s.rate,
+                 "speeds": s.speed, "probability": s.probability}
+                for s in found.scales
+            ]
+        )  # fmt: skip
+        blocks.append(
+            TableBlock(
+                "units", table.head(6),
+                "Combinations of units by how well these medians agree with what is usual; all of "
+                "them in the CSV.", digits={"probability": 3}, full=table,
+            )
+        )  # fmt: skip
+    return blocks
+
+
+def _figures(found: Examination) -> list[Block]:
+    from nnode.plots import check as plots  # loads Matplotlib, which takes a second
+    from nnode.plots.quality import faults_figure
+
+    tracks, domain = found.tracks, found.scale.domain
+    shown: list[Block] = [
+        FigureBlock(
+            "speeds",
+            plots.speeds(tracks, USUAL[domain]["speed"]),
+            "Speeds over ten samples, and steps in time. Shaded: what is usual.",
+            "Histograms of speeds in m/s and of sampling steps in s.",
+        ),
+        FigureBlock(
+            "presence",
+            plots.presence(tracks, domain),
+            "Above, where agents are over time, of many a part; below, how many there are.",
+            "Paths over time, and the number of agents over time.",
+        ),
+    ]
+    if found.faults:
+        shown.append(
+            FigureBlock(
+                "faults",
+                faults_figure(found.sequences, found.faults, domain, 10),
+                f"Sequences that data={found.source.group} makes, with faults marked; the first 10 "
+                f"of {len(found.faults)}.",
+                "Positions over time of faulty sequences, faults marked.",
+            )
+        )
+    return shown
+
+
+def _made() -> Provenance:
+    return Provenance(how_made(("numpy", "pandas", "scipy", "matplotlib")))

@@ -1,0 +1,139 @@
+"""Players for users: of an evaluated model, and of tables from anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from nnode.app.python_inputs import Table, table_options
+from nnode.calibrate.evaluate import Simulate
+from nnode.data.readers.table import TABLE, WALLS, read_table, table_files
+from nnode.data.sequence import Sequence
+from nnode.data.store import Store
+from nnode.discover.report.replay import zone_of
+from nnode.errors import DataError
+from nnode.exchange.trajectories import simulated as simulated_by
+from nnode.models import System
+from nnode.models.effects import Effect
+from nnode.models.extend import effects_of
+from nnode.pages.page import write_player
+from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone
+
+_CAPTION = (
+    "Outlines are where agents were measured; arrows, the residuals, go there from where they are "
+    "simulated."
+)
+
+
+def replay(
+    measured: Table,
+    simulated: Table | Mapping[str, Table],
+    path: str | Path,
+    *,
+    domain: str,
+    walls: str | Path | None = None,
+    zones: Iterable[Zone] = (),
+) -> Path:
+    """Write a page on which measured and simulated agents move side by side.
+
+    Sequences and agents go by their names; a simulation is looked at at the times that were
+    measured, evenly between its own.
+
+    Args:
+        measured: CSV or Parquet, or a data frame, with ``sequence, time, agent, x`` and, for a
+            crowd, ``y``, SI units; see ``docs/data.md``.
+        simulated: the same of a simulation, or of several by their titles.
+        path: of the page, ``.html``; it needs no other file.
+        domain: ``traffic`` or ``crowd``.
+        walls: CSV with x1, y1, x2, y2, m.
+        zones: places or times to shade.
+
+    Returns:
+        The path.
+
+    Raises:
+        NNodeError: a table that does not fit, tables without a sequence in common, or a path that
+            cannot be written to.
+    """
+    tables = dict(simulated) if isinstance(simulated, Mapping) else {"simulated": simulated}
+    with TemporaryDirectory(prefix="nnode-replay-") as folder:
+        real = _read(measured, domain, walls, Path(folder))
+        models = {
+            title: {s.name.rpartition("/")[2]: s for s in _read(table, domain, None, Path(folder))}
+            for title, table in tables.items()
+        }
+    scenes = []
+    for s in real:
+        name = s.name.rpartition("/")[2]
+        if all(name in found for found in models.values()):
+            there = {title: _at(found[name], s) for title, found in models.items()}
+            scenes.append(Scene(s, there))
+    if not scenes:
+        own = real[0].name.rpartition("/")[2]
+        others = ", ".join(sorted({name for found in models.values() for name in found})[:5])
+        raise DataError(
+            f"no sequence is both measured and simulated: those measured are called {own} and the "
+            f"like, those simulated {others}; give both tables the same names in column 'sequence'"
+        )
+    block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), list(zones), len(real))
+    return write_player(block, Path(path), title="Measured and simulated")
+
+
+def _read(table: Table, domain: str, walls: str | Path | None, folder: Path) -> list[Sequence]:
+    options = table_options(table, domain, walls, folder)
+    files = table_files(options)
+    return read_table(files[TABLE], options, files.get(WALLS))
+
+
+def _at(found: Sequence, measured: Sequence) -> np.ndarray:
+    """Positions of the measured agents at the measured times, NaN where there are none."""
+    x = np.full_like(measured.x, np.nan)
+    place = {name: i for i, name in enumerate(found.agents)}
+    for n, agent in enumerate(measured.agents):
+        if agent in place:
+            for d in range(x.shape[2]):
+                x[:, n, d] = np.interp(
+                    measured.time, found.time, found.x[:, place[agent], d],
+                    left=np.nan, right=np.nan,
+                )  # fmt: skip
+    return x
+
+
+def write_replay(
+    path: Path,
+    store: Store,
+    indices: list[int],
+    simulate: Simulate,
+    model: System,
+    name: str,
+    *,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Path:
+    """Write a player of some sequences of a store as measured and as a model simulates them.
+
+    Args:
+        indices: of the sequences; evenly chosen ones of many are shown.
+        name: of the model.
+    """
+    shown = indices[:: -(-len(indices) // MOST)]
+    real = [store[i] for i in shown]
+    found = simulated_by(simulate, real, dtype=dtype, device=device)
+    scenes = [Scene(s, {name: x.x}) for s, x in zip(real, found, strict=True)]
+    zones = [zone for one in effects_of(model) if (zone := _zone(one)) is not None]
+    block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), zones, len(indices))
+    return write_player(block, path, title=f"{name}, measured and simulated")
+
+
+def _zone(effect: Effect) -> Zone | None:
+    options, settings = effect.options(), effect.settings
+    at = {name: float(options[name]) for name in settings}
+    return zone_of(effect.name, at, settings["a"].unit if "a" in settings else "")
+
+
+def _alt(scenes: list[Scene]) -> str:
+    return f"Player of {len(scenes)} sequences: agents as measured and as simulated."

@@ -1,0 +1,156 @@
+"""What the columns of a table mean: by their names, or, where there are none, by what they hold."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from nnode.data.check.raw import Raw
+
+#: Names by meaning, small letters and digits only; the first is the meaning's own.
+NAMES: dict[str, tuple[str, ...]] = {
+    "agent": (
+        "agent", "id", "vehicle", "vehicleid", "veh", "vehid", "vid", "track", "trackid", "car",
+        "carid", "person", "personid", "pid", "ped", "pedid", "pedestrian", "pedestrianid",
+        "agentid", "object", "objectid", "obj", "objid", "targetid", "name",
+    ),
+    "time": ("time", "t", "timestamp", "globaltime", "seconds", "sec", "datetime", "epoch"),
+    "frame": ("frame", "frameid", "framenumber", "framenum", "frameindex", "fr", "step"),
+    "x": (
+        "x", "posx", "xpos", "positionx", "xposition", "localy", "position", "pos", "station",
+        "distance", "s", "px", "xcoord", "xcenter", "xm", "east", "easting", "frontx",
+    ),
+    "y": (
+        "y", "posy", "ypos", "positiony", "yposition", "localx", "lateral", "py", "ycoord",
+        "ycenter", "ym", "north", "northing", "d",
+    ),
+    "lane": ("lane", "laneid", "laneno", "lanenumber", "laneindex"),
+    "speed": ("speed", "v", "vel", "velocity", "vvel", "spd", "speedmps"),
+    "vx": ("vx", "xvelocity", "velx", "velocityx", "xvel", "speedx"),
+    "vy": ("vy", "yvelocity", "vely", "velocityy", "yvel", "speedy"),
+    "length": ("length", "len", "vlength", "vehiclelength", "vehlength", "carlength"),
+    "kind": ("kind", "class", "cls", "type", "vclass", "vehicletype", "vehicleclass", "agenttype"),
+    "sequence": ("sequence", "seq", "scene", "sceneid", "segment", "episode", "trial", "platoon"),
+    "recording": ("recording", "recordingid", "run", "runno", "location", "session", "dataset"),
+    "x_follower": ("xfollower", "xfollowerreal", "xf", "followerx", "xfollowing", "xfoll"),
+    "x_leader": ("xleader", "xleaderreal", "xl", "leaderx", "xlead", "xpreceding"),
+    "v_follower": ("vfollower", "vfollowerreal", "vf", "followerv", "vfollowing", "followerspeed"),
+    "v_leader": ("vleader", "vleaderreal", "vl", "leaderv", "vlead", "leaderspeed"),
+    "leader_length": ("leaderlength", "lengthleader", "lleader"),
+    "spacing": ("spacing", "gap", "spaceheadway", "ivs"),
+    "pair": ("pair", "pairid"),
+    "follower": ("follower", "followerid", "following"),
+    "leader": ("leader", "leaderid", "preceding", "precedingid"),
+    "split": ("split",),
+    "leader_kind": ("leaderkind", "leadertype"),
+    "position": ("order", "rank", "place"),
+}  # fmt: skip
+#: Units that a name may end in, with their own names.
+UNITS = {
+    "m": "m", "cm": "cm", "mm": "mm", "ft": "ft", "feet": "ft", "km": "km",
+    "s": "s", "sec": "s", "ms": "ms", "frames": "frame",
+    "m/s": "m/s", "mps": "m/s", "ms-1": "m/s", "km/h": "km/h", "kmh": "km/h", "kph": "km/h",
+    "mph": "mph", "ft/s": "ft/s", "fps": "ft/s",
+}  # fmt: skip
+_ENDING = re.compile(
+    r"(?:\s*[\[(/]\s*|[_ ])(" + "|".join(map(re.escape, sorted(UNITS, key=len, reverse=True)))
+    + r")\s*[\])]?$",
+    re.IGNORECASE,
+)  # fmt: skip
+_NUMERIC = (
+    "time", "frame", "x", "y", "speed", "vx", "vy", "length", "x_follower", "x_leader",
+    "v_follower", "v_leader", "leader_length", "spacing", "position",
+)  # fmt: skip
+#: Share of a column's cells that must be numbers where its meaning needs them.
+MOSTLY = 0.5
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A column and what it is taken for.
+
+    Attributes:
+        column: its name in the table.
+        unit: that its name ends in; empty: none.
+        sure: ``named`` exactly, ``like`` a usual name, or by what it ``holds``.
+    """
+
+    column: str
+    unit: str
+    sure: str
+
+
+def plain(name: str) -> tuple[str, str]:
+    """A column's name in small letters and digits, and the unit that it ends in."""
+    unit = ""
+    found = _ENDING.search(name)
+    if found and found.start() > 0:
+        unit, name = UNITS[found[1].lower()], name[: found.start()]
+    return re.sub(r"[^a-z0-9]", "", name.lower()), unit
+
+
+def numbers(frame: pd.DataFrame, column: str) -> np.ndarray:
+    """A column as float64, NaN where a cell holds no finite number."""
+    values = np.array(pd.to_numeric(frame[column], errors="coerce"), dtype=np.float64)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def meanings(raw: Raw) -> dict[str, Meaning]:
+    """What the columns mean, as far as that can be told."""
+    assert raw.table is not None
+    frame = raw.table.frame
+    if not raw.named:
+        return {m: Meaning(c, raw.unit or "", "holds") for m, c in _by_content(frame).items()}
+    found: dict[str, Meaning] = {}
+    known = {str(name): plain(str(name)) for name in frame.columns}
+    whole = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in known}
+    taken: set[str] = set()
+    for meaning, usual in NAMES.items():
+        own = {column: usual.index(w) for column, w in whole.items() if w in usual}
+        own |= {
+            column: usual.index(word)
+            for column, (word, _) in known.items()
+            if column not in own and word in usual
+        }
+        for column in sorted(own, key=lambda c: own[c]):
+            fits = meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY
+            if column not in taken and fits:
+                sure = "named" if column == meaning else "like"
+                unit = "" if whole[column] in usual else known[column][1]
+                found[meaning] = Meaning(column, unit, sure)
+                taken.add(column)
+                break
+    return found
+
+
+def _by_content(frame: pd.DataFrame) -> dict[str, str]:
+    """Columns of rows of numbers: agent and frame in either order, positions, velocities."""
+    names = [str(name) for name in frame.columns]
+    if len(names) < 4:
+        return {}
+    first, second = numbers(frame, names[0]), numbers(frame, names[1])
+    if len(names) == 8:  # frame id x z y vx vz vy: obsmat of Pellegrini et al. 2009
+        places = [numbers(frame, name) for name in (names[2], names[4])]
+        order: tuple[str, ...] = ("x", "", "y", "vx", "", "vy")
+    else:
+        places = [numbers(frame, name) for name in names[2:4]]
+        order = ("x", "y")
+    forth = _roughness(first, second, places)
+    back = _roughness(second, first, places)
+    ids = ("agent", "frame") if forth <= back else ("frame", "agent")
+    return {m: c for m, c in zip((*ids, *order), names, strict=False) if m}
+
+
+def _roughness(agent: np.ndarray, frame: np.ndarray, places: list[np.ndarray]) -> float:
+    """Median distance between neighbouring rows of one agent, ties of agent and frame counting."""
+    order = np.lexsort((frame, agent))
+    same = np.diff(agent[order]) == 0
+    if not same.any():
+        return np.inf
+    steps = np.sqrt(sum(np.diff(place[order]) ** 2 for place in places))
+    found = float(np.nanmedian(steps[same])) if np.isfinite(steps[same]).any() else np.inf
+    ties = float((np.diff(frame[order])[same] == 0).mean())
+    return np.inf if ties > 0.5 else found

@@ -1,0 +1,358 @@
+"""What is wrong with rows of trajectories, in words, with the numbers that say so."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from nnode.data.check.scale import AGREE, INTERVAL, RATES, USUAL, Medians, Scale
+from nnode.data.check.tracks import Tracks
+from nnode.data.quality import KINDS, LIMITS, Fault
+from nnode.data.readers.columns import Table
+from nnode.data.sequence import Domain
+
+#: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
+#: over a second: that of gravity, m/s².
+FRICTION = 9.81
+#: Share of the covered length at either end where agents may come and go; elsewhere they do not.
+EDGE = 0.1
+#: Share of agents from which on something is told of all.
+FEW = 0.02
+#: Jumps at one time among which swaps are looked for.
+SOME = 30
+#: A step longer than so many usual ones is a hole.
+HOLE = 1.5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found.
+
+    Attributes:
+        kind: a word for it.
+        level: ``error``: results would be wrong; ``warning``: look at it; ``note``: to know.
+        text: what, with numbers and what to do.
+    """
+
+    kind: str
+    level: str
+    text: str
+
+
+def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
+    """Cells without a number where one is needed, and agents without a name."""
+    for meaning, column in columns.items():
+        own = table.frame[column]
+        empty = own.isna().to_numpy()
+        bad = empty
+        if meaning != "agent":
+            bad = ~np.isfinite(np.array(pd.to_numeric(own, errors="coerce"), dtype=float))
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            shown = "nothing" if empty[i] else repr(str(own.iloc[i])[:40])
+            yield Finding(
+                "cells", "error",
+                f"column {column!r} ({meaning}) holds no number in {bad.sum()} of {len(own)} rows, "
+                f"first {shown} in {table.row(i)}; correct or remove these rows",
+            )  # fmt: skip
+
+
+def rows(table: Table, agent: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
+    """One agent twice at one time, and rows that are not in order of time."""
+    code = pd.factorize(agent)[0]
+    pairs = pd.DataFrame({"agent": code, "time": time})
+    again = pairs.duplicated().to_numpy() & np.isfinite(time)
+    if again.any():
+        i = int(np.flatnonzero(again)[0])
+        whole = int(table.frame.duplicated().sum())
+        yield Finding(
+            "duplicates", "error",
+            f"{again.sum()} rows have an agent and a time that stood there before ({whole} of them "
+            f"are the same throughout), first agent {agent[i]} at {time[i]:g} in {table.row(i)}; "
+            "keep one row per agent and time, or tell agents of one name apart",
+        )  # fmt: skip
+    order = np.argsort(code, kind="stable")
+    back = (np.diff(time[order]) < 0) & (np.diff(code[order]) == 0)
+    if back.any():
+        i = int(order[np.flatnonzero(back)[0] + 1])
+        yield Finding(
+            "unsorted", "note",
+            f"{back.sum()} rows stand before earlier ones of their agent, first in {table.row(i)}; "
+            "the readers sort them",
+        )  # fmt: skip
+
+
+def sampling(tracks: Tracks) -> Iterator[Finding]:
+    """Sampling interval, uneven steps, holes (s)."""
+    steps, dt = tracks.steps, tracks.dt
+    if not steps.size:
+        yield Finding(
+            "rate", "error", "no agent has two rows at different times; nothing moves here"
+        )
+        return
+    uneven = np.abs(steps - dt) > 0.01 * dt
+    holes = steps > HOLE * dt
+    text = f"sampled every {dt:.4g} s ({1 / dt:.4g} in a second)"
+    level = "note"
+    if (uneven & ~holes).mean() > FEW:
+        level = "warning"
+        text += f"; {(uneven & ~holes).mean():.0%} of the steps differ by more than 1 %"
+    if INTERVAL.score(dt) < -2:
+        level = "warning"
+        text += f"; unusual: {INTERVAL.source}"
+    yield Finding("rate", level, text)
+    if holes.any():
+        yield Finding(
+            "holes", "warning" if holes.mean() > FEW else "note",
+            f"{holes.sum()} holes in agents' records, the longest of {steps.max():.3g} s",
+        )  # fmt: skip
+
+
+def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Finding]:
+    """Whether the clock is right, by speeds in the file and by what is possible.
+
+    Args:
+        told: frames per second as the file or the user tells.
+    """
+    speed = known.speed * scale.metres / scale.seconds
+    ratio = known.ratio * scale.metres / (scale.per_second * scale.seconds)
+    usual = USUAL[scale.domain]["speed"]
+    who = "people walk" if scale.domain == "crowd" else "vehicles drive"
+    if told is not None and scale.rate is not None and abs(scale.rate / told - 1) > 0.01:
+        own = f"; its own velocities say {speed / ratio:.3g} m/s" if np.isfinite(ratio) else ""
+        yield Finding(
+            "time_scale", "error",
+            f"at the {told:g} frames/s that are told, {who} "
+            f"{known.speed * scale.metres * told:.3g} m/s (median of those who move){own}: "
+            f"{scale.rate:g} frames/s fit",
+        )  # fmt: skip
+    elif np.isfinite(ratio) and AGREE.score(ratio) < -4:
+        if scale.rate is not None:
+            right = scale.rate / ratio
+            near = min(RATES, key=lambda r: abs(np.log(r / right)))
+            cure = f"a rate of {right:.3g} frames/s would agree"
+            cure += f", such as {near:g}" if abs(near / right - 1) < 0.05 else ""
+        else:
+            cure = (
+                f"times multiplied by {ratio:.3g} would agree, or positions divided by it: ask how "
+                "both were made"
+            )
+        yield Finding(
+            "time_scale", "error",
+            f"by their positions {who} {speed:.3g} m/s (median of those who move), by the file's "
+            f"own velocities {speed / ratio:.3g} m/s; {cure}",
+        )  # fmt: skip
+    clock = known.sway / scale.seconds
+    walk = USUAL["crowd"]["sway"]
+    if scale.domain == "crowd" and np.isfinite(clock):
+        text = f"people sway {clock:.3g} times in a second; expected {walk.low:g} to {walk.high:g}"
+        if told is None and scale.rate is not None:
+            yield Finding("gait", "note", f"{text}: the frame rate is taken from this")
+        elif walk.score(clock) > -4:
+            yield Finding("gait", "note", f"{text}: the time scale is right to about a tenth")
+        else:
+            right = 1 / np.sqrt(walk.low * walk.high) * clock
+            cure = f"times multiplied by {right:.2g} would be usual"
+            if scale.rate is not None:
+                cure = f"{scale.rate / right:.3g} frames/s would be usual"
+            yield Finding("time_scale", "error", f"{text} ({walk.source}); {cure}")
+    if np.isfinite(speed) and usual.score(speed) < -2:
+        yield Finding(
+            "speed", "error" if usual.score(speed) < -8 else "warning",
+            f"{who} {speed:.3g} m/s (median of those who move); expected {usual.low:g} to "
+            f"{usual.high:g} m/s: {usual.source}; check rate and units",
+        )  # fmt: skip
+
+
+def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
+    """Steps, and accelerations over a second, that nobody can have (m, s)."""
+    yield from _jumps(tracks, domain)
+    moves = tracks.moves(max(1, round(1.0 / tracks.dt)) if tracks.dt > 0 else 1)
+    if not len(moves):
+        return
+    v = (tracks.x[moves.last] - tracks.x[moves.first]) / moves.took[:, None]
+    # the next second of the same agent begins where this one ends
+    next_ = np.searchsorted(moves.first, moves.last).clip(max=len(moves) - 1)
+    good = moves.first[next_] == moves.last
+    a = np.linalg.norm(v[next_] - v, axis=1)[good] / moves.took[good]
+    if a.size and (a > FRICTION).mean() > 0.001:
+        yield Finding(
+            "acceleration", "warning",
+            f"{(a > FRICTION).mean():.1%} of the changes of speed over a second exceed "
+            f"{FRICTION:g} m/s², what friction can give; 99 % are below "
+            f"{np.percentile(a, 99):.3g} m/s²: the time scale or the positions are off",
+        )  # fmt: skip
+
+
+def _jumps(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
+    """Steps that are too long, and pairs of agents that take each other's place in one."""
+    steps, limits = tracks.moves(1), LIMITS[domain]
+    fast = steps.size > limits.max_speed * steps.took + limits.noise
+    if not fast.any():
+        return
+    first, last = steps.first[fast], steps.last[fast]
+    reach = limits.reach + float(np.median(steps.size))
+    swaps = [
+        (i, j)
+        for at in np.unique(tracks.time[last])
+        for i, j in combinations(np.flatnonzero(tracks.time[last] == at)[:SOME], 2)
+        if np.linalg.norm(tracks.x[last[i]] - tracks.x[first[j]]) < reach
+        and np.linalg.norm(tracks.x[last[j]] - tracks.x[first[i]]) < reach
+    ]
+    who = sorted({tracks.names[i] for i in tracks.agent[first]})
+    text = (
+        f"{fast.sum()} of {len(steps)} steps are faster than {limits.max_speed:g} m/s, of "
+        f"{_some(who)}"
+    )
+    if swaps:
+        names = [tracks.names[tracks.agent[first[i]]] for i in swaps[0]]
+        text += (
+            f"; in {len(swaps)} pairs of them two agents take each other's place, first "
+            f"{names[0]} and {names[1]} at {tracks.time[last[swaps[0][0]]]:g} s: their identifiers "
+            "are swapped"
+        )
+    yield Finding("swap" if swaps else "jump", "error", text)
+
+
+def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
+    """Which way agents go (m)."""
+    start, end = ends(tracks)
+    net = tracks.x[end] - tracks.x[start]
+    if domain == "traffic":
+        net = _usual(tracks)[:, None] * (end - start)[:, None]
+    went = np.abs(net).max(axis=1) > 3 * LIMITS[domain].noise
+    if not went.any():
+        return
+    if domain == "crowd":
+        axis = int(np.argmax(np.abs(net[went]).sum(axis=0)))
+        forth = float((net[went, axis] > 0).mean())
+        yield Finding(
+            "direction", "note",
+            f"people walk along {'xy'[axis]}, {forth:.0%} of them towards larger values",
+        )  # fmt: skip
+        return
+    back = net[went, 0] < 0
+    if not back.any():
+        return
+    if back.all():
+        text = "all vehicles drive towards smaller positions; data.direction=-1 turns them"
+        yield Finding("direction", "warning", text)
+        return
+    lanes = np.zeros(went.sum(), int) if tracks.lane is None else tracks.lane[start][went]
+    both = [i for i in np.unique(lanes) if 0 < back[lanes == i].mean() < 1]
+    names = [str(tracks.lanes[i]) for i in both] if tracks.lane is not None else []
+    where = f" in lane {_some(names)}" if names else ""
+    opposed = "both ways" + where if both else "one way in some lanes, the other way in others"
+    yield Finding(
+        "direction", "error" if min(back.mean(), 1 - back.mean()) > EDGE else "warning",
+        f"vehicles drive {opposed}: {back.mean():.0%} of {back.size} towards smaller positions; "
+        "choose one direction with data.lane, or tell the lanes apart",
+    )  # fmt: skip
+
+
+def _usual(tracks: Tracks) -> np.ndarray:
+    """Median step of every agent along the lane: one that is wrong does not turn it."""
+    same = np.diff(tracks.agent) == 0
+    step = pd.Series(np.diff(tracks.x[:, 0])[same])
+    found = step.groupby(tracks.agent[1:][same]).median()
+    return np.array(found.reindex(np.unique(tracks.agent)).fillna(0.0), dtype=float)
+
+
+def ends(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
+    """First and last row of every agent."""
+    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
+    return start, np.append(start[1:], len(tracks)) - 1
+
+
+def coming_and_going(tracks: Tracks, domain: Domain, whole: bool) -> Iterator[Finding]:
+    """Who is there, who enters and leaves, and whose record breaks off where nobody can (m, s).
+
+    Args:
+        whole: whether records begin and end where agents come and go, not where they were cut.
+    """
+    start, end = ends(tracks)
+    times, count = np.unique(tracks.time, return_counts=True)
+    span = times[-1] - times[0]
+    yield Finding(
+        "agents", "note",
+        f"{len(start)} {'people' if domain == 'crowd' else 'vehicles'} in {span:.5g} s, "
+        f"{np.median(count):.0f} at a time (at most {count.max()}), each for "
+        f"{np.median(tracks.time[end] - tracks.time[start]):.3g} s",
+    )  # fmt: skip
+    if not whole:
+        return
+    axis = int(np.argmax(np.abs(tracks.x[end] - tracks.x[start]).sum(axis=0)))
+    low, high = np.percentile(tracks.x[:, axis], [1, 99])
+    edge = EDGE * (high - low)
+
+    def inside(rows: np.ndarray, moment: float) -> np.ndarray:
+        at = tracks.x[rows, axis]
+        found: np.ndarray = (at > low + edge) & (at < high - edge)
+        return found & (np.abs(tracks.time[rows] - moment) > tracks.dt)
+
+    born, gone = inside(start, times[0]), inside(end, times[-1])
+    if not (born.any() or gone.any()):
+        return
+    again = _continued(tracks, start[born], end[gone], domain)
+    text = (
+        f"{born.sum()} agents appear and {gone.sum()} vanish in the middle of what is covered, "
+        "away from its ends and from the recording's"
+    )
+    if again:
+        text += (
+            f"; {len(again)} of those who appear carry on where another broke off (such as "
+            f"{again[0][0]} as {again[0][1]}): identifiers change along the way"
+        )
+    many = max(born.mean(), gone.mean()) > EDGE
+    yield Finding("broken", "warning" if again or many else "note", text)
+
+
+def _continued(
+    tracks: Tracks, born: np.ndarray, gone: np.ndarray, domain: Domain
+) -> list[tuple[str, str]]:
+    """Agents that end and others that begin where these would be, within ten samples."""
+    if not (len(born) and len(gone)):
+        return []
+    found = []
+    # time as a third coordinate: ten samples count like the reach
+    clock = LIMITS[domain].reach / (10 * tracks.dt)
+    before = np.maximum(gone - 1, 0)
+    v = (tracks.x[gone] - tracks.x[before]) / tracks.dt
+    v[tracks.agent[before] != tracks.agent[gone]] = 0
+    tree = cKDTree(np.column_stack([tracks.x[born], clock * tracks.time[born]]))
+    for k in range(1, 11):
+        then = tracks.x[gone] + k * tracks.dt * v
+        at = np.column_stack([then, clock * (tracks.time[gone] + k * tracks.dt)])
+        away, which = tree.query(at, distance_upper_bound=LIMITS[domain].reach / 2)
+        for i in np.flatnonzero(np.isfinite(away)):
+            row = born[which[i]]
+            late = tracks.time[row] - tracks.time[gone[i]]
+            if 0 < late < 10.5 * tracks.dt and tracks.agent[row] != tracks.agent[gone[i]]:
+                found.append((tracks.names[tracks.agent[gone[i]]], tracks.names[tracks.agent[row]]))
+    return sorted(set(found))
+
+
+def faults(found: list[Fault], sequences: int) -> Iterator[Finding]:
+    """What no vehicle and no person can have done, as :mod:`nnode.data.quality` finds it."""
+    counts = Counter(kind for kind, _ in {(f.kind, f.sequence) for f in found})
+    for kind, number in counts.most_common():
+        if kind == "too_short":
+            continue
+        first = next(f for f in found if f.kind == kind)
+        level = "error" if number > 0.1 * sequences else "warning"
+        yield Finding(
+            kind, level,
+            f"{KINDS[kind]}: in {number} of {sequences} sequences, first in {first.sequence}"
+            + (f" at {first.time:g} s" if first.time is not None else "")
+            + f": {first.detail}",
+        )  # fmt: skip
+
+
+def _some(names: list[str], most: int = 5) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,262 @@
+"""Units and time scale: which of those that come into question make what was measured possible.
+
+Every combination of units is weighed by how likely it makes a few medians: the speed, the distance
+to the nearest agent, the length of vehicles, the sampling interval, and whether speeds in the file
+are those of its positions. Between the ends of a range that people or vehicles are seen in, a
+median counts fully; outside, it falls off like a normal density of its logarithm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from nnode.data.check.gait import sway
+from nnode.data.check.tracks import Moves, Tracks
+from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
+from nnode.data.sequence import Domain
+
+#: Seconds by unit of time; frames last as long as their rate tells.
+TIME_UNITS = {"s": 1.0, "ms": 1e-3}
+#: Frame rates of cameras and of published files, 1/s, the usual ones first: they win ties.
+RATES = (25.0, 30.0, 10.0, 16.0, 15.0, 50.0, 60.0, 20.0, 24.0, 29.97, 12.5, 5.0, 2.5)
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a median lies, and by what factor (its logarithm's standard deviation) it may miss it.
+
+    Attributes:
+        low, high: SI units.
+        spread: of the logarithm.
+        source: in words.
+    """
+
+    low: float
+    high: float
+    spread: float
+    source: str
+
+    def score(self, value: float) -> float:
+        """Logarithm of the likelihood, 0 within; at least -12: one median shall not decide all."""
+        if not (value > 0 and math.isfinite(value)):
+            return 0.0
+        away = max(math.log(self.low / value), math.log(value / self.high), 0.0) / self.spread
+        return max(-0.5 * away**2, -12.0)
+
+
+#: What is usual, by domain and quantity.
+USUAL: dict[Domain, dict[str, Range]] = {
+    "crowd": {
+        "speed": Range(
+            0.2, 1.6, 0.19,
+            "free walking 1.34 ± 0.26 m/s (Weidmann 1993), less in a crowd",
+        ),
+        "nearest": Range(
+            0.4, 6.0, 0.3,
+            "5.4 people on a square metre at most (Weidmann 1993), 0.43 m from each other",
+        ),
+        "sway": Range(
+            0.8, 1.08, 0.08,
+            "people sway once in two steps, of which they make 2.0 ± 0.13 in a second (MacDougall "
+            "& Moore 2005), 1.6 in a dense crowd",
+        ),
+    },
+    "traffic": {
+        "speed": Range(1.0, 42.0, 0.2, "from a jam to 150 km/h"),
+        "nearest": Range(
+            5.5, 120.0, 0.25,
+            "a car's length and the gap of standing cars (Treiber & Kesting 2013: 2 m); at most "
+            "about 5 s behind at 25 m/s",
+        ),
+        "length": Range(3.5, 7.0, 0.12, "cars are 3.5 to 5 m long; up to half trucks"),
+    },
+}  # fmt: skip
+INTERVAL = Range(0.02, 1.0, 0.4, "recordings take 1 to 50 samples in a second")
+#: How near speeds in a file are to those of its positions; beyond, one of them is wrong.
+AGREE = Range(0.995, 1.005, 0.025, "two measurements of one motion")
+#: What units are expected at all, without a name that tells: most data are in SI units.
+_BEFORE = {
+    "m": 1.0, "cm": 0.1, "ft": 0.03, "km": 0.01,
+    "s": 1.0, "ms": 0.1, "frame": 0.3,
+    "m/s": 1.0, "km/h": 0.2, "ft/s": 0.03, "mph": 0.03,
+}  # fmt: skip
+#: The same for two coordinates that are of vehicles, though nothing names a vehicle or a lane.
+_UNNAMED = 0.02
+#: The same for another rate than the one that is told, which is copied from set to set.
+_OTHER = 0.1
+#: The same for a unit that the file says it is not.
+_AGAINST = 0.002
+
+
+@dataclass(frozen=True)
+class Medians:
+    """What is known in the file's own units; NaN where it is not.
+
+    Attributes:
+        speed: of those that move, length by time.
+        nearest: distance to the nearest agent at the same time, or to the next one in the lane.
+        length: of vehicles.
+        dt: sampling interval.
+        ratio: distance covered by what the file's speeds say was covered.
+        sway: of people, cycles per unit of time.
+    """
+
+    speed: float
+    nearest: float
+    length: float
+    dt: float
+    ratio: float
+    sway: float
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Units of a file, and how sure they are.
+
+    Attributes:
+        domain: that they make possible.
+        position, time, speed: units.
+        rate: frames per second, where times are frames.
+        probability: beside all other combinations.
+    """
+
+    domain: Domain
+    position: str
+    time: str
+    speed: str
+    rate: float | None
+    probability: float = 1.0
+
+    @property
+    def metres(self) -> float:
+        """Of a unit of length."""
+        return LENGTH_UNITS[self.position]
+
+    @property
+    def seconds(self) -> float:
+        """Of a unit of time."""
+        return TIME_UNITS[self.time] if self.rate is None else 1 / self.rate
+
+    @property
+    def per_second(self) -> float:
+        """m/s of a unit of speed."""
+        return SPEED_UNITS[self.speed]
+
+
+def medians(tracks: Tracks, domain: Domain) -> Medians:
+    """What the scale is told by."""
+    moves = tracks.moves()
+    speed = ratio = float("nan")
+    if len(moves):
+        each = moves.size / moves.took
+        moving = each > 0.1 * np.percentile(each, 90)
+        if moving.any():
+            speed = float(np.median(each[moving]))
+            ratio = _ratio(tracks, moves, moving)
+    length = float("nan")
+    if tracks.length is not None and np.isfinite(tracks.length).any():
+        # each agent once: standing ones have most rows
+        _, row = np.unique(tracks.agent, return_index=True)
+        own = tracks.length[row]
+        length = float(np.nanmedian(own)) if np.isfinite(own).any() else length
+    clock = sway(tracks) if domain == "crowd" else float("nan")
+    return Medians(speed, nearest(tracks, domain), length, tracks.dt, ratio, clock)
+
+
+def _ratio(tracks: Tracks, moves: Moves, moving: np.ndarray) -> float:
+    """Median over displacements of how far it was, by how far speed times time says."""
+    if tracks.speed is None:
+        return float("nan")
+    mean = (tracks.speed[1:] + tracks.speed[:-1]) / 2
+    gone = np.concatenate([[0.0], np.nancumsum(mean * np.diff(tracks.time))])
+    said = (gone[moves.last] - gone[moves.first])[moving]
+    known = said > 0
+    return float(np.median(moves.size[moving][known] / said[known])) if known.any() else np.nan
+
+
+def nearest(tracks: Tracks, domain: Domain, moments: int = 100) -> float:
+    """Median distance to the nearest agent at the same time, or to the next one in its lane."""
+    every, at = np.unique(tracks.time, return_inverse=True)
+    found = []
+    for k in np.unique(np.linspace(0, len(every) - 1, moments).astype(int)):
+        rows = np.flatnonzero(at == k)
+        if domain == "traffic":
+            lane = np.zeros(len(rows)) if tracks.lane is None else tracks.lane[rows]
+            order = np.lexsort((tracks.x[rows, 0], lane))
+            gaps = np.diff(tracks.x[rows, 0][order])[np.diff(lane[order]) == 0]
+            found.append(gaps[gaps > 0])
+        elif len(rows) > 1:
+            found.append(cKDTree(tracks.x[rows]).query(tracks.x[rows], k=2)[0][:, 1])
+    each = np.concatenate(found) if found else np.empty(0)
+    return float(np.median(each)) if each.size else float("nan")
+
+
+def scales(
+    known: Mapping[Domain, Medians],
+    told: Mapping[str, str],
+    *,
+    frames: bool,
+    rate: float | None = None,
+    speeds: bool = False,
+) -> list[Scale]:
+    """All combinations of units, the most probable first.
+
+    Args:
+        known: medians by the domains that come into question.
+        told: units by ``position``, ``time``, ``speed`` as the file tells them.
+        frames: whether times may be frames; then they are where ``told`` says so.
+        rate: frames per second as the file or the user tells.
+        speeds: whether the file has speeds.
+    """
+    found = []
+    for domain, values in known.items():
+        for position, (time, own), speed in product(
+            LENGTH_UNITS, _times(frames, rate), SPEED_UNITS if speeds else ("m/s",)
+        ):
+            one = Scale(domain, position, time, speed, own)
+            score = _expected(position, told.get("position")) + _expected(time, told.get("time"))
+            score += _expected(speed, told.get("speed")) if speeds else 0.0
+            score += math.log(_UNNAMED) if len(known) > 1 and domain == "traffic" else 0.0
+            if own is not None and own != rate:
+                score += math.log((_OTHER if rate else 1.0) / len(RATES))
+            found.append((score + _likely(one, values), one))
+    top = max(score for score, _ in found)
+    weights = np.array([math.exp(score - top) for score, _ in found])
+    weights /= weights.sum()
+    order = np.argsort(-weights, kind="stable")
+    return [
+        Scale(**{**vars(found[i][1]), "probability": float(weights[i])}) for i in order.tolist()
+    ]
+
+
+def _times(frames: bool, rate: float | None) -> Iterator[tuple[str, float | None]]:
+    for unit in TIME_UNITS:
+        yield unit, None
+    if frames:
+        for each in dict.fromkeys([*([rate] if rate else []), *RATES]):
+            yield "frame", each
+
+
+def _expected(unit: str, told: str | None) -> float:
+    if told is None:
+        return math.log(_BEFORE[unit])
+    return 0.0 if unit == told else math.log(_AGAINST * _BEFORE[unit])
+
+
+def _likely(scale: Scale, known: Medians) -> float:
+    usual = USUAL[scale.domain]
+    metres, seconds = scale.metres, scale.seconds
+    score = usual["speed"].score(known.speed * metres / seconds)
+    score += usual["nearest"].score(known.nearest * metres)
+    score += INTERVAL.score(known.dt * seconds)
+    if "length" in usual:
+        score += usual["length"].score(known.length * metres)
+    if "sway" in usual:
+        score += usual["sway"].score(known.sway / seconds)
+    return score + AGREE.score(known.ratio * metres / (scale.per_second * seconds))

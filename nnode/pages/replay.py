@@ -1,0 +1,160 @@
+"""A player: measured and simulated agents move side by side, one sequence at a time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from nnode.data.sequence import Sequence
+from nnode.plots.style import GREY, OKABE_ITO
+
+#: A player's sequences take at most so many bytes, and are at most so many.
+BYTES, MOST = 1_000_000, 60
+#: Samples that are closer in time are thinned out, s; in between, agents move evenly.
+FINEST = 0.1
+#: Positions farther away, m, come from a simulation that went astray, and are not shown.
+FAR = 1e7
+#: Length of a car that is drawn where lengths are unknown, m.
+CAR = 4.5
+#: Radius that is drawn of people, m.
+BODY = 0.2
+
+#: Colours of up to three simulations, those of the still figures.
+COLOURS = (OKABE_ITO["vermillion"], OKABE_ITO["blue"], OKABE_ITO["green"])
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A named place or time, shaded.
+
+    Attributes:
+        label: says what it is.
+        x, y: from and to, m; None: everywhere.
+        t: from and to on the recording's clock, s; None: always.
+        circle: x, y, radius, m.
+    """
+
+    label: str
+    x: tuple[float, float] | None = None
+    y: tuple[float, float] | None = None
+    t: tuple[float, float] | None = None
+    circle: tuple[float, float, float] | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """For the page."""
+        return {key: value for key, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sequence as measured and as models simulate it.
+
+    Attributes:
+        sequence: as measured.
+        simulated: ``(K, N, D)`` m by title, in the order of :data:`COLOURS`. Where it is no number
+            nothing is shown.
+    """
+
+    sequence: Sequence
+    simulated: dict[str, np.ndarray]
+
+
+@dataclass
+class ReplayBlock:
+    """A player on a page; in Markdown, a link to it.
+
+    Attributes:
+        name: ``[text](#figure-<name>)`` refers to the player.
+        scenes: the one to begin with first; as many as :data:`BYTES` and :data:`MOST` allow are
+            kept.
+        caption: in Markdown; says what to see.
+        alt: what moves, in words, for those who cannot see it.
+        zones: shaded in all scenes.
+        total: sequences that the scenes were chosen from; by default their number.
+    """
+
+    name: str
+    scenes: Iterable[Scene]
+    caption: str
+    alt: str
+    zones: list[Zone] = field(default_factory=list)
+    total: int | None = None
+
+    def data(self) -> tuple[str, str]:
+        """What the page holds, as JSON, and what must be said of it."""
+        scenes = list(self.scenes)
+        packed: list[str] = []
+        used = 0
+        for scene in scenes[:MOST]:
+            text = _json(_scene(scene))
+            used += len(text)
+            if packed and used > BYTES:
+                break
+            packed.append(text)
+        head = {
+            "colours": {"measured": GREY, "simulated": COLOURS},
+            "car": CAR,
+            "body": BODY,
+            "zones": [zone.plain() for zone in self.zones],
+        }
+        text = f'{_json(head)[:-1]},"scenes":[{",".join(packed)}]}}'
+        said = []
+        total = len(scenes) if self.total is None else self.total
+        if len(packed) < total:
+            said.append(f"{len(packed)} of {total} sequences are here.")
+        shown = [scene.sequence for scene in scenes[: len(packed)]]
+        if any(s.x.shape[2] == 1 and not _lengths(s) for s in shown):
+            said.append(f"Cars of unknown length are drawn {CAR:g} m long.")
+        if any(s.x.shape[2] == 2 for s in shown):
+            said.append(f"People are drawn with a radius of {BODY:g} m.")
+        return text, " ".join(said)
+
+
+def _json(value: Any) -> str:
+    # a "<" could end the element that holds the text
+    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.replace("<", "\\u003c")
+
+
+def _lengths(s: Sequence) -> bool:
+    return s.length is not None and bool(np.isfinite(s.length).any())
+
+
+def _scene(scene: Scene) -> dict[str, Any]:
+    s = scene.sequence
+    every = max(1, int(FINEST / s.dt + 1e-6)) if s.n_samples > 1 else 1
+    keep = slice(None, None, every)
+    found: dict[str, Any] = {
+        "name": s.name,
+        "start": round(float(s.time[0]), 3),
+        "dt": round(every * s.dt, 6) if s.n_samples > 1 else 1.0,
+        "dims": s.x.shape[2],
+        "measured": packed(s.x[keep]),
+        "simulated": [{"title": t, "x": packed(x[keep])} for t, x in scene.simulated.items()],
+    }
+    if s.length is not None and _lengths(s):
+        found["length"] = [round(float(one), 2) if np.isfinite(one) else CAR for one in s.length]
+    if s.walls is not None and len(s.walls):
+        found["walls"] = np.round(s.walls, 2).tolist()
+    return found
+
+
+def packed(x: np.ndarray) -> list[list[int | None]]:
+    """Positions ``(K, N, D)`` in m as ``N D`` rows of whole centimetres.
+
+    A number is the step from the one before it in its row, which keeps it short; None: absent.
+    """
+    columns = np.asarray(x, float).reshape(len(x), -1).T
+    rows: list[list[int | None]] = []
+    for column in columns:
+        there = np.abs(np.nan_to_num(column, nan=np.inf)) < FAR
+        steps = np.diff(np.round(100 * column[there]).astype(int), prepend=0)
+        row: list[int | None] = [None] * len(column)
+        for place, step in zip(np.flatnonzero(there).tolist(), steps.tolist(), strict=True):
+            row[place] = step
+        rows.append(row)
+    return rows

@@ -1,0 +1,61 @@
+"""A study's player: some of its sequences beside calibrated models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as Many
+
+import numpy as np
+import torch
+
+from nnode.data.sequence import Sequence, collate
+from nnode.errors import SimulationError
+from nnode.models.system import System
+from nnode.pages.replay import ReplayBlock, Scene
+from nnode.solvers.fused.engine import FusedSolver
+
+
+def spread(items: Many[Sequence], number: int) -> list[Sequence]:
+    """At most so many of some sequences, evenly chosen."""
+    return list(items[:: max(1, -(-len(items) // number))])
+
+
+def scenes(
+    sequences: Iterable[Sequence], systems: Mapping[str, System], dt: float | None = None
+) -> list[Scene]:
+    """Sequences as measured and as models simulate them; nobody is there once a model blows up.
+
+    Args:
+        systems: models by title.
+        dt: step, s; by default the domain's.
+    """
+    solver = FusedSolver(dt)
+    return [
+        Scene(s, {title: _simulated(system, s, solver) for title, system in systems.items()})
+        for s in sequences
+    ]
+
+
+@torch.no_grad()
+def _simulated(system: System, s: Sequence, solver: FusedSolver) -> np.ndarray:
+    try:
+        return solver(system.double(), collate([s])).x[:, 0].numpy()
+    except SimulationError:
+        return np.concatenate([s.x[:1], np.full_like(s.x[1:], np.nan)])
+
+
+def player(name: str, every: list[Scene], what: str, total: int) -> ReplayBlock:
+    """The player of some scenes.
+
+    Args:
+        what: which sequences and models they are, as a sentence.
+        total: sequences that they were chosen from.
+    """
+    return ReplayBlock(
+        name,
+        every,
+        f"{what} Outlines are where agents were measured; arrows, the residuals, go there from "
+        "where they are simulated.",
+        f"Player of {len(every)} sequences: agents as measured and as simulated.",
+        total=total,
+    )

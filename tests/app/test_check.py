@@ -1,0 +1,72 @@
+"""``scripts/check.py`` from a file to a page, and to the options that read the file."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from nnode.app.check import sentence, summary
+from nnode.data.check.examine import examine
+from nnode.data.store import Store
+from tests.app.conftest import Script
+from tests.data.check.planted import cars, people, saved, text
+
+
+def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
+    table = cars()
+    table["t"] = (1000 * table["t"]).round().astype(int)
+    table["x"] /= -0.3048
+    table["length"] /= 0.3048
+    file = saved(table.rename(columns={"veh": "Vehicle ID"}), tmp_path, "my cars.csv")
+    done = script("check", f"file='{file}'", f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 0, done.stderr
+    assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors, 1 thing" in done.stdout
+    assert "look  direction: all vehicles drive towards smaller positions" in done.stdout
+    page = (tmp_path / "run" / "check.html").read_text(encoding="utf-8")
+    assert "Check of my cars.csv" in page
+    (line,) = [line for line in done.stdout.splitlines() if "prepare_data.py" in line]
+    _, command, *words = shlex.split(line)
+    assert command == "scripts/prepare_data.py"
+    read = script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
+    assert read.returncode == 0, read.stderr
+    options = Store(tmp_path / "data").manifest["options"]
+    assert (options["position_unit"], options["time_unit"]) == ("ft", "ms")
+    assert options["direction"] == -1
+    assert options["columns"]["vehicle"] == "Vehicle ID"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["file=$T/absent.csv"], "there is no file"),
+        (["file=$T"], "is a folder"),
+        (["file=$T/junk.csv"], "is no text"),
+        (["file=$T/junk.csv", "domain=sea"], "domain=sea: expected traffic, crowd, or null"),
+        (["file=$T/junk.csv", "frame_rate=-1"], "frame_rate=-1.0: expected a positive number"),
+        ([], "file is not set"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_told_in_a_line(
+    script: Script, tmp_path: Path, options: list[str], words: str
+) -> None:
+    (tmp_path / "junk.csv").write_bytes(bytes(range(256)))
+    given = [option.replace("$T", str(tmp_path)) for option in options]
+    done = script("check", *given, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode in (1, 2)
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_the_text_says_all(tmp_path: Path) -> None:
+    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
+    found = examine(text(people(), tmp_path, head, 100.0))
+    assert sentence(found).startswith("40 people, ")
+    told = summary(found, ["data=pedpy", "data.path=X"])
+    assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in told
+    assert "units: crowd, positions in cm, times in frames of 1/16 s (sure)" in told
+    assert told.endswith("  python scripts/prepare_data.py data=pedpy data.path=X")
+    for one in found.findings:
+        assert one.text in told

@@ -1,0 +1,331 @@
+"""Files with planted faults, and files that are right: what is said of them, what reads them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nnode.data.check.examine import Examination, examine, sure
+from nnode.data.options import VehicleTableOptions, WalkwayOptions
+from nnode.data.prepare import FORMATS
+from nnode.errors import ConfigError, DataError
+from tests.data.check.planted import cars, people, saved, text
+
+
+def said(found: Examination, level: str = "error") -> dict[str, str]:
+    """Findings of a level by kind."""
+    return {one.kind: one.text for one in found.findings if one.level == level}
+
+
+def vehicles(found: Examination) -> VehicleTableOptions:
+    assert found.source.group == "vehicles"
+    return cast(VehicleTableOptions, found.source.options)
+
+
+def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) -> None:
+    found = examine(saved(cars(), tmp_path))
+    assert said(found) == {}
+    assert said(found, "warning") == {}
+    options = vehicles(found)
+    assert options.columns == {"vehicle": "veh", "time": "t", "speed": "v"}
+    assert (options.position_unit, options.time_unit, options.speed_unit) == ("m", "s", "m/s")
+    assert (options.direction, options.dt) == (1, 0.2)
+    assert sure(found.scale.probability) == "sure"
+    kind = FORMATS[type(options)]
+    (platoon,) = kind.read(kind.files(options), options)
+    assert platoon.n_agents == 12
+    assert platoon.agents[-1] == "0"  # the leader
+    assert found.tracks.dt == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("speeds", [True, False])
+def test_feet_for_metres(tmp_path: Path, speeds: bool) -> None:
+    table = cars()
+    table[["x", "length"]] /= 0.3048
+    found = examine(saved(table if speeds else table.drop(columns="v"), tmp_path))
+    assert vehicles(found).position_unit == "ft"
+    assert said(found) == {}
+    assert np.ptp(found.tracks.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
+
+
+def test_speeds_in_kilometres_an_hour(tmp_path: Path) -> None:
+    table = cars()
+    table["v"] *= 3.6
+    found = examine(saved(table, tmp_path))
+    assert (vehicles(found).speed_unit, vehicles(found).position_unit) == ("km/h", "m")
+    assert said(found) == {}
+
+
+def test_milliseconds(tmp_path: Path) -> None:
+    table = cars()
+    table["t"] = (1000 * table["t"]).round().astype(int)
+    found = examine(saved(table, tmp_path))
+    assert (vehicles(found).time_unit, vehicles(found).position_unit) == ("ms", "m")
+    assert said(found) == {}
+
+
+def test_the_rate_of_frames_follows_from_speeds_in_the_file(tmp_path: Path) -> None:
+    table = cars(dt=0.04)
+    table["frame"] = (table.pop("t") / 0.04).round().astype(int)
+    found = examine(saved(table, tmp_path))
+    options = vehicles(found)
+    assert (options.time_unit, options.frame_rate) == ("frame", 25.0)
+    assert options.columns["time"] == "frame"
+    assert said(found) == {}
+    assert found.tracks.dt == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.5, 0.25])
+def test_a_clock_that_is_wrong_is_told_by_speeds_in_the_file(tmp_path: Path, factor: float) -> None:
+    table = cars()
+    table["t"] *= factor
+    found = examine(saved(table, tmp_path))
+    text = said(found)["time_scale"]
+    drive = re.search(r"by their positions vehicles drive ([\d.]+) m/s", text)
+    assert drive is not None
+    assert float(drive[1]) == pytest.approx(12 / factor, rel=0.01)
+    assert f"times multiplied by {1 / factor:.3g} would agree" in text
+
+
+def test_a_mirrored_direction_is_turned(tmp_path: Path) -> None:
+    found = examine(saved(cars().assign(x=lambda t: -t["x"]), tmp_path))
+    assert vehicles(found).direction == -1
+    assert "data.direction=-1" in said(found, "warning")["direction"]
+    assert said(found) == {}
+
+
+def test_one_that_drives_the_other_way_is_seen(tmp_path: Path) -> None:
+    table = cars()
+    table.loc[table["veh"] < 3, "x"] *= -1
+    text = said(examine(saved(table, tmp_path)))["direction"]
+    assert "both ways in lane 1: 25% of 12 towards smaller positions" in text
+
+
+def test_swapped_identifiers_are_seen(tmp_path: Path) -> None:
+    table = cars()
+    late = table["t"] > 20
+    one, two = late & (table["veh"] == 3), late & (table["veh"] == 4)
+    table.loc[one, "veh"], table.loc[two, "veh"] = 4, 3
+    found = examine(saved(table, tmp_path))
+    assert "the path of car" in said(found)["identity_swap"]
+    assert "at 20" in said(found)["identity_swap"]
+    assert "(id 4) carries on as car 8 (id 3)" in said(found)["identity_swap"]
+    text = said(found)["swap"]
+    assert "2 of 4800 steps are faster than 60 m/s, of 3, 4; in 1 pairs of them" in text
+    assert "first 3 and 4 at 20.1 s" in text
+
+
+def test_identifiers_that_change_along_the_way_are_seen(tmp_path: Path) -> None:
+    table = cars()
+    table.loc[(table["t"] > 20) & (table["veh"] == 5), "veh"] = 99
+    table.loc[(table["t"] > 12) & (table["veh"] == 7), "veh"] = 98
+    text = said(examine(saved(table, tmp_path)), "warning")["broken"]
+    assert "2 agents appear and 2 vanish" in text
+    assert "2 of those who appear carry on where another broke off (such as 5 as 99)" in text
+
+
+def test_cells_rows_and_holes(tmp_path: Path) -> None:
+    table = cars().astype({"x": object})
+    table.loc[100, "x"] = "oops"
+    table.loc[101, "x"] = None
+    table = pd.concat([table, table.iloc[[7, 7]]])
+    table = table.drop(index=range(600, 640))
+    found = examine(saved(table, tmp_path))
+    wrong = said(found)
+    assert "column 'x' (x) holds no number in 2 of" in wrong["cells"]
+    assert "first 'oops' in line 102" in wrong["cells"]
+    assert (
+        "2 rows have an agent and a time that stood there before (2 of them" in wrong["duplicates"]
+    )
+    assert "refuses it" in wrong["reader"]
+    assert "the longest of 4.1 s" in said(found, "note")["holes"]
+    assert "readers sort them" in said(found, "note")["unsorted"]
+
+
+def test_overlaps_are_seen(tmp_path: Path) -> None:
+    table = cars()
+    table.loc[table["veh"] == 3, "x"] = table.loc[table["veh"] == 4, "x"].to_numpy() + 0.5
+    assert "overlap" in said(examine(saved(table, tmp_path)))
+
+
+def test_people_in_text_whose_header_tells_all(tmp_path: Path) -> None:
+    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
+    found = examine(text(people(), tmp_path, head, 100.0))
+    assert said(found) == said(found, "warning") == {}
+    options = cast(WalkwayOptions, found.source.options)
+    assert found.source.group == "pedpy"
+    assert (options.frame_rate, options.unit) == (None, None)
+    assert "right to about a tenth" in said(found, "note")["gait"]
+    assert "50% of them towards larger values" in said(found, "note")["direction"]
+
+
+def test_people_in_centimetres_whose_rate_nobody_tells(tmp_path: Path) -> None:
+    found = examine(text(people(), tmp_path, "", 100.0))
+    options = cast(WalkwayOptions, found.source.options)
+    assert options.unit == "cm"
+    assert options.frame_rate == pytest.approx(16, rel=0.15)  # by their gait
+    assert "of a rate that the file does not tell" in said(found, "warning")["units"]
+    assert " 16" in said(found, "warning")["units"]
+    known = examine(found.path, rate=16.0)
+    assert said(known, "warning") == {}
+    assert cast(WalkwayOptions, known.source.options).frame_rate == 16.0
+
+
+def test_a_wrong_rate_is_told_by_peoples_gait_alone(tmp_path: Path) -> None:
+    head = "# framerate: 30 fps\n# id frame x/m y/m z/m\n"
+    text_ = said(examine(text(people(), tmp_path, head)))["time_scale"]
+    walk = re.search(r"at the 30 frames/s that are told, people walk ([\d.]+) m/s", text_)
+    assert walk is not None
+    assert float(walk[1]) == pytest.approx(1.3 * 30 / 16, rel=0.1)
+    assert "16 frames/s fit" in text_ or "15 frames/s fit" in text_
+
+
+def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
+    """Frames that count 15 in a second, velocities of their own, taken for 25 frames/s."""
+    table = people(rate=2.5, length=16.0, number=60)
+    table["frame"] *= 6  # every sixth frame of 15 in a second
+    faster = 1.47 / table["vx"].abs().median()
+    table["x"], table["vx"] = faster * table["x"], faster * table["vx"]
+    rows = table.assign(a=0.0, b=0.0)[["frame", "id", "x", "a", "y", "vx", "b", "vy"]]
+    path = tmp_path / "obsmat.txt"
+    path.write_text(rows.sort_values("frame").to_csv(sep=" ", header=False, index=False))
+    found = examine(path, rate=25.0)
+    assert found.meanings["agent"].column == "column 2"
+    assert found.meanings["y"].column == "column 5"
+    text_ = said(found)["time_scale"]
+    assert "at the 25 frames/s that are told, people walk 2.4" in text_
+    assert "its own velocities say 1.4" in text_
+    assert "15 frames/s fit" in text_
+    # and the file that would be read says so
+    assert found.source.group == "pedpy"
+    lines = "\n".join(found.source.convert)
+    exec(compile(lines, "convert", "exec"), {})
+    options = found.source.options
+    kind = FORMATS[type(options)]
+    sequences = kind.read(kind.files(options), options)
+    speed = np.concatenate([np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt
+                            for s in sequences])  # fmt: skip
+    assert np.median(speed) == pytest.approx(1.47, rel=0.05)
+
+
+def test_pairs_and_tidy_tables_and_semicolons(tmp_path: Path) -> None:
+    table = cars(2)
+    lead, follow = (table[table["veh"] == i].reset_index() for i in (0, 1))
+    pairs = pd.DataFrame(
+        {"t": lead["t"], "xFollower": follow["x"], "x_leader": lead["x"],
+         "v_follower": follow["v"], "v_leader": lead["v"]}
+    )  # fmt: skip
+    found = examine(saved(pairs, tmp_path, "pairs.csv"))
+    assert found.source.group == "pairs"
+    assert said(found) == {}
+    assert len(found.sequences) == 1
+    tidy = cars().rename(columns={"veh": "agent", "t": "time"}).assign(sequence=0)
+    found = examine(saved(tidy[["sequence", "time", "agent", "x"]], tmp_path, "tidy.csv"))
+    assert found.source.group == "table"
+    assert len(found.sequences) == 1
+    path = tmp_path / "german.csv"
+    cars().to_csv(path, index=False, sep=";", decimal=",")
+    found = examine(path)
+    assert found.source.group == "vehicles"
+    exec(compile("\n".join(found.source.convert), "convert", "exec"), {})
+    options = found.source.options
+    kind = FORMATS[type(options)]
+    (platoon,) = kind.read(kind.files(options), options)
+    assert platoon.n_agents == 12
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b" \n\n", "is empty"),
+        (bytes(range(256)) * 20, "is no text"),
+        (b"veh,t,x,lane\n", "has no rows below"),
+        (b"veh,t,x,lane\n1,0,5,1\n", "1 row, in which no agent"),
+        (b"just some words in a letter\nand more of them\n", "no column was recognised"),
+        (b"# only\n# comments\n", "no rows below its comments"),
+        (b"a,b\n1,2\n", "is no table of trajectories"),
+        (b"<html><body></body></html>", "expected the root element <fcd-export>"),
+        (b"PAR1 and then nothing", "give it a name that ends in .parquet"),
+        (b"SQLite format 3\0 nothing", "cannot be read as a JuPedSim database"),
+        (b"1 2 nan nan 0\n1 3 nan nan 0\n", "no column was|in which no agent"),
+        ("veh,t,x\n".encode("utf-16"), "UTF-16"),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "file.csv"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=words):
+        examine(path)
+
+
+def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no file"):
+        examine(tmp_path / "absent.csv")
+    with pytest.raises(ConfigError, match="is a folder"):
+        examine(tmp_path)
+
+
+REAL = {
+    "esimas/sequence_data1-1_1.mat": ("esimas", "traffic"),
+    "juelich/bi_corr_400_b_03.txt": ("pedpy", "crowd"),
+    "juelich/bo-360-090-090.txt": ("pedpy", "crowd"),
+    "ngsim/i80_lanes_1_2.csv": ("vehicles", "traffic"),
+    "ngsim_pairs/i80_pairs.parquet": ("pairs", "traffic"),
+    "tgsim/pairs.parquet": ("pairs", "traffic"),
+    "openacc/astazero.parquet": ("astazero", "traffic"),
+    "openacc/zalazone/mixed_dynamic_part7.csv": ("openacc", "traffic"),
+}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", REAL)
+def test_real_files_are_recognised(real_data: Path, name: str) -> None:
+    found = examine(real_data / name)
+    assert (found.source.group, found.scale.domain) == REAL[name]
+    assert found.sequences
+    assert "time_scale" not in said(found)
+    assert "reader" not in said(found)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("told", "wrong"), [(16.0, False), (25.0, True), (10.0, True)])
+def test_real_people_tell_their_rate(real_data: Path, told: float, wrong: bool) -> None:
+    """HERMES took 16 frames in a second, as its archive says; nothing in the file does."""
+    found = examine(real_data / "juelich" / "bo-360-050-050.txt", rate=told)
+    assert ("time_scale" in said(found)) == wrong
+
+
+def test_random_damage_ends_in_words_or_in_findings(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    good = [saved(cars(3, 3.0), tmp_path), text(people(4), tmp_path, "# framerate: 16 fps\n")]
+    contents = [path.read_bytes() for path in good]
+    examined, refused = 0, list[str]()
+    for trial in range(60):
+        content = bytearray(contents[trial % 2])
+        for _ in range(int(rng.integers(1, 8))):
+            at = int(rng.integers(0, len(content)))
+            match int(rng.integers(0, 5)):
+                case 0:
+                    content[at] = int(rng.integers(0, 256))
+                case 1:
+                    del content[at : at + int(rng.integers(1, 200))]
+                case 2:
+                    content[at:at] = rng.choice([b",", b"\n", b"nan", b"-", b"1e400", b"x"])
+                case 3:
+                    content[at:at] = content[: int(rng.integers(1, 400))]
+                case _:
+                    content = content[: max(at, 1)]
+        path = tmp_path / "damaged.csv"
+        path.write_bytes(bytes(content))
+        try:
+            examined += bool(examine(path).findings)
+        except DataError as error:
+            refused.append(str(error))
+    assert examined > 10
+    assert all(str(path) in words for words in refused)
