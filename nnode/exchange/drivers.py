@@ -202,11 +202,12 @@ class Drivers:
         code = [t for t in self._terms if t.memory and not begins(t, order)]
         if not code:
             return []
-        gap, gap_1 = given["gaps"]
-        ahead = np.where(seen.gap <= self._far, gap, 2 * PADDING_GAP)
-        next_one = np.where((seen.lead >= 0) & (given["second"] > 0), gap_1, 2 * PADDING_GAP)
+        nobody = 2 * PADDING_GAP
+        ahead = np.where(seen.gap <= self._far, seen.gap, nobody)
+        lead = given["lead"]
+        next_one = np.where(lead >= 0, ahead[lead], nobody)
         x = np.stack([0 * ahead, ahead, ahead + next_one], 1)
-        v = np.stack([given["v"], given["v_1"], given["v_2"]], 1)
+        v = np.stack([given["v"], given["v_1"], given["v_1"]], 1)
         places, speeds = torch.from_numpy(x)[..., None], torch.from_numpy(v)[..., None]
         with torch.no_grad():
             told = torch.cat([t.remember(places, speeds, self._system) for t in code], -1)

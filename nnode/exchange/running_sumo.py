@@ -185,10 +185,12 @@ class RunningSumo:
             if at < 0 and name not in others:
                 others[name] = max(float(every.getSpeed(name)), 0.0)
             lead[i], v_1[i] = at, v[at] if at >= 0 else others[name]
-            after = every.getLeader(name, LOOK) if twice else None
+            after = every.getLeader(name, LOOK) if twice and at < 0 else None
             if after and after[0]:
                 gap_1[i] = after[1] + self._min_gap_of(name) + self._length_of(after[0])
                 v_2[i] = max(float(every.getSpeed(after[0])), 0.0)
+        led = np.flatnonzero(lead >= 0)
+        gap_1[led], v_2[led] = gap[lead[led]], v_1[lead[led]]
         return Seen(v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2,
                     x=np.zeros(n))  # fmt: skip
 
