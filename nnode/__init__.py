@@ -9,14 +9,16 @@ from nnode.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from nnode.app.discover import diagnose_table as diagnose
+    from nnode.app.drive import drive_run as drive
     from nnode.app.notebook import fit
     from nnode.calibrate.checkpoint import load
 
-__all__ = ["__version__", "diagnose", "fit", "load"]
+__all__ = ["__version__", "diagnose", "drive", "fit", "load"]
 
 #: Where each name comes from: imported on first use, a short command should not wait for torch.
 _HOMES = {
     "diagnose": ("nnode.app.discover", "diagnose_table"),
+    "drive": ("nnode.app.drive", "drive_run"),
     "fit": ("nnode.app.notebook", "fit"),
     "load": ("nnode.calibrate.checkpoint", "load"),
 }

@@ -7,7 +7,7 @@ import sys
 
 import nnode
 
-NAMES = ["__version__", "diagnose", "fit", "load"]
+NAMES = ["__version__", "diagnose", "drive", "fit", "load"]
 
 
 def test_completion_finds_the_public_names_without_loading_torch() -> None:
