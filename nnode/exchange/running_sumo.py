@@ -10,7 +10,9 @@ import os
 import shutil
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +72,8 @@ class RunningSumo:
             ballistic = str(steps.method == "ballistic").lower()
             options += ["--step-length", repr(steps.seconds), "--step-method.ballistic", ballistic]
         try:
-            self.api.start([binary, *options])
+            with redirect_stdout(StringIO()):  # traci counts its attempts to connect
+                self.api.start([binary, *options])
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             raise ConfigError(f"sumo={scenario} cannot be loaded by SUMO: {error}") from error
         self._constants = self.api.constants
@@ -235,7 +238,9 @@ def _loaded(program: str) -> tuple[Any, str]:
         sys.path.append(tools)  # traci comes with SUMO
     binary = str(home / "bin" / "sumo") if home else shutil.which("sumo")
     try:
-        found = importlib.import_module(program)
+        # libsumo warns of a pyarrow of another version, which matters to tables that it would write
+        with redirect_stdout(StringIO()):
+            found = importlib.import_module(program)
     except ImportError as error:
         raise ConfigError(
             f"program={program} cannot be loaded ({error}); pip install nnode[sumo], or take "
