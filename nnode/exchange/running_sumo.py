@@ -67,6 +67,8 @@ class RunningSumo:
         options = [
             "-c", str(scenario), "--fcd-output", str(output), "--fcd-output.attributes",
             "id,type,speed,pos,lane", "--precision", str(DIGITS), "--no-step-log", "true",
+            # a law may stop closer than the type's minGap: a collision is where bodies touch
+            "--collision.mingap-factor", "0",
         ]  # fmt: skip
         if steps is not None:
             ballistic = str(steps.method == "ballistic").lower()

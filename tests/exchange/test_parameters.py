@@ -164,7 +164,7 @@ def test_no_gap_at_the_recorded_speed(speed: float) -> None:
     [crowd(), Traffic([NetworkSpeed(4)])],
 )
 def test_sumo_knows_no_other_model(model: System) -> None:
-    with pytest.raises(ConfigError, match=r"to=sumo: .* no law with a gap at rest"):
+    with pytest.raises(ConfigError, match=r"to=sumo: .* nor a law with a gap at rest.*drive\.py"):
         sumo_type(model, "x", 15.0, None)
 
 
