@@ -11,6 +11,7 @@ the second.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -19,7 +20,7 @@ import numpy as np
 import torch
 from scipy.special import kve
 
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.exchange.counterpart import (
     Counterpart,
@@ -32,7 +33,7 @@ from nnode.laws.crowd import CrowdRule
 from nnode.models import Relaxation, SocialForce, System
 from nnode.models.field_crowd import PEOPLE
 from nnode.models.own_law import FormulaForce
-from nnode.models.scene import wall_points
+from nnode.models.scene import Scene, wall_points
 
 
 @dataclass
@@ -44,18 +45,21 @@ class Scenes:
         points: number of wall points; 0 where no sequence has walls.
         spacing: distance of neighbouring wall points, m.
         speed: median of the measured speeds, m/s.
+        pace: median of people's preferred speeds, m/s, as laws of the field take them.
     """
 
     people: float
     points: float
     spacing: float
     speed: float
+    pace: float = math.nan
 
 
 def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
     """Look at all sequences, whose walls become points ``spacing`` (m) apart or closer."""
-    people, points, speeds, gaps = [], [], [], []
+    people, points, speeds, gaps, paces = [], [], [], [], []
     for s in sequences:
+        paces.append(Scene.of(collate([s]), spacing).pace[0].numpy())
         people.append(s.n_agents)
         speeds.append(np.linalg.norm(s.velocity(), axis=-1).ravel())
         number = 0
@@ -70,6 +74,7 @@ def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
         points=float(np.mean(points)),
         spacing=float(np.mean(gaps)) if gaps else spacing,
         speed=float(np.median(np.concatenate(speeds))),
+        pace=float(np.median(np.concatenate(paces))),
     )
 
 
@@ -85,6 +90,7 @@ def points_per_edge(r: float, B: float, spacing: float) -> float:
 
 #: Laws of the field that JuPedSim has.
 SAME = ("cfsm", "gcfm")
+_PACE = "desired_speed: the median of people's preferred speeds; each has his own"
 
 
 def has_parameters(system: System) -> bool:
@@ -127,7 +133,7 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
     own = {p: float(getattr(law, p).detach()) for p in law.scalars}
     assert isinstance(law.rule, CrowdRule)
     fixed = {name: value for name, (value, _) in law.rule.constants.items()}
-    agent: dict[str, Any] = {"desired_speed": scenes.speed}
+    agent: dict[str, Any] = {"desired_speed": scenes.pace}
     if name == "cfsm":
         agent |= {"time_gap": own["T"], "radius": own["l"] / 2}
         model = {
@@ -151,7 +157,7 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
             "the distance of bodies: JuPedSim takes points of the ellipses that are not on the "
             "line between the centres, and interpolates the force where they are near or far"
         )
-    found.notes.append("desired_speed: the median of the measured speeds; people may have others")
+    found.notes.append(_PACE)
     found.missing.append(
         "walls: the law has none, and those of JuPedSim push as they do by default"
     )
@@ -188,8 +194,11 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
         "forces are averaged over people here and summed there; accelerations between people are "
         "equal in a scene of so many"
     )
+    preferred = relaxation is not None and relaxation.preferred
     found.notes.append(
-        "desired_speed: the median of the measured speeds; the model itself keeps everybody's "
+        _PACE
+        if preferred
+        else "desired_speed: the median of the measured speeds; the model itself keeps everybody's "
         "present speed, which JuPedSim cannot"
     )
     if force.walls and not walls:
@@ -205,7 +214,7 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
         {"body_force": k, "friction": kappa},
         {
             "mass": mass,
-            "desired_speed": scenes.speed,
+            "desired_speed": scenes.pace if preferred else scenes.speed,
             "reaction_time": relaxation.tau if relaxation else 0.5,
             "agent_scale": strength,
             "obstacle_scale": obstacle,
