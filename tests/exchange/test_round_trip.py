@@ -143,8 +143,9 @@ def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
 def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
     jupedsim: ModuleType, tmp_path: Path
 ) -> None:
-    """Head-on the distance of bodies is the same in both, and so are accelerations: where bodies are
-    farther apart than JuPedSim's interpolation begins, and centres nearer than the law fades."""
+    """Head-on the distance of bodies is the same in both, and so are accelerations: where bodies
+    are farther apart than JuPedSim's interpolation begins, and centres nearer than the law fades.
+    """
     import shapely
 
     system = Crowd([law_from("gcfm", PEOPLE["gcfm"])])
