@@ -100,6 +100,9 @@ def drive_scenario(config: DictConfig, folder: Path) -> None:
         f"collisions: {found.collisions}, {found.driven_collisions} of them with driven vehicles; "
         f"teleports: {found.teleports}"
     )
+    if found.stranded:
+        hint = "" if config.lane_changes else "; lane_changes=true lets SUMO choose their lanes"
+        print(f"stopped where a lane did not lead on: {found.stranded} driven vehicles{hint}")
     print(f"took {found.wall:.2f} s, {found.in_sumo:.2f} s of them in SUMO's steps")
     print(f"trajectories: {found.trajectories}")
     print(f"account: {folder / 'drive.json'}")

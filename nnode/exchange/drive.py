@@ -30,6 +30,7 @@ class Drive:
         collisions: pairs of vehicles of which one ran into the other; driven_collisions: those
             with a driven one.
         teleports: vehicles that SUMO carried elsewhere.
+        stranded: driven vehicles that SUMO stopped where their lane did not lead on.
         wall: s that it took; in_sumo: of these within SUMO's own steps.
     """
 
@@ -43,6 +44,7 @@ class Drive:
     collisions: int = 0
     driven_collisions: int = 0
     teleports: int = 0
+    stranded: int = 0
     wall: float = 0.0
     in_sumo: float = 0.0
 
@@ -140,6 +142,7 @@ class _Job:
         self._zero = np.empty(0)  # m along the lane where the way began
         self._every: set[str] = set()
         self._crashed: set[tuple[str, str]] = set()
+        self._stranded: set[str] = set()
         self._teleports, self._steps, self._in_sumo = 0, 0, 0.0
         self._speeds, self._number = 0.0, 0
         self._take(sumo.vehicles)
@@ -164,6 +167,7 @@ class _Job:
         self._in_sumo += time.perf_counter() - before
         self._steps += 1
         self._crashed.update(sumo.collisions())
+        self._stranded.update(sumo.stranded())
         self._teleports += sumo.teleports()
         self._take(sumo.departed)
 
@@ -189,5 +193,6 @@ class _Job:
             collisions=len(self._crashed),
             driven_collisions=sum(not self._every.isdisjoint(pair) for pair in self._crashed),
             teleports=self._teleports,
+            stranded=len(self._stranded & self._every),
             in_sumo=self._in_sumo,
         )

@@ -68,7 +68,7 @@ class RunningSumo:
             "-c", str(scenario), "--fcd-output", str(output), "--fcd-output.attributes",
             "id,type,speed,pos,lane", "--precision", str(DIGITS), "--no-step-log", "true",
             # a law may stop closer than the type's minGap: a collision is where bodies touch
-            "--collision.mingap-factor", "0",
+            "--collision.mingap-factor", "0", "--aggregate-warnings", "3",
         ]  # fmt: skip
         if steps is not None:
             ballistic = str(steps.method == "ballistic").lower()
@@ -211,6 +211,10 @@ class RunningSumo:
     def teleports(self) -> int:
         """How many vehicles SUMO has begun to carry elsewhere in the last step."""
         return int(self.api.simulation.getStartingTeleportNumber())
+
+    def stranded(self) -> tuple[str, ...]:
+        """Vehicles that SUMO has stopped in the last step where their lane does not lead on."""
+        return tuple(self.api.simulation.getEmergencyStoppingVehiclesIDList())
 
     def close(self) -> None:
         self.api.close()

@@ -108,6 +108,7 @@ def test_idm_in_euler_s_steps(sumo: Path, program: str, tmp_path: Path) -> None:
     assert seen.v is not None
     assert seen.v.min() == 0  # they stop, and nobody drives backwards
     assert (found.driven, found.steps, found.collisions, found.teleports) == (7, 601, 0, 0)
+    assert found.stranded == 0
     assert found.mean_speed == pytest.approx(seen.v[:, :-1].mean(), rel=0.01)
 
 
@@ -240,6 +241,40 @@ def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path:
     assert changes.mean_speed is not None
     # who may not change lanes goes on behind 6 m/s
     assert stays.mean_speed < 8 < 10 < changes.mean_speed
+
+
+def test_who_stands_where_a_lane_does_not_lead_on(sumo: Path, program: str, tmp_path: Path) -> None:
+    (tmp_path / "a.nod.xml").write_text(
+        '<nodes><node id="a" x="0" y="0"/><node id="b" x="200" y="0"/>'
+        '<node id="c" x="400" y="0"/></nodes>'
+    )
+    (tmp_path / "a.edg.xml").write_text(
+        '<edges><edge id="e" from="a" to="b" numLanes="2" speed="20"/>'
+        '<edge id="f" from="b" to="c" numLanes="1" speed="20"/></edges>'
+    )
+    by_sumo.call(
+        sumo / "bin" / "netconvert", "-n", tmp_path / "a.nod.xml", "-e", tmp_path / "a.edg.xml",
+        "-o", tmp_path / "a.net.xml",
+    )  # fmt: skip
+    (tmp_path / "a.rou.xml").write_text(
+        '<routes><vType id="own"/><route id="r" edges="e f"/>'
+        + "".join(
+            f'<vehicle id="v{i}" type="own" route="r" depart="0" departLane="{i}"/>' for i in (0, 1)
+        )
+        + "</routes>"
+    )
+    path = tmp_path / "a.sumocfg"
+    path.write_text(
+        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
+        '</input><time><step-length value="0.1"/><end value="60"/></time></configuration>'
+    )
+    stays, changes = (
+        drive(model("idm"), path, ["own"], tmp_path / str(free), program=program, lane_changes=free)
+        for free in (False, True)
+    )
+    assert (stays.driven, stays.stranded, stays.steps) == (2, 1, 600)
+    assert changes.driven == 2
+    assert changes.steps < 400  # all have arrived
 
 
 def test_a_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_path: Path) -> None:
