@@ -14,7 +14,7 @@ import argparse
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -106,24 +106,22 @@ def measured(name: str, program: str, scenario: Path, folder: Path) -> dict[str,
 
 def rows(
     numbers: Sequence[int], laws: Sequence[str], programs: Sequence[str], repeats: int
-) -> list[dict[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """The best of some repeats for every case."""
 
     def best(call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return max((call() for _ in range(repeats)), key=lambda row: row["steps_per_s"])
 
-    found = []
     for number in numbers:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             scenario = scene(folder, number)
             for program in programs:
                 own = best(partial(alone, program, scenario, folder))
-                found.append({"vehicles": number, "program": program, "law": "SUMO's", **own})
+                yield {"vehicles": number, "program": program, "law": "SUMO's", **own}
                 for kind in laws:
                     more = best(partial(measured, kind, program, scenario, folder))
-                    found.append({"vehicles": number, "program": program, "law": kind, **more})
-    return found
+                    yield {"vehicles": number, "program": program, "law": kind, **more}
 
 
 def main() -> None:
@@ -136,12 +134,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark/driving.json"))
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    found = rows(asked.vehicles, asked.laws, asked.programs, asked.repeats)
-    for row in found:
+    found = []
+    for row in rows(asked.vehicles, asked.laws, asked.programs, asked.repeats):
+        found.append(row)
         share = f", {100 * row['in_sumo']:.0f} % in SUMO" if "in_sumo" in row else ""
         print(
             f"{row['vehicles']} vehicles, {row['law']} law, {row['program']}: "
-            f"{row['steps_per_s']:.0f} steps/s{share}"
+            f"{row['steps_per_s']:.0f} steps/s{share}",
+            flush=True,
         )
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(asked.out, {"rows": found})
