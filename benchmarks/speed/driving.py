@@ -90,13 +90,14 @@ def alone(program: str, scenario: Path, folder: Path) -> dict[str, Any]:
             steps += 1
     finally:
         sumo.close()
-    return {"steps_per_s": steps / (time.perf_counter() - started)}
+    return {"steps": steps, "steps_per_s": steps / (time.perf_counter() - started)}
 
 
 def measured(name: str, program: str, scenario: Path, folder: Path) -> dict[str, Any]:
     """The same with vehicles driven by a law."""
     found = drive(law(name), scenario, ["own"], folder, program=program)
     return {
+        "steps": found.steps,
         "steps_per_s": found.steps / found.wall,
         "in_sumo": found.in_sumo / found.wall,
         "driven": found.driven,

@@ -84,8 +84,8 @@ class Drivers:
         if far is not None and not 0 < far < EMPTY[0]:
             raise ConfigError(f"far={far} must be a distance in m, below {EMPTY[0]:g}, or null")
         lane = drivable(system)
-        self._system = system.double()
-        self._terms = cast(list[Term], list(system.terms))
+        self._system = copy.deepcopy(system).double()
+        self._terms = cast(list[Term], list(self._system.terms))
         self.lane, self.dt = stepped(lane, method), dt
         self._far, self._lengths = EMPTY[1] if far is None else far, lengths
         self._rng = np.random.default_rng(seed)
