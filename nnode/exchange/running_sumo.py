@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -75,7 +76,8 @@ class RunningSumo:
             options += ["--step-length", repr(steps.seconds), "--step-method.ballistic", ballistic]
         try:
             with redirect_stdout(StringIO()):  # traci counts its attempts to connect
-                self.api.start([binary, *options])
+                # of a start that failed traci keeps the name
+                self.api.start([binary, *options], label=uuid4().hex)
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             raise ConfigError(f"sumo={scenario} cannot be loaded by SUMO: {error}") from error
         self._constants = self.api.constants
