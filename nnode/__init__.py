@@ -10,10 +10,11 @@ from nnode.version import VERSION as __version__
 if TYPE_CHECKING:
     from nnode.app.calibration import Calibration
     from nnode.app.discover import diagnose_table as diagnose
-    from nnode.app.estimator import Calibrator, fit
-    from nnode.app.python_inputs import sequences
+    from nnode.app.drive import drive_run as drive
+    from nnode.app.python.estimator import Calibrator, fit
+    from nnode.app.python.inputs import sequences
+    from nnode.app.python.report import Report
     from nnode.app.replay import replay
-    from nnode.app.report import Report
     from nnode.calibrate.checkpoint import load
     from nnode.data.sequence import Sequence
     from nnode.data.sequences import Sequences
@@ -26,6 +27,7 @@ __all__ = [
     "Sequences",
     "__version__",
     "diagnose",
+    "drive",
     "fit",
     "load",
     "replay",
@@ -35,15 +37,16 @@ __all__ = [
 #: Where each name comes from: imported on first use, a short command should not wait for torch.
 _HOMES = {
     "Calibration": ("nnode.app.calibration", "Calibration"),
-    "Calibrator": ("nnode.app.estimator", "Calibrator"),
-    "Report": ("nnode.app.report", "Report"),
+    "Calibrator": ("nnode.app.python.estimator", "Calibrator"),
+    "Report": ("nnode.app.python.report", "Report"),
     "Sequence": ("nnode.data.sequence", "Sequence"),
     "Sequences": ("nnode.data.sequences", "Sequences"),
     "diagnose": ("nnode.app.discover", "diagnose_table"),
-    "fit": ("nnode.app.estimator", "fit"),
+    "drive": ("nnode.app.drive", "drive_run"),
+    "fit": ("nnode.app.python.estimator", "fit"),
     "replay": ("nnode.app.replay", "replay"),
     "load": ("nnode.calibrate.checkpoint", "load"),
-    "sequences": ("nnode.app.python_inputs", "sequences"),
+    "sequences": ("nnode.app.python.inputs", "sequences"),
 }
 
 

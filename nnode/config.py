@@ -110,6 +110,22 @@ class ExportConfig:
 
 
 @dataclass
+class DriveConfig:
+    """``scripts/drive.py``: a calibrated law drives vehicles in SUMO."""
+
+    run: str = MISSING  # folder of a training or a diagnosis
+    sumo: str = MISSING  # SUMO's configuration, *.sumocfg
+    vehicles: Any = MISSING  # type of the vehicles to drive, or a list of types
+    program: str = "libsumo"  # libsumo | traci
+    steps: str = "match"  # match | run | scenario: whose steps SUMO makes
+    end: float | None = None  # s of SUMO's clock; null: the scenario's, or when all have arrived
+    far: float | None = None  # m at which a vehicle ahead counts as none; null: 5000
+    lengths: bool | None = None  # gaps are bumper to bumper; null: as the run's data had lengths
+    lane_changes: bool = False  # whether SUMO may change lanes of driven vehicles
+    seed: int = 0  # of the numbers of drivers who differ
+
+
+@dataclass
 class PlotForcesConfig:
     """``scripts/plot_forces.py``: what calibrated models have learned."""
 
@@ -140,6 +156,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "check_schema"): CheckConfig,
     (None, "evaluate_schema"): EvaluateConfig,
     (None, "export_schema"): ExportConfig,
+    (None, "drive_schema"): DriveConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "study_schema"): StudyConfig,
     (None, "discover_schema"): DiscoverConfig,

@@ -9,7 +9,7 @@ import nnode
 
 NAMES = [
     "Calibration", "Calibrator", "Report", "Sequence", "Sequences", "__version__", "diagnose",
-    "fit", "load", "replay", "sequences",
+    "drive", "fit", "load", "replay", "sequences",
 ]  # fmt: skip
 
 

@@ -48,13 +48,38 @@ def platoon(
         profile: ``(P, 2)`` times, s, and speeds of the leader, m/s.
         gap: between bumpers at the start, m; it grows by a metre from vehicle to vehicle.
     """
+    write_scene(home, folder, follow, values, speed=float(profile[0, 1]), gap=gap)
+    command = [
+        home / "bin" / "sumo", "-n", folder / "a.net.xml", "-r", folder / "a.rou.xml",
+        "--step-length", STEP, "--precision", DIGITS, "--no-step-log", "--no-warnings",
+        "--fcd-output", folder / "fcd.xml.gz", "--fcd-output.attributes",
+        "id,type,speed,pos,lane", *(["--step-method.ballistic"] if ballistic else []),
+    ]  # fmt: skip
+    _led([str(part) for part in command], home, profile, round(seconds / STEP))
+    return folder / "fcd.xml.gz"
+
+
+def write_scene(
+    home: Path,
+    folder: Path,
+    follow: str,
+    values: Mapping[str, float],
+    *,
+    speed: float = float(PROFILE[0, 1]),
+    gap: float = 16.0,
+) -> None:
+    """A road, ``a.net.xml``, and a leader ``c0`` with followers of type ``own``, ``a.rou.xml``.
+
+    Args:
+        speed: of everybody at the start, m/s.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     attributes = " ".join(f"{k}={quoteattr(f'{v:.17g}')}" for k, v in values.items())
     cars, place = [], 400.0
     for i in range(FOLLOWERS + 1):
         cars.append(
             f'<vehicle id="c{i}" type="{"own" if i else "lead"}" route="r" depart="0" '
-            f'departPos="{place:g}" departSpeed="{profile[0, 1]:g}" insertionChecks="none"/>'
+            f'departPos="{place:g}" departSpeed="{speed:g}" insertionChecks="none"/>'
         )
         place -= LENGTH + gap + i
     (folder / "a.rou.xml").write_text(
@@ -69,16 +94,8 @@ def platoon(
     (folder / "a.edg.xml").write_text(
         '<edges><edge id="e" from="a" to="b" numLanes="1" speed="60"/></edges>'
     )
-    _call(home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
+    call(home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
           "-o", folder / "a.net.xml")  # fmt: skip
-    command = [
-        home / "bin" / "sumo", "-n", folder / "a.net.xml", "-r", folder / "a.rou.xml",
-        "--step-length", STEP, "--precision", DIGITS, "--no-step-log", "--no-warnings",
-        "--fcd-output", folder / "fcd.xml.gz", "--fcd-output.attributes",
-        "id,type,speed,pos,lane", *(["--step-method.ballistic"] if ballistic else []),
-    ]  # fmt: skip
-    _led([str(part) for part in command], home, profile, round(seconds / STEP))
-    return folder / "fcd.xml.gz"
 
 
 def _led(command: list[str], home: Path, profile: np.ndarray, steps: int) -> None:
@@ -99,7 +116,12 @@ def _led(command: list[str], home: Path, profile: np.ndarray, steps: int) -> Non
         traci.close()
 
 
-def _call(*arguments: object) -> None:
+def call(*arguments: object) -> None:
+    """Run a program.
+
+    Raises:
+        RuntimeError: it fails; what it said.
+    """
     done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(done.stderr)

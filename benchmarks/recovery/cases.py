@@ -22,7 +22,7 @@ _SUMO = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel
 _IDM = {"v0": 28.0, "T": 1.1, "s0": 2.3, "a": 1.4, "b": 2.0}
 _KRAUSS = {"v0": 21.0, "T": 1.1, "s0": 2.3, "a": 1.9, "b": 3.5}
 #: A leader that never drives at the followers' v0 and never stops.
-_SLOWLY = np.array(
+SLOWLY = np.array(
     [(0, 8), (6, 8), (11, 14), (17, 14), (20, 6), (28, 5), (34, 12), (40, 12), (45, 4), (52, 13),
      (60, 10)],
     dtype=float,
@@ -160,7 +160,7 @@ CASES: dict[str, Case] = {
     ),
     "krauss_moving": _sumo(
         "KraussOrig1, Euler, never at rest nor at v0", "KraussOrig1", "`krauss`", FIELD["krauss"],
-        _KRAUSS, profile=_SLOWLY,
+        _KRAUSS, profile=SLOWLY,
     ),
     "krauss_stopping": _sumo(
         "KraussOrig1, Euler", "KraussOrig1", "`krauss`", FIELD["krauss"], _KRAUSS

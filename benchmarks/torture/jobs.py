@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.torture.child import Child, script
-from nnode.app.report import Report
+from nnode.app.python.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare

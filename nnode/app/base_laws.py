@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-from nnode.app.python_inputs import MODELS, model_options
+from nnode.app.python.inputs import MODELS, model_options
 from nnode.data.sequence import Sequence
 from nnode.discover.compare.laws import compare_laws
 from nnode.discover.options import DiscoverOptions

@@ -18,8 +18,8 @@ from nnode.app.base_laws import candidates, compared, law_options
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, shell_override
-from nnode.app.python_inputs import Table, data_of, model_options, table_options
-from nnode.app.report import Report
+from nnode.app.python.inputs import Table, data_of, model_options, table_options
+from nnode.app.python.report import Report
 from nnode.app.training import brief, set_threads
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import merge_saved, path_given, saved_groups
+from nnode.app.cli.sweep import RESULT
 from nnode.app.evaluate import choose
 from nnode.app.training import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
@@ -27,13 +29,13 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
-from nnode.exchange.counterpart import Counterpart
-from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
-from nnode.exchange.sumo import sumo_type, traffic_of
+from nnode.exchange.counterpart import Counterpart, Intervals
+from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
+from nnode.exchange.sumo import has_type, sumo_type, traffic_of
 from nnode.exchange.tables import write_csv, write_results
 from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy
 from nnode.files import write_json, write_text
-from nnode.models import Linear, Logarithmic, SocialForce, System
+from nnode.models import System
 
 #: What can be written, in the order in which it is.
 TARGETS = ("jupedsim", "sumo", "pedpy", "parquet", "csv")
@@ -55,6 +57,16 @@ def checkpoint_of(run: str) -> Path:
     return place if place.suffix == ".pt" else place / BEST
 
 
+def intervals_of(run: str) -> Intervals:
+    """What a run's ``result.json`` says of its parameters; nothing where it is not there."""
+    path = checkpoint_of(run).parent.parent / RESULT
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["parameters"]
+    except (OSError, ValueError, KeyError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def groups_of_run(overrides: list[str]) -> list[str]:
     """Overrides that choose the run's own data and solver where the user chooses none."""
     run = path_given(overrides, "run")
@@ -74,6 +86,7 @@ class _Export:
     device: torch.device
     sources: tuple[str, ...]
     batch_size: int
+    intervals: Intervals
 
     @property
     def dtype(self) -> torch.dtype:
@@ -119,6 +132,7 @@ def export(config: DictConfig, folder: Path) -> None:
         device=device,
         sources=SOURCES[config.trajectories],
         batch_size=data.loader.batch_size,
+        intervals=intervals_of(config.run),
     )
     print(f"{data.name}, {part}: {len(indices)} sequences, model {_label(checkpoint)}")
     told: dict[str, Any] = {}
@@ -149,9 +163,9 @@ def targets_of(asked: Any, model: System) -> list[str]:
     """
     if asked == "auto":
         fit = {"parquet", "csv"}
-        if model.find(SocialForce) is not None:
+        if has_parameters(model):
             fit.add("jupedsim")
-        if model.find(Linear) is not None or model.find(Logarithmic) is not None:
+        if has_type(model):
             fit.add("sumo")
         if model.domain == "crowd":
             fit.add("pedpy")
@@ -174,13 +188,13 @@ _Written = tuple[list[Path], Counterpart]
 
 def _jupedsim(job: _Export) -> _Written:
     scenes = scenes_of(job.trajectories("measured"), job.model.wall_spacing)
-    found = jupedsim_parameters(job.model, scenes)
+    found = jupedsim_parameters(job.model, scenes, job.intervals)
     return [write_text(job.folder / "jupedsim.json", found.text + "\n")], found
 
 
 def _sumo(job: _Export) -> _Written:
     speed, length = traffic_of(job.trajectories("measured"))
-    found = sumo_type(job.model, _label(job.checkpoint), speed, length)
+    found = sumo_type(job.model, _label(job.checkpoint), speed, length, job.intervals)
     return [write_text(job.folder / "vtype.add.xml", found.text)], found
 
 

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from nnode.app.python_inputs import Table, table_options
+from nnode.app.python.inputs import Table, table_options
 from nnode.calibrate.evaluate import Simulate
 from nnode.data.readers.table import TABLE, WALLS, read_table, table_files
 from nnode.data.sequence import Sequence

@@ -52,7 +52,9 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
             )
         from nnode.solvers import FusedSolver  # loads Numba, which takes a second
 
-        return FusedSolver(options.dt, options.threads, options.cutoff, options.cutoff_error)
+        return FusedSolver(
+            options.dt, options.threads, options.cutoff, options.cutoff_error, options.method
+        )
     assert isinstance(options, TorchdiffeqOptions)
     return TorchdiffeqSolver(
         options.method, options.gradient.value, options.dt, options.rtol, options.atol

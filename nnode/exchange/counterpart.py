@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from nnode.models import System
+from nnode.models.own_law import law_from
+from nnode.models.term import Term, short_names
+
+#: Address of a parameter to what a run says of it: ``low`` and ``high``, None where not known.
+Intervals = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass
@@ -15,11 +22,13 @@ class Counterpart:
         text: the parameter file.
         notes: how values were made that are not the model's own.
         missing: what of the model has no counterpart, and what that means.
+        values: parameter of the other program to its text, where it takes them so.
     """
 
     text: str = ""
     notes: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+    values: dict[str, str] = field(default_factory=dict)
 
 
 def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
@@ -29,3 +38,31 @@ def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
         for term in list(system.terms)[first:]
         if term.name not in counted
     ]
+
+
+def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
+    """Which of the field's laws a model has, whatever it calls it.
+
+    Args:
+        described: their descriptions by name, see :func:`nnode.models.own_law.law_from`.
+        names: those that are asked for.
+    """
+    term = system.terms[0] if len(system.terms) else None
+    for name in names:
+        law = law_from(name, described[name])
+        same = type(term) is type(law) and getattr(term, "network", None) is None
+        if same and isinstance(term, Term) and (term.rule, term.scalars) == (law.rule, law.scalars):
+            return name
+    return None
+
+
+def interval_lines(system: System, intervals: Intervals) -> list[str]:
+    """A line for each parameter: its value and, where it is known, its interval of 95 %."""
+    values = system.physical()
+    short, lines = short_names(values), []
+    for address, (value, unit) in values.items():
+        own = intervals.get(address, {})
+        low, high = own.get("low"), own.get("high")
+        known = "no interval" if low is None or high is None else f"95 % [{low:.6g}, {high:.6g}]"
+        lines.append(f"{short[address]} = {float(value):.6g} {unit}, {known}")
+    return lines

@@ -1,26 +1,39 @@
-"""Calibrated social forces as parameters of JuPedSim's social force model.
+"""Calibrated laws of people as parameters of JuPedSim's models.
 
-Both have the same force between two people, A exp((2r - d)/B) n with contact and sliding
-friction. Two things differ. Here a person's forces are averaged over the N people and the P wall
-points of the scene, there they are summed; and walls are points here, there the nearest point of
-each edge. The mass takes up the first difference, the strength of obstacles the second.
+Collision-free speeds (``cfsm``) are the same there, the generalised centrifugal force (``gcfm``)
+nearly. Social forces have the same force between two people in both, A exp((2r - d)/B) n with
+contact and sliding friction. Two things differ. Here a person's forces are averaged over the N
+people and the P wall points of the scene, there they are summed; and walls are points here, there
+the nearest point of each edge. The mass takes up the first difference, the strength of obstacles
+the second.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import torch
 from scipy.special import kve
 
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
-from nnode.exchange.counterpart import Counterpart, effects_without
+from nnode.exchange.counterpart import (
+    Counterpart,
+    Intervals,
+    effects_without,
+    field_law,
+    interval_lines,
+)
+from nnode.laws.crowd import CrowdRule
 from nnode.models import Relaxation, SocialForce, System
-from nnode.models.scene import wall_points
+from nnode.models.field_crowd import PEOPLE
+from nnode.models.own_law import FormulaForce
+from nnode.models.scene import Scene, wall_points
 
 
 @dataclass
@@ -32,18 +45,21 @@ class Scenes:
         points: number of wall points; 0 where no sequence has walls.
         spacing: distance of neighbouring wall points, m.
         speed: median of the measured speeds, m/s.
+        pace: median of people's preferred speeds, m/s, as laws of the field take them.
     """
 
     people: float
     points: float
     spacing: float
     speed: float
+    pace: float = math.nan
 
 
 def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
     """Look at all sequences, whose walls become points ``spacing`` (m) apart or closer."""
-    people, points, speeds, gaps = [], [], [], []
+    people, points, speeds, gaps, paces = [], [], [], [], []
     for s in sequences:
+        paces.append(Scene.of(collate([s]), spacing).pace[0].numpy())
         people.append(s.n_agents)
         speeds.append(np.linalg.norm(s.velocity(), axis=-1).ravel())
         number = 0
@@ -58,6 +74,7 @@ def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
         points=float(np.mean(points)),
         spacing=float(np.mean(gaps)) if gaps else spacing,
         speed=float(np.median(np.concatenate(speeds))),
+        pace=float(np.median(np.concatenate(paces))),
     )
 
 
@@ -71,18 +88,90 @@ def points_per_edge(r: float, B: float, spacing: float) -> float:
     return float(2 * r * kve(0, r / B) / spacing)
 
 
-def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
-    """JSON with the arguments of ``SocialForceModel`` (``model``) and of
-    ``SocialForceModelAgentParameters`` (``agent``), in JuPedSim's units.
+#: Laws of the field that JuPedSim has.
+SAME = ("cfsm", "gcfm")
+_PACE = "desired_speed: the median of people's preferred speeds; each has his own"
+
+
+def has_parameters(system: System) -> bool:
+    """Whether JuPedSim has a counterpart to a model."""
+    return system.find(SocialForce) is not None or field_law(system, PEOPLE, SAME) is not None
+
+
+def jupedsim_parameters(
+    system: System, scenes: Scenes, intervals: Intervals | None = None
+) -> Counterpart:
+    """JSON with the arguments of one of JuPedSim's models (``model``), of its agents' parameters
+    (``agent``), in JuPedSim's units, and the names of both classes (``classes``).
+
+    Args:
+        intervals: of the parameters, for the file's notes.
 
     Raises:
-        ConfigError: the model is no social force.
+        ConfigError: JuPedSim has no counterpart to the model.
     """
+    name = field_law(system, PEOPLE, SAME)
+    if name is not None:
+        found, content = _of_the_field(system, name, scenes)
+    else:
+        found, content = _social_force(system, scenes)
+    found.notes[:0] = interval_lines(system, intervals or {})
+    content |= {"notes": found.notes, "no_counterpart": found.missing}
+    found.text = json.dumps(content, indent=2, ensure_ascii=False)
+    return found
+
+
+def _content(model: str, arguments: dict[str, Any], agent: dict[str, Any]) -> dict[str, Any]:
+    classes = {"model": model, "agent": f"{model}AgentParameters"}
+    return {"program": f"JuPedSim >= 1.4, {model}", "classes": classes, "model": arguments,
+            "agent": agent}  # fmt: skip
+
+
+def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
+    """``cfsm`` or ``gcfm``."""
+    found, law = Counterpart(), cast(FormulaForce, system.terms[0])
+    own = {p: float(getattr(law, p).detach()) for p in law.scalars}
+    assert isinstance(law.rule, CrowdRule)
+    fixed = {name: value for name, (value, _) in law.rule.constants.items()}
+    agent: dict[str, Any] = {"desired_speed": scenes.pace}
+    if name == "cfsm":
+        agent |= {"time_gap": own["T"], "radius": own["l"] / 2}
+        model = {
+            "strength_neighbor_repulsion": own["a"],
+            "range_neighbor_repulsion": own["D"],
+        }
+        content = _content("CollisionFreeSpeedModel", model, agent)
+        found.notes.append("radius: l/2")
+    else:
+        agent |= {
+            "mass": 1.0, "tau": own["tau"], "a_v": fixed["tau_a"],
+            **{p: fixed[p] for p in ("a_min", "b_min", "b_max")},
+        }  # fmt: skip
+        model = {
+            "strength_neighbor_repulsion": own["eta"],
+            "max_neighbor_interaction_distance": fixed["r_c"],
+            "max_neighbor_repulsion_force": fixed["f_max"],
+        }
+        content = _content("GeneralizedCentrifugalForceModel", model, agent)
+        found.missing.append(
+            "the distance of bodies: JuPedSim takes points of the ellipses that are not on the "
+            "line between the centres, and interpolates the force where they are near or far"
+        )
+    found.notes.append(_PACE)
+    found.missing.append(
+        "walls: the law has none, and those of JuPedSim push as they do by default"
+    )
+    found.missing += effects_without(system, 1, set())
+    return found, content
+
+
+def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
     force, relaxation = system.find(SocialForce), system.find(Relaxation)
     if force is None:
         raise ConfigError(
-            "to=jupedsim: the run's model has no social force, and JuPedSim has no counterpart "
-            "to another; leave it out of to="
+            "to=jupedsim: the run's model has no social force and is neither "
+            f"{' nor '.join(SAME)}; JuPedSim has no counterpart to it, and its released wheels "
+            "take no model of one's own; leave it out of to="
         )
     found = Counterpart()
     walls = force.walls and scenes.points > 0
@@ -105,8 +194,11 @@ def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
         "forces are averaged over people here and summed there; accelerations between people are "
         "equal in a scene of so many"
     )
+    preferred = relaxation is not None and relaxation.preferred
     found.notes.append(
-        "desired_speed: the median of the measured speeds; the model itself keeps everybody's "
+        _PACE
+        if preferred
+        else "desired_speed: the median of the measured speeds; the model itself keeps everybody's "
         "present speed, which JuPedSim cannot"
     )
     if force.walls and not walls:
@@ -117,23 +209,17 @@ def jupedsim_parameters(system: System, scenes: Scenes) -> Counterpart:
         )
     found.missing.append("reach: JuPedSim lets nobody feel people farther away than 2.5 m")
     found.missing += effects_without(system, 2 if relaxation else 1, set())
-    found.text = json.dumps(
+    content = _content(
+        "SocialForceModel",
+        {"body_force": k, "friction": kappa},
         {
-            "program": "JuPedSim >= 1.4, SocialForceModel",
-            "model": {"body_force": k, "friction": kappa},
-            "agent": {
-                "mass": mass,
-                "desired_speed": scenes.speed,
-                "reaction_time": relaxation.tau if relaxation else 0.5,
-                "agent_scale": strength,
-                "obstacle_scale": obstacle,
-                "force_distance": force.B,
-                "radius": force.r,
-            },
-            "notes": found.notes,
-            "no_counterpart": found.missing,
+            "mass": mass,
+            "desired_speed": scenes.pace if preferred else scenes.speed,
+            "reaction_time": relaxation.tau if relaxation else 0.5,
+            "agent_scale": strength,
+            "obstacle_scale": obstacle,
+            "force_distance": force.B,
+            "radius": force.r,
         },
-        indent=2,
-        ensure_ascii=False,
     )
-    return found
+    return found, content

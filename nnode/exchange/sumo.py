@@ -1,14 +1,16 @@
-"""Calibrated laws of the gap as a vehicle type for SUMO.
+"""Calibrated laws as a vehicle type for SUMO.
 
-SUMO has no car-following model of first order. Krauss' model without its noise is taken, whose
-gap at a constant speed v is length + minGap + tau v; the type keeps from a law what such a state
-shows: the gap at rest, the gap at the recorded speed, and the greatest speed.
+``idm`` and ``krauss`` are SUMO's IDM and KraussOrig1, parameter by parameter. SUMO has no
+car-following model of first order: for laws of the gap Krauss' model without its noise is taken,
+whose gap at a constant speed v is length + minGap + tau v; the type keeps from a law what such a
+state shows: the gap at rest, the gap at the recorded speed, and the greatest speed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,11 +18,22 @@ from torch.nn import Module
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
-from nnode.exchange.counterpart import Counterpart, effects_without
+from nnode.exchange.counterpart import (
+    Counterpart,
+    Intervals,
+    effects_without,
+    field_law,
+    interval_lines,
+)
 from nnode.models import Linear, Logarithmic, System
+from nnode.models.field import FIELD
 
 #: SUMO's own length of a passenger car, m, where the data tell none.
 DEFAULT_LENGTH = 5.0
+#: Laws that SUMO has, and what it calls them.
+SAME = {"idm": "IDM", "krauss": "KraussOrig1"}
+#: What SUMO calls their parameters, beside the gap at rest.
+_SAME = {"v0": "maxSpeed", "T": "tau", "a": "accel", "b": "decel"}
 
 
 def traffic_of(sequences: Iterable[Sequence]) -> tuple[float, float | None]:
@@ -47,35 +60,99 @@ def equilibrium_gap(law: Linear | Logarithmic, speed: float, time_gap: float = 0
     return standstill / (1 - speed / v0) if speed < v0 else math.inf
 
 
-def sumo_type(system: System, name: str, speed: float, length: float | None) -> Counterpart:
+def has_type(system: System) -> bool:
+    """Whether SUMO has a counterpart to a model's law."""
+    simple = system.find(Linear) is not None or system.find(Logarithmic) is not None
+    return simple or field_law(system, FIELD, tuple(SAME)) is not None
+
+
+def sumo_type(
+    system: System, name: str, speed: float, length: float | None,
+    intervals: Intervals | None = None,
+) -> Counterpart:  # fmt: skip
     """An additional file with one ``vType``.
 
     Args:
-        system: a law of the gap, with or without effects.
+        system: ``idm``, ``krauss`` or a law of the gap, with or without effects.
         name: of the vehicle type.
-        speed: m/s at which gaps are to agree, the median of the data.
-        length: of the vehicles, m; None takes SUMO's own.
+        speed: m/s at which gaps are to agree, the median of the data; of laws of the gap.
+        length: of the vehicles, m; None, the data have none, takes SUMO's own.
+        intervals: of the parameters, for the file's comments.
 
     Raises:
-        ConfigError: the model has no gap at rest.
+        ConfigError: SUMO has no counterpart to the law.
     """
+    law = field_law(system, FIELD, tuple(SAME))
+    if law is not None:
+        found = _same(system, law, name, length)
+    else:
+        found = _of_the_gap(system, name, speed, length)
+    found.notes[:0] = interval_lines(system, intervals or {})
+    found.text = _document(found.values, found)
+    return found
+
+
+def _same(system: System, law: str, name: str, length: float | None) -> Counterpart:
+    """A law that SUMO has."""
+    found = Counterpart()
+    own: Any = system.terms[0]
+    s0 = _value(own, "s0")
+    size, room = (length, s0) if length is not None else _parted(s0, DEFAULT_LENGTH)
+    found.values = {
+        "id": name, "carFollowModel": SAME[law], "sigma": "0", "speedFactor": "1", "speedDev": "0",
+        "length": _exactly(size), "minGap": _exactly(room),
+        **{_SAME[p]: _exactly(_value(own, p)) for p in _SAME},
+    }  # fmt: skip
+    if law == "idm":
+        del found.values["sigma"]
+    if length is None:
+        found.notes.append(
+            f"length + minGap = s0 = {s0:.4g} m: the data have no lengths, and s0 contains one"
+        )
+        if law == "idm":
+            found.missing.append(
+                "gaps from front to front: SUMO's IDM divides by the gap between bumpers, the "
+                "run's by one that is a length longer; calibrate with lengths for the same paths"
+            )
+    else:
+        found.notes.append(f"length: the data's median, {size:.4g} m")
+    found.notes.append(
+        "maxSpeed: no faster than a lane allows; leave speedFactor at 1 and limits above v0"
+    )
+    if law == "krauss":
+        found.missing.append(
+            "the last metre behind a vehicle at rest, which SUMO drives at decel times one step"
+        )
+    found.missing += effects_without(system, 1, set())
+    return found
+
+
+def _parted(whole: float, length: float) -> tuple[float, float]:
+    """A gap at rest from front to front as a length and what is between bumpers, m."""
+    own = min(length, whole)
+    return own, whole - own
+
+
+def _of_the_gap(system: System, name: str, speed: float, length: float | None) -> Counterpart:
+    """A law of the gap as Krauss' model."""
     law = system.find(Linear) or system.find(Logarithmic)
     if law is None:
         raise ConfigError(
-            "to=sumo: the run's model is no law with a gap at rest, and SUMO has no counterpart "
-            "to it; leave it out of to="
+            f"to=sumo: the run's model is neither {' nor '.join(SAME)} nor a law with a gap at "
+            "rest, and SUMO has no counterpart to it; leave it out of to=, or let it drive SUMO's "
+            "vehicles itself: scripts/drive.py"
         )
     found = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}
     L, v0 = float(law.L.detach()), float(law.v0.detach())
-    own = min(DEFAULT_LENGTH if length is None else length, L)
+    own, room = _parted(L, DEFAULT_LENGTH if length is None else length)
     values = {
         "id": name,
         "carFollowModel": "Krauss",
         "sigma": "0",
         "speedDev": "0",
         "length": _digits(own),
-        "minGap": _digits(L - own),
+        "minGap": _digits(room),
     }
     told = f"{own:.3g} m of it are the length, "
     told += "SUMO's own, cut to L" if length is None else "the data's median, cut to L"
@@ -122,7 +199,7 @@ def sumo_type(system: System, name: str, speed: float, length: float | None) -> 
         "the speed ahead and accelerate by at most accel, decel, which stay SUMO's"
     )
     found.missing += effects_without(system, 1, counted)
-    found.text = _document(values, found)
+    found.values = values
     return found
 
 
@@ -132,6 +209,10 @@ def _value(effect: Module, parameter: str) -> float:
 
 def _digits(value: float) -> str:
     return f"{value:.6g}"
+
+
+def _exactly(value: float) -> str:
+    return f"{value:.12g}"
 
 
 def _document(values: dict[str, str], found: Counterpart) -> str:

@@ -29,8 +29,8 @@ LOADED = (
     "matplotlib.pyplot",
     "scipy.optimize",
     "torch.utils.tensorboard",
-    *(f"nnode.app.{name}" for name in ("discover", "evaluate", "export", "forces", "prepare")),
-    *(f"nnode.app.{name}" for name in ("study", "train")),
+    *(f"nnode.app.{name}" for name in ("discover", "drive", "evaluate", "export")),
+    *(f"nnode.app.{name}" for name in ("forces", "prepare", "study", "train")),
 )
 
 

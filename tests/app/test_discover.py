@@ -15,7 +15,7 @@ import pytest
 
 from nnode.app import discover as app
 from nnode.app.cli.run import check_overrides
-from nnode.app.python_inputs import model_options
+from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions

@@ -11,7 +11,13 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.app.export import TARGETS, checkpoint_of, groups_of_run, targets_of
+from nnode.app.export import (
+    TARGETS,
+    checkpoint_of,
+    groups_of_run,
+    intervals_of,
+    targets_of,
+)
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import JuelichOptions, TableOptions
 from nnode.data.readers.juelich import read_juelich
@@ -82,6 +88,29 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
     np.testing.assert_allclose(horizons["rmse_m"], expected, rtol=1e-9)
     history = pd.read_csv(tmp_path / "csv" / "history.csv")
     assert {"cost/train", "cost/heldout", "parameters/lin.v0"} <= set(history["quantity"])
+
+
+def test_idm_s_vehicle_type_has_the_run_s_intervals(
+    script: Script, raw: Path, tmp_path: Path
+) -> None:
+    run, out = tmp_path / "run", tmp_path / "out"
+    done = script(
+        "train", "model=idm", "data=demo_traffic", f"data.source={raw}", f"hydra.run.dir={run}"
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads((run / "result.json").read_text())["parameters"]
+    done = script("export", f"run={run}", "to=sumo", f"hydra.run.dir={out}")
+    assert done.returncode == 0, done.stderr
+    text = (out / "vtype.add.xml").read_text()
+    known = [name for name, own in found.items() if own["low"] is not None]
+    assert known
+    for name in known:
+        own = found[name]
+        short = name.rpartition(".")[2]
+        interval = f"95 % [{own['low']:.6g}, {own['high']:.6g}]"
+        assert f"<!-- {short} = {own['value']:.6g} {own['unit']}, {interval} -->" in text
+    assert intervals_of(str(run)) == found
+    assert intervals_of(str(tmp_path)) == {}
 
 
 @pytest.mark.slow

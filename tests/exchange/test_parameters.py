@@ -13,8 +13,14 @@ from hypothesis import strategies as st
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
-from nnode.exchange.jupedsim import Scenes, jupedsim_parameters, points_per_edge, scenes_of
-from nnode.exchange.sumo import equilibrium_gap, sumo_type, traffic_of
+from nnode.exchange.jupedsim import (
+    Scenes,
+    has_parameters,
+    jupedsim_parameters,
+    points_per_edge,
+    scenes_of,
+)
+from nnode.exchange.sumo import equilibrium_gap, has_type, sumo_type, traffic_of
 from nnode.models import (
     Crowd,
     Linear,
@@ -27,6 +33,9 @@ from nnode.models import (
     Traffic,
 )
 from nnode.models.build import add_effects
+from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
+from nnode.models.own_law import law_from
 from nnode.models.term import State
 
 SCENES = Scenes(people=12.0, points=50.0, spacing=0.25, speed=1.3)
@@ -134,6 +143,67 @@ def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
     assert float(values(model)["tau"]) == pytest.approx(6 * (np.exp(1.5) - 1) / 15, rel=1e-5)
 
 
+def field(name: str) -> System:
+    """A law of the field, whatever its user calls it."""
+    described = FIELD.get(name) or PEOPLE[name]
+    law = law_from("mine", described)
+    return Traffic([law], leader="measured") if name in FIELD else Crowd([law])
+
+
+@pytest.mark.parametrize(("law", "follow"), [("idm", "IDM"), ("krauss", "KraussOrig1")])
+def test_laws_that_sumo_has(law: str, follow: str) -> None:
+    system = field(law)
+    assert has_type(system)
+    found = values(system, length=4.5)
+    known = {name.rpartition(".")[2]: float(v) for name, (v, _) in system.physical().items()}
+    assert (found["id"], found["carFollowModel"]) == ("lin", follow)
+    names = {"v0": "maxSpeed", "T": "tau", "a": "accel", "b": "decel", "s0": "minGap"}
+    for own, theirs in names.items():
+        assert float(found[theirs]) == pytest.approx(known[own], rel=1e-11)
+    assert float(found["length"]) == 4.5
+    # without lengths the gap at rest contains one
+    found = values(system, length=None)
+    assert float(found["length"]) + float(found["minGap"]) == pytest.approx(known["s0"])
+
+
+def test_intervals_stand_in_comments() -> None:
+    known = {"mine.T": {"value": 1.2, "low": 1.125, "high": 1.25}, "mine.a": {"low": None}}
+    text = sumo_type(field("idm"), "x", 15.0, 4.5, known).text
+    assert "<!-- T = 1.2 s, 95 % [1.125, 1.25] -->" in text
+    assert "<!-- a = 1.3 m/s², no interval -->" in text
+    content = json.loads(
+        jupedsim_parameters(field("cfsm"), SCENES, {"mine.l": {"low": 0.2, "high": 0.4}}).text
+    )
+    assert "l = 0.3 m, 95 % [0.2, 0.4]" in content["notes"]
+
+
+def test_a_law_with_another_formula_is_none_of_sumo_s() -> None:
+    rate = FIELD["idm"]["rate"]["v"].replace("(v/v0)**4", "(v/v0)**2")
+    system = Traffic([law_from("idm", {**FIELD["idm"], "rate": {"v": rate}})], leader="measured")
+    assert not has_type(system)
+    beside = law_from("idm", FIELD["idm"], network=4)
+    assert not has_type(Traffic([beside], leader="measured"))
+    with pytest.raises(ConfigError, match=r"neither idm nor krauss.*drive\.py"):
+        sumo_type(system, "x", 15.0, None)
+
+
+def test_laws_of_people_that_jupedsim_has() -> None:
+    scenes = Scenes(people=8.0, points=0.0, spacing=0.25, speed=1.1, pace=1.4)
+    content = json.loads(jupedsim_parameters(field("cfsm"), scenes).text)
+    assert content["classes"]["model"] == "CollisionFreeSpeedModel"
+    assert content["model"] == {"strength_neighbor_repulsion": 5.0, "range_neighbor_repulsion": 0.1}
+    assert content["agent"] == {"desired_speed": 1.4, "time_gap": 1.0, "radius": 0.15}
+    content = json.loads(jupedsim_parameters(field("gcfm"), scenes).text)
+    assert content["classes"]["agent"] == "GeneralizedCentrifugalForceModelAgentParameters"
+    assert content["model"]["strength_neighbor_repulsion"] == pytest.approx(0.2)
+    assert content["agent"]["a_v"] == pytest.approx(0.53)
+    assert any("distance of bodies" in line for line in content["no_counterpart"])
+    for name in ("ttc", "esf"):
+        assert not has_parameters(field(name))
+        with pytest.raises(ConfigError, match="neither cfsm nor gcfm"):
+            jupedsim_parameters(field(name), scenes)
+
+
 def test_effects_with_a_counterpart() -> None:
     model = Traffic([Linear(30.0, 7.0)])
     chosen = [
@@ -164,7 +234,7 @@ def test_no_gap_at_the_recorded_speed(speed: float) -> None:
     [crowd(), Traffic([NetworkSpeed(4)])],
 )
 def test_sumo_knows_no_other_model(model: System) -> None:
-    with pytest.raises(ConfigError, match=r"to=sumo: .* no law with a gap at rest"):
+    with pytest.raises(ConfigError, match=r"to=sumo: .* nor a law with a gap at rest.*drive\.py"):
         sumo_type(model, "x", 15.0, None)
 
 

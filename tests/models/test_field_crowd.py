@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.app.python_inputs import model_options
+from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.models import Crowd, build_model

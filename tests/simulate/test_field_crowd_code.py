@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.app.python_inputs import model_options
+from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models import System, build_model

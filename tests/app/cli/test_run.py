@@ -85,10 +85,12 @@ def test_every_group_of_every_script_composes(name: str) -> None:
 
 
 def test_the_fused_solver_gets_its_options() -> None:
-    solver = build_solver(FusedOptions(dt=0.01, threads=2, cutoff=2.5, cutoff_error=1e-6))
+    solver = build_solver(
+        FusedOptions(dt=0.01, threads=2, cutoff=2.5, cutoff_error=1e-6, method="ballistic")
+    )
     assert isinstance(solver, FusedSolver)
-    given = {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6, "method": None}
-    assert vars(solver) == {**given, "uncompiled": ""}
+    given = {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6}
+    assert vars(solver) == {**given, "method": "ballistic", "uncompiled": ""}
     with pytest.raises(ConfigError, match=r"solver\.cutoff_error=2 must be"):
         build_solver(FusedOptions(cutoff_error=2))
 

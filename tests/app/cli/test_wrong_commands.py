@@ -33,6 +33,7 @@ Run = Callable[[str], tuple[int, str]]
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Run a command line in a forked child, which shares the loaded libraries."""
     import nnode.app.discover
+    import nnode.app.drive
     import nnode.app.evaluate
     import nnode.app.export
     import nnode.app.forces
@@ -141,6 +142,8 @@ WRONG = [
     # files
     ("train data=table", "data.domain is not set; give it a value with data.domain=..."),
     ("export", "run is not set"),
+    ("drive", "run is not set"),
+    ("drive run=$T sumo=a.sumocfg", "vehicles is not set"),
     ("train data=table data.domain=traffic data.path=none.csv", "none.csv is not there"),
     ("train data=table data.domain=traffic data.path=$T/folder", "is a folder, expected a file"),
     ("train data=table data.domain=traffic data.path=$T/empty.csv", "is empty"),
@@ -150,6 +153,7 @@ WRONG = [
     ("train resume=$T/folder", "it is a folder, expected a file *.pt"),
     ("train resume=$T/junk.pt", "cannot be opened as a checkpoint"),
     ("export run=none", "no checkpoint none/checkpoints/best.pt"),
+    ("drive run=none sumo=a.sumocfg vehicles=car", "no checkpoint none/checkpoints/best.pt"),
     ("plot_forces checkpoint=[]", "give one or more paths"),
     ("train data.source=/nowhere", "there is no folder /nowhere"),
     ("train hydra.run.dir=$T/head.csv", "cannot be used as a folder"),

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.truths.laws.case import LawCase, measured
 from nnode.app.base_laws import LAWS, candidates
-from nnode.app.python_inputs import model_options, table_options
+from nnode.app.python.inputs import model_options, table_options
 from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
 from nnode.discover.compare.laws import compare_laws

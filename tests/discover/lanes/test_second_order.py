@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nnode.app.python_inputs import model_options
+from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.able import not_offered
 from nnode.discover.lanes.engine import TrafficEngine

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import nnode
-from nnode.app.python_inputs import named
+from nnode.app.python.inputs import named
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import collate
@@ -235,7 +235,7 @@ def test_one_call_calibrates_with_some_held_out(tidy: pd.DataFrame) -> None:
 
 
 def test_models_bear_the_names_of_the_configuration() -> None:
-    files = {p.stem for p in (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")}
+    files = {p.stem for p in (Path(__file__).parents[3] / "conf" / "model").glob("*.yaml")}
     own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
     assert own | set(FIELD) | set(PEOPLE) == files
     assert all(named(name)["name"] == name for name in files)

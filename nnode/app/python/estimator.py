@@ -19,7 +19,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
-from nnode.app.python_inputs import choice, data_of, model_options, sequences
+from nnode.app.python.inputs import choice, data_of, model_options, sequences
 from nnode.app.training import build_solver, check, model_of, set_threads, trainer_of
 from nnode.calibrate.options import Device
 from nnode.data.sequences import Sequences

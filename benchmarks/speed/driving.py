@@ -1,0 +1,153 @@
+"""How many steps a second SUMO makes while a law of this package drives its vehicles.
+
+Examples:
+  python -m benchmarks.speed.driving
+  python -m benchmarks.speed.driving --vehicles 100 --laws idm --programs libsumo
+
+Platoons of twenty on roads of their own, one leader of SUMO's before each; 60 s in steps of 0.1 s.
+Beside it the same vehicles with SUMO's own IDM, which nobody drives. The best of some repeats.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nnode.exchange.drive import drive
+from nnode.exchange.running_sumo import RunningSumo
+from nnode.files import write_json
+from nnode.models import Linear, Traffic
+from nnode.models.build import add_effects
+from nnode.models.field import FIELD
+from nnode.models.own_law import law_from
+
+#: Vehicles of a road, the step, s, and for how long, s.
+PLATOON, STEP, SECONDS = 20, 0.1, 60.0
+
+
+def law(name: str) -> Traffic:
+    """``idm``; ``chained``: a law of first order that looks at the speed ahead in the same step."""
+    if name == "idm":
+        return Traffic([law_from("idm", FIELD["idm"])], leader="measured")
+    system = Traffic([Linear(20.0, 7.0)], leader="measured")
+    add_effects(system, [{"name": "relative_speed", "kappa": 0.3}])
+    return system
+
+
+LAWS = ("idm", "chained")
+
+
+def scene(folder: Path, number: int) -> Path:
+    """Roads with platoons, ``number`` followers in all."""
+    home = Path(import_module("sumo").SUMO_HOME)
+    roads = -(-number // PLATOON)
+    nodes, edges, routes, cars = "", "", "", ""
+    for k in range(roads):
+        nodes += f'<node id="a{k}" x="0" y="{20 * k}"/><node id="b{k}" x="3000" y="{20 * k}"/>'
+        edges += f'<edge id="e{k}" from="a{k}" to="b{k}" numLanes="1" speed="14"/>'
+        routes += f'<route id="r{k}" edges="e{k}"/>'
+        for i in range(min(PLATOON, number - k * PLATOON) + 1):
+            kind = "own" if i else "lead"
+            cars += (
+                f'<vehicle id="{k}.{i}" type="{kind}" route="r{k}" depart="0" '
+                f'departPos="{900 - 30 * i}" departSpeed="12" insertionChecks="none"/>'
+            )
+    types = (
+        '<vType id="lead" speedDev="0" sigma="0"/>'
+        '<vType id="own" carFollowModel="IDM" minGap="2" tau="1.2" accel="1.3" decel="1.7"/>'
+    )
+    (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "a.edg.xml").write_text(f"<edges>{edges}</edges>")
+    (folder / "a.rou.xml").write_text(f"<routes>{types}{routes}{cars}</routes>")
+    files = {"-n": "a.nod.xml", "-e": "a.edg.xml", "-o": "a.net.xml"}
+    options = [part for option, file in files.items() for part in (option, str(folder / file))]
+    subprocess.run([home / "bin" / "netconvert", *options], check=True, capture_output=True)
+    found = folder / "a.sumocfg"
+    found.write_text(
+        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
+        f'</input><time><step-length value="{STEP}"/><end value="{SECONDS}"/></time>'
+        '<report><no-warnings value="true"/></report></configuration>'
+    )
+    return found
+
+
+def alone(program: str, scenario: Path, folder: Path) -> dict[str, Any]:
+    """SUMO with its own drivers."""
+    sumo = RunningSumo(program, scenario, folder / "fcd.xml.gz")
+    steps, started = 0, time.perf_counter()
+    try:
+        while sumo.going_on(None):
+            sumo.step()
+            steps += 1
+    finally:
+        sumo.close()
+    return {"steps": steps, "steps_per_s": steps / (time.perf_counter() - started)}
+
+
+def measured(name: str, program: str, scenario: Path, folder: Path) -> dict[str, Any]:
+    """The same with vehicles driven by a law."""
+    found = drive(law(name), scenario, ["own"], folder, program=program)
+    return {
+        "steps": found.steps,
+        "steps_per_s": found.steps / found.wall,
+        "in_sumo": found.in_sumo / found.wall,
+        "driven": found.driven,
+        "collisions": found.collisions,
+    }
+
+
+def rows(
+    numbers: Sequence[int], laws: Sequence[str], programs: Sequence[str], repeats: int
+) -> Iterator[dict[str, Any]]:
+    """The best of some repeats for every case."""
+
+    def best(call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        return max((call() for _ in range(repeats)), key=lambda row: row["steps_per_s"])
+
+    for number in numbers:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            scenario = scene(folder, number)
+            for program in programs:
+                own = best(partial(alone, program, scenario, folder))
+                yield {"vehicles": number, "program": program, "law": "SUMO's", **own}
+                for kind in laws:
+                    more = best(partial(measured, kind, program, scenario, folder))
+                    yield {"vehicles": number, "program": program, "law": kind, **more}
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--vehicles", nargs="+", type=int, default=[100, 1000])
+    parser.add_argument("--laws", nargs="+", default=list(LAWS), choices=LAWS)
+    parser.add_argument("--programs", nargs="+", default=["libsumo", "traci"])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmark/driving.json"))
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    found = []
+    for row in rows(asked.vehicles, asked.laws, asked.programs, asked.repeats):
+        found.append(row)
+        share = f", {100 * row['in_sumo']:.0f} % in SUMO" if "in_sumo" in row else ""
+        print(
+            f"{row['vehicles']} vehicles, {row['law']} law, {row['program']}: "
+            f"{row['steps_per_s']:.0f} steps/s{share}",
+            flush=True,
+        )
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(asked.out, {"rows": found})
+    print(f"results: {asked.out}")
+
+
+if __name__ == "__main__":
+    main()

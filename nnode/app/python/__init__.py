@@ -1,0 +1,1 @@
+"""What users of Python meet: tables and names in, objects out."""

@@ -1,0 +1,355 @@
+"""Vehicles that a model drives and another program moves: their speeds in a step, all at once."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from nnode.data.sequence import PADDING_GAP
+from nnode.errors import ConfigError, SimulationError
+from nnode.laws.arrays import straight
+from nnode.laws.expression import Expr, below, symbol, symbols
+from nnode.laws.lane import Lane
+from nnode.laws.steps import stepped
+from nnode.models import System, Traffic
+from nnode.models.effects.base import IndividualEffect
+from nnode.models.effects.traffic import VehicleClass
+from nnode.models.formula import begins, own_values, values_of
+from nnode.models.term import Term
+
+#: Gaps, m, that stand for an empty road: a law that drives there says the same at both.
+EMPTY = (1e6, 1e9)
+#: How much it may differ there, m/s and m/s², of one and of the value.
+_SAME = 1e-3
+#: Speeds, m/s, at which this is looked at.
+_SPEEDS = (0.0, 5.0, 15.0, 30.0)
+#: Formulas of gaps are computed from gaps: places may begin anew on every edge of a road.
+_GAPS = (symbol("x_1") - symbol("x"), symbol("x_2") - symbol("x_1"))
+#: Nobody's pace or time gap is changed to less than this share.
+_SLOWEST = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What n drivers see at one moment, ``(n,)`` each.
+
+    Attributes:
+        v: own speeds, m/s.
+        gap: to the vehicle ahead, front to front, m; infinite where there is none.
+        v_1, length_1: its speed, m/s, and length, m.
+        lead: its number among the drivers; -1 where it is none of them.
+        gap_1, v_2: of the next one ahead of that, m, m/s; infinite where there is none.
+        x: places, m, for laws that name them.
+    """
+
+    v: np.ndarray
+    gap: np.ndarray
+    v_1: np.ndarray
+    length_1: np.ndarray
+    lead: np.ndarray
+    gap_1: np.ndarray
+    v_2: np.ndarray
+    x: np.ndarray
+
+
+class Drivers:
+    """Vehicles with one model, each with memories, delays and numbers of its own.
+
+    Whoever changes his leader keeps them. Nobody ahead, or nobody within ``far``, is a vehicle at
+    that distance with one's own speed; without ``far`` it is infinitely far away.
+
+    Args:
+        system: a lane's model.
+        dt: step of the other program, s.
+        method: how it places vehicles, ``semi_implicit`` or ``ballistic``; of no account for laws
+            that say a speed, whose vehicles are placed with the speed that they said.
+        far: m.
+        lengths: whether gaps were calibrated bumper to bumper; otherwise they contain a length.
+        seed: of what is drawn for each driver.
+
+    Raises:
+        ConfigError: people; code that is no formula; what only recorded data tell; no ``far`` for
+            a law that says nothing certain at an infinite gap.
+    """
+
+    def __init__(
+        self, system: System, dt: float, method: str, *, far: float | None = None,
+        lengths: bool = True, seed: int = 0,
+    ) -> None:  # fmt: skip
+        if far is not None and not 0 < far < EMPTY[0]:
+            raise ConfigError(f"far={far} must be a distance in m, below {EMPTY[0]:g}, or null")
+        lane = drivable(system)
+        self._system = copy.deepcopy(system).double()
+        self._terms = cast(list[Term], list(self._system.terms))
+        self.lane, self.dt = stepped(lane, method), dt
+        self._far, self._lengths = EMPTY[1] if far is None else far, lengths
+        self._rng = np.random.default_rng(seed)
+        values = values_of(lane, own_values(self._terms, lane))
+        self._fixed = {s: float(v.detach()) for s, v in zip(lane.owned, values, strict=True)}
+        self._added = list(lane.rates)[lane.order :]
+        self._states = {state: np.empty(0) for state in self._added}
+        self._inputs = {name: np.empty(0) for name in lane.inputs}
+        self._begun, self._fresh = np.empty(0), np.empty(0, bool)
+        self._rates = _Rates(self.lane)
+        if far is None:
+            self._check_empty(lane)
+
+    def __len__(self) -> int:
+        return len(self._begun)
+
+    @property
+    def names_places(self) -> bool:
+        """Whether places matter, not only distances."""
+        return self._rates.places
+
+    @property
+    def looks_twice(self) -> bool:
+        """Whether the second vehicle ahead matters."""
+        return any(j == 2 for _, j in self.lane.ahead)
+
+    def enter(self, kinds: Sequence[Collection[str]]) -> None:
+        """Add drivers behind those that there are.
+
+        Args:
+            kinds: of each the names of its class.
+        """
+        n = len(kinds)
+        for name, (place, _) in self.lane.inputs.items():
+            own = _drawn(self._terms[place], kinds, self._rng)
+            self._inputs[name] = np.concatenate([self._inputs[name], own])
+        for state, known in self._states.items():
+            self._states[state] = np.concatenate([known, np.zeros(n)])
+        self._begun = np.concatenate([self._begun, np.zeros(n)])
+        self._fresh = np.concatenate([self._fresh, np.ones(n, bool)])
+
+    def keep(self, who: np.ndarray) -> None:
+        """Forget the others.
+
+        Args:
+            who: ``(n,)`` True for who stays.
+        """
+        for every in (self._states, self._inputs):
+            every.update({name: known[who] for name, known in every.items()})
+        self._begun, self._fresh = self._begun[who], self._fresh[who]
+
+    def speeds(self, time: float, seen: Seen) -> np.ndarray:
+        """``(n,)`` speeds, m/s, at the end of the step that begins now; never negative.
+
+        Args:
+            time: of the clock, s.
+
+        Raises:
+            SimulationError: the law says no finite number.
+        """
+        speed = self._advanced(time, seen)
+        bad = ~np.isfinite([speed, *self._states.values()]).all(0)
+        if bad.any():
+            i = int(bad.argmax())
+            raise SimulationError(
+                f"the law says no finite number at {time:g} s, v = {seen.v[i]:g} m/s and a gap of "
+                f"{seen.gap[i]:g} m; take a shorter step, or other parameters"
+            )
+        return np.maximum(speed, 0.0)
+
+    def _advanced(self, time: float, seen: Seen) -> np.ndarray:
+        """``(n,)`` what the law says of the end of the step; memories are brought there."""
+        given = self._given(time, seen)
+        if self._fresh.any():
+            self._begin(time, seen, given)
+        top, *others = self._rates(given, len(self))
+        for state, rate in zip(self._added, others, strict=True):
+            self._states[state] = self._states[state] + self.dt * rate
+        found: np.ndarray = top if self.lane.order == 1 else given["v"] + self.dt * top
+        return found
+
+    def _given(self, time: float, seen: Seen) -> dict[str, Any]:
+        """Values of all symbols, and of the gaps."""
+        n = len(self)
+        follows = seen.gap <= self._far
+        second = follows & np.isfinite(seen.gap_1)
+        gap = np.where(follows, seen.gap, self._far)
+        gap_1 = np.where(second, seen.gap_1, self._far)
+        v_1 = np.where(follows, seen.v_1, seen.v)
+        own_length = seen.length_1 if self._lengths else np.zeros(n)
+        start = np.where(self._fresh, time, self._begun)
+        return {
+            **self._fixed, **self._states, **self._inputs,
+            "x": seen.x, "x_1": seen.x + gap, "x_2": seen.x + gap + gap_1,
+            "v": seen.v, "v_1": v_1, "v_2": np.where(second, seen.v_2, v_1), "dx_1": v_1,
+            "length_1": np.where(follows, own_length, 0.0), "second": second.astype(float),
+            "t": time - start, "start": start, "dt": np.full(n, self.dt), "gaps": (gap, gap_1),
+            "lead": np.where(follows, seen.lead, -1),
+        }  # fmt: skip
+
+    def _begin(self, time: float, seen: Seen, given: dict[str, Any]) -> None:
+        """The states of those that have just been added."""
+        new = self._fresh
+        self._begun = given["start"]
+        starts = self.lane.starts
+        begun = straight(tuple(starts.values()), _GAPS)(given, given["gaps"])
+        others = iter(self._remembered(seen, given))
+        for state in self._added:
+            own = begun[list(starts).index(state)] if state in starts else next(others)
+            self._states[state] = np.where(new, own, self._states[state])
+            given[state] = self._states[state]
+        self._fresh = np.zeros(len(self), bool)
+
+    def _remembered(self, seen: Seen, given: Mapping[str, Any]) -> list[np.ndarray]:
+        """``(n,)`` each: starts that terms tell by code, from places and speeds of a vehicle,
+        the one ahead, and where that one is driven as well the next one."""
+        order = self.lane.order
+        code = [t for t in self._terms if t.memory and not begins(t, order)]
+        if not code:
+            return []
+        nobody = 2 * PADDING_GAP
+        ahead = np.where(seen.gap <= self._far, seen.gap, nobody)
+        lead = given["lead"]
+        next_one = np.where(lead >= 0, ahead[lead], nobody)
+        x = np.stack([0 * ahead, ahead, ahead + next_one], 1)
+        v = np.stack([given["v"], given["v_1"], given["v_1"]], 1)
+        places, speeds = torch.from_numpy(x)[..., None], torch.from_numpy(v)[..., None]
+        with torch.no_grad():
+            told = torch.cat([t.remember(places, speeds, self._system) for t in code], -1)
+        return [column.numpy() for column in told[:, 0].unbind(-1)]
+
+    def _check_empty(self, lane: Lane) -> None:
+        """Refuse a law that does not come to an end as the gap grows.
+
+        Args:
+            lane: as it is before a step ends at rest at the latest.
+        """
+        v = np.array(_SPEEDS)
+        inf, zero = np.full_like(v, np.inf), np.zeros_like(v)
+        seen = Seen(v=v, gap=inf, v_1=v, length_1=zero, lead=zero.astype(int) - 1, gap_1=inf,
+                    v_2=v, x=zero)  # fmt: skip
+        said = []
+        for far in EMPTY:
+            trial = copy.copy(self)
+            trial._far, trial.lane, trial._rates = far, lane, _Rates(lane)
+            trial._states, trial._inputs = dict(self._states), dict(self._inputs)
+            trial._rng = np.random.default_rng(0)
+            trial.enter([()] * len(v))
+            with np.errstate(all="ignore"):
+                said.append([trial._advanced(k * self.dt, seen) for k in range(3)])
+            said[-1] += list(trial._states.values())
+        with np.errstate(all="ignore"):
+            same = all(
+                (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all() for a, b in zip(*said, strict=True)
+            )
+        if not same:
+            raise ConfigError(
+                f"{' with '.join(str(term.name) for term in self._terms)} has no speed on an "
+                "empty road: what it says, or remembers, grows with the gap; name far=100, say: m, "
+                "at which a vehicle ahead counts as none, and none as a vehicle there with one's "
+                "own speed"
+            )
+
+
+class _Rates:
+    """The rate of the law, then those of added states, of many vehicles.
+
+    A vehicle whose rate depends on that of the vehicle ahead (``dx_1``, of laws of first order) is
+    computed after that one.
+    """
+
+    def __init__(self, lane: Lane) -> None:
+        outputs = tuple(lane.rates[s] for s in (lane.top, *list(lane.rates)[lane.order :]))
+        parts = below([*outputs, *lane.starts.values()], set(_GAPS))
+        named = {part.value for part in parts if part.op == "symbol"}
+        self.places = not named.isdisjoint(("x", "x_1", "x_2"))
+        self._all = straight(outputs, _GAPS)
+        chain: set[Expr] = set()
+        for part in parts:
+            if part.value == "dx_1" or any(a in chain for a in part.args):
+                chain.add(part)
+        self._chained = bool(lane.chained) and any(node in chain for node in outputs)
+        if self._chained:
+            inside = [part for part in parts if part in chain]
+            ready = {a for part in inside for a in part.args if a not in chain}
+            ready |= {node for node in outputs if node not in chain}
+            known = tuple(a for a in (*_GAPS, *parts) if a in ready and a.op != "const")
+            self._before = straight(known, _GAPS)
+            self._after = straight(outputs, known)
+
+    def __call__(self, given: Mapping[str, Any], n: int) -> list[np.ndarray]:
+        if not self._chained:
+            return [np.broadcast_to(r, n) for r in self._all(given, given["gaps"])]
+        known = [np.broadcast_to(k, n) for k in self._before(given, given["gaps"])]
+        found: list[np.ndarray] = []
+        ahead = np.array(given["dx_1"])
+        lead = given["lead"]
+        for who in one_behind_the_other(lead):
+            led = who[lead[who] >= 0]
+            if found:
+                ahead[led] = np.maximum(found[0][lead[led]], 0.0)
+            rates = self._after({**given, "dx_1": ahead[who]}, tuple(k[who] for k in known))
+            found = found or [np.empty(n) for _ in rates]
+            for every, rate in zip(found, rates, strict=True):
+                every[who] = rate
+        return found
+
+
+def one_behind_the_other(lead: np.ndarray) -> list[np.ndarray]:
+    """Numbers of vehicles in an order in which everybody comes after his leader.
+
+    Args:
+        lead: ``(n,)`` number of the leader; -1: none. In a ring somebody begins.
+    """
+    done = lead < 0
+    found = [np.flatnonzero(done)] if done.any() else []
+    while not done.all():
+        now = ~done & done[lead]
+        if not now.any():
+            now[int(done.argmin())] = True
+        found.append(np.flatnonzero(now))
+        done = done | now
+    return found
+
+
+def drivable(system: System) -> Lane:
+    """The formula of a model that can drive vehicles in another program.
+
+    Raises:
+        ConfigError: there is none, or it names what only recorded data tell.
+    """
+    if not isinstance(system, Traffic):
+        raise ConfigError(
+            "the run's model is one of people, and drive moves vehicles in SUMO; JuPedSim's "
+            "released wheels take no model of one's own: export.py to=jupedsim writes the "
+            "parameters of models that it has"
+        )
+    lane = system.lane
+    if type(system) is not Traffic or lane is None or not lane.is_formula:
+        raise ConfigError(
+            "the run's model has a term that is Python code; to drive vehicles it needs a formula, "
+            "see docs/method.md"
+        )
+    if "measured" in symbols([*lane.rates.values(), *lane.starts.values()]):
+        raise ConfigError("the run's model names measured speeds, which SUMO's vehicles have not")
+    for place, part in lane.inputs.values():
+        term = system.terms[place]
+        if not isinstance(term, VehicleClass | IndividualEffect):
+            raise ConfigError(
+                f"effect {term.name} needs {part} of each vehicle from the recorded data, which "
+                "SUMO cannot tell; leave the effect out and calibrate again"
+            )
+    return lane
+
+
+def _drawn(term: Term, kinds: Sequence[Collection[str]], rng: np.random.Generator) -> np.ndarray:
+    """``(n,)`` what new drivers have of an effect: whether they belong to its class, or a number
+    drawn from its normal distribution, at least what leaves a tenth of a pace."""
+    if isinstance(term, VehicleClass):
+        return np.array([float(term.kind in own) for own in kinds])
+    assert isinstance(term, IndividualEffect)
+    known = np.concatenate([np.zeros(0), *(np.array(own) for own in term.people.values())])
+    (strength, *_) = term.strengths
+    spread = float(getattr(term, strength).detach())
+    if not spread and len(known):
+        spread = float(np.sqrt(np.mean(known**2)))
+    return np.maximum(rng.normal(0.0, 1.0, len(kinds)) * spread, _SLOWEST - 1)

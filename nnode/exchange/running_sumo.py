@@ -1,0 +1,268 @@
+"""SUMO as it runs, step by step: who is where, who is ahead of whom, and how fast they shall drive.
+
+Through ``libsumo``, in this process, or ``traci``, in one of its own; both have the same interface.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+
+from nnode.errors import ConfigError
+from nnode.exchange.drivers import Seen
+
+#: What can be run.
+PROGRAMS = ("libsumo", "traci")
+#: Within these, m, a vehicle ahead is looked for.
+LOOK = 5000.0
+#: Decimals of what SUMO writes: what is read is what was driven, to the nanometre.
+DIGITS = 9
+#: Of a vehicle that is off the road SUMO says numbers far below this.
+_OFF_ROAD = -1e6
+
+#: Vehicle to what is known of it, by SUMO's numbers of quantities.
+Told = dict[str, dict[int, Any]]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How a program steps: length, s, and method, of :data:`nnode.laws.steps.METHODS`."""
+
+    seconds: float
+    method: str
+
+    def __str__(self) -> str:
+        return f"{self.method} steps of {self.seconds:g} s"
+
+
+class RunningSumo:
+    """A scenario that SUMO has loaded.
+
+    Args:
+        program: one of :data:`PROGRAMS`.
+        scenario: ``.sumocfg``.
+        output: floating car data are written there.
+        steps: SUMO is told to make these; None: the scenario's own.
+
+    Raises:
+        ConfigError: no such program or file, or SUMO does not load it.
+    """
+
+    def __init__(
+        self, program: str, scenario: Path, output: Path, steps: Steps | None = None
+    ) -> None:
+        if not scenario.is_file():
+            raise ConfigError(f"sumo={scenario} is not there; name a SUMO configuration, *.sumocfg")
+        self.api, binary = _loaded(program)
+        options = [
+            "-c", str(scenario), "--fcd-output", str(output), "--fcd-output.attributes",
+            "id,type,speed,pos,lane", "--precision", str(DIGITS), "--no-step-log", "true",
+            # a law may stop closer than the type's minGap: a collision is where bodies touch
+            "--collision.mingap-factor", "0", "--aggregate-warnings", "3",
+        ]  # fmt: skip
+        if steps is not None:
+            ballistic = str(steps.method == "ballistic").lower()
+            options += ["--step-length", repr(steps.seconds), "--step-method.ballistic", ballistic]
+        try:
+            with redirect_stdout(StringIO()):  # traci counts its attempts to connect
+                # of a start that failed traci keeps the name
+                self.api.start([binary, *options], label=uuid4().hex)
+        except (self.api.TraCIException, self.api.FatalTraCIError) as error:
+            raise ConfigError(f"sumo={scenario} cannot be loaded by SUMO: {error}") from error
+        self._constants = self.api.constants
+        self._speed = self._constants.VAR_SPEED
+        self._length: dict[str, float] = {}
+        self._min_gap: dict[str, float] = {}
+
+    @property
+    def ballistic(self) -> bool:
+        return str(self.api.simulation.getOption("step-method.ballistic")) == "true"
+
+    @property
+    def seconds(self) -> float:
+        """Length of a step, s."""
+        return float(self.api.simulation.getDeltaT())
+
+    @property
+    def time(self) -> float:
+        """Of the clock, s, at which SUMO writes that vehicles were where they are now."""
+        return float(self.api.simulation.getTime()) - self.seconds
+
+    def going_on(self, end: float | None) -> bool:
+        """Whether somebody is on the road or will be, before the end, s."""
+        last = float(self.api.simulation.getEndTime()) if end is None else end
+        soon = last < 0 or self.api.simulation.getTime() < last - self.seconds / 2
+        return soon and self.api.simulation.getMinExpectedNumber() > 0
+
+    def check_types(self, types: Sequence[str]) -> None:
+        """Refuse types that there are not, or whose vehicles do not decide in every step.
+
+        Raises:
+            ConfigError: names them.
+        """
+        known = [t for t in self.api.vehicletype.getIDList() if not t.startswith("DEFAULT_")]
+        for name in types:
+            if name not in known:
+                raise ConfigError(
+                    f"vehicles={name} is no vehicle type of the scenario, it has "
+                    f"{', '.join(known) or 'none'}"
+                )
+            pause = float(self.api.vehicletype.getActionStepLength(name))
+            if pause > self.seconds * (1 + 1e-9):
+                raise ConfigError(
+                    f"vehicles={name}: its actionStepLength is {pause:g} s and SUMO's step "
+                    f"{self.seconds:g} s, so that speeds would wait; leave actionStepLength out of "
+                    "the vType"
+                )
+
+    def step(self) -> None:
+        self.api.simulationStep()
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Everybody on the road."""
+        return tuple(self.api.vehicle.getIDList())
+
+    @property
+    def departed(self) -> tuple[str, ...]:
+        """Who has entered the road in the last step."""
+        return tuple(self.api.simulation.getDepartedIDList())
+
+    def type_of(self, vehicle: str) -> str:
+        return str(self.api.vehicle.getTypeID(vehicle))
+
+    def classes_of(self, vehicle: str) -> set[str]:
+        """Its type, which ``data=sumo`` calls its kind, and SUMO's class of vehicles."""
+        return {self.type_of(vehicle), str(self.api.vehicle.getVehicleClass(vehicle))}
+
+    def take(self, vehicle: str, *, lane_changes: bool) -> None:
+        """Take over a vehicle: SUMO no longer looks after its speed, nor, if so, after its lane."""
+        every, c = self.api.vehicle, self._constants
+        every.setSpeedMode(vehicle, 0)
+        if not lane_changes:
+            every.setLaneChangeMode(vehicle, 0)
+        every.subscribe(vehicle, [c.VAR_SPEED, c.VAR_DISTANCE, c.VAR_LANEPOSITION])
+        every.subscribeLeader(vehicle, LOOK)
+
+    def set_speeds(self, vehicles: Iterable[str], speeds: np.ndarray) -> None:
+        """At the end of the step that begins now, m/s."""
+        command = self.api.vehicle.setSpeed
+        for vehicle, speed in zip(vehicles, speeds.tolist(), strict=True):
+            command(vehicle, speed)
+
+    def told(self) -> Told:
+        """What was subscribed to, of the vehicles that were taken over and have not arrived."""
+        found: Told = self.api.vehicle.getAllSubscriptionResults()
+        return found
+
+    def seen(self, vehicles: Sequence[str], told: Told, *, twice: bool) -> Seen:
+        """What vehicles see; those that SUMO carries elsewhere see nobody.
+
+        Args:
+            told: see :meth:`told`.
+            twice: whether the second vehicle ahead is asked for.
+        """
+        speed, leader, every = self._speed, self._constants.VAR_LEADER, self.api.vehicle
+        n = len(vehicles)
+        number = {vehicle: i for i, vehicle in enumerate(vehicles)}
+        v = np.array([max(told[vehicle][speed], 0.0) for vehicle in vehicles])
+        gap, v_1, length, lead = np.full(n, np.inf), v.copy(), np.zeros(n), np.full(n, -1)
+        gap_1, v_2 = np.full(n, np.inf), v.copy()
+        others: dict[str, float] = {}
+        for i, vehicle in enumerate(vehicles):
+            found = told[vehicle][leader]
+            if not found or not found[0] or told[vehicle][speed] < _OFF_ROAD:
+                continue
+            name = found[0]
+            length[i] = self._length_of(name)
+            # SUMO's distance ends minGap before the bumper
+            gap[i] = found[1] + self._min_gap_of(vehicle) + length[i]
+            at = number.get(name, -1)
+            if at < 0 and name not in others:
+                others[name] = max(float(every.getSpeed(name)), 0.0)
+            lead[i], v_1[i] = at, v[at] if at >= 0 else others[name]
+            after = every.getLeader(name, LOOK) if twice and at < 0 else None
+            if after and after[0]:
+                gap_1[i] = after[1] + self._min_gap_of(name) + self._length_of(after[0])
+                v_2[i] = max(float(every.getSpeed(after[0])), 0.0)
+        led = np.flatnonzero(lead >= 0)
+        gap_1[led], v_2[led] = gap[lead[led]], v_1[lead[led]]
+        return Seen(v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2,
+                    x=np.zeros(n))  # fmt: skip
+
+    def places(self, vehicles: Sequence[str], told: Told) -> tuple[np.ndarray, np.ndarray]:
+        """``(n,)`` each: m along the lane, and m driven since the departure."""
+        lane, way = self._constants.VAR_LANEPOSITION, self._constants.VAR_DISTANCE
+        return tuple(np.array([told[v][key] for v in vehicles]) for key in (lane, way))  # type: ignore[return-value]
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Who runs into whom."""
+        return [(one.collider, one.victim) for one in self.api.simulation.getCollisions()]
+
+    def teleports(self) -> int:
+        """How many vehicles SUMO has begun to carry elsewhere in the last step."""
+        return int(self.api.simulation.getStartingTeleportNumber())
+
+    def stranded(self) -> tuple[str, ...]:
+        """Vehicles that SUMO has stopped in the last step where their lane does not lead on."""
+        return tuple(self.api.simulation.getEmergencyStoppingVehiclesIDList())
+
+    def close(self) -> None:
+        self.api.close()
+
+    def _length_of(self, vehicle: str) -> float:
+        if vehicle not in self._length:
+            self._length[vehicle] = float(self.api.vehicle.getLength(vehicle))
+        return self._length[vehicle]
+
+    def _min_gap_of(self, vehicle: str) -> float:
+        if vehicle not in self._min_gap:
+            self._min_gap[vehicle] = float(self.api.vehicle.getMinGap(vehicle))
+        return self._min_gap[vehicle]
+
+
+def _loaded(program: str) -> tuple[Any, str]:
+    """The module, and SUMO's own program.
+
+    Raises:
+        ConfigError: unknown, or not installed.
+    """
+    if program not in PROGRAMS:
+        raise ConfigError(f"program={program} is unknown, expected {' or '.join(PROGRAMS)}")
+    home = _home()
+    tools = str(home / "tools") if home else None
+    if tools is not None and tools not in sys.path:
+        sys.path.append(tools)  # traci comes with SUMO
+    binary = str(home / "bin" / "sumo") if home else shutil.which("sumo")
+    try:
+        # libsumo warns of a pyarrow of another version, which matters to tables that it would write
+        with redirect_stdout(StringIO()):
+            found = importlib.import_module(program)
+    except ImportError as error:
+        raise ConfigError(
+            f"program={program} cannot be loaded ({error}); pip install nnode[sumo], or take "
+            f"program={PROGRAMS[program == PROGRAMS[0]]}"
+        ) from error
+    if binary is None and program == "traci":
+        raise ConfigError("no program sumo is found; pip install eclipse-sumo, or set SUMO_HOME")
+    return found, binary or "sumo"
+
+
+def _home() -> Path | None:
+    """SUMO's folder."""
+    try:
+        return Path(importlib.import_module("sumo").SUMO_HOME)
+    except ImportError:
+        told = os.environ.get("SUMO_HOME")
+        return Path(told) if told else None

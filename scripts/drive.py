@@ -1,0 +1,6 @@
+"""``nnode drive`` in a checkout; ``--help`` shows what it does, examples and options."""
+
+from nnode.app.commands.drive import main
+
+if __name__ == "__main__":
+    main()

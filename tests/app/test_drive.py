@@ -1,0 +1,155 @@
+"""A run drives vehicles in SUMO: the script, ``nnode.drive``, and what is refused beforehand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import nnode
+from benchmarks.recovery import by_sumo
+from nnode.app.drive import _has_lengths, steps_of
+from nnode.app.python.inputs import model_options
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from nnode.data.options import SumoOptions, TableOptions
+from nnode.data.prepare import prepare
+from nnode.data.readers.sumo import read_sumo
+from nnode.errors import CheckpointError, ConfigError
+from nnode.exchange.running_sumo import Steps
+from nnode.models import build_model
+from tests.app.conftest import Script
+
+
+@pytest.fixture(scope="module")
+def sumo() -> Path:
+    """SUMO's folder."""
+    return Path(pytest.importorskip("sumo").SUMO_HOME)
+
+
+def run_of(folder: Path, name: str, *effects: dict[str, Any], **solver: Any) -> Path:
+    """The folder of a training of which only the checkpoint is left."""
+    options = {**model_options(name, "measured"), "effects": list(effects)}
+    config = {
+        "model": options, "seed": 0, "trainer": {"dtype": "float64"}, "data": {"name": "sumo"},
+        "solver": {"name": "fused", "dt": 0.1, "method": None, **solver},
+    }  # fmt: skip
+    made = Checkpoint(
+        config=config, manifest={"dt": 0.2}, model=build_model(options).state_dict(), optimizer={},
+        progress={},
+    )  # fmt: skip
+    save_checkpoint(made, folder / "checkpoints" / "best.pt")
+    return folder
+
+
+@pytest.fixture
+def scene(sumo: Path, tmp_path: Path) -> Path:
+    """Seven vehicles of type ``own`` behind one of type ``lead``, ballistic steps of 0.1 s."""
+    by_sumo.write_scene(sumo, tmp_path, "Krauss", {"decel": 4.5})
+    path = tmp_path / "a.sumocfg"
+    path.write_text(
+        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
+        '</input><time><step-length value="0.1"/><end value="20"/></time>'
+        '<processing><step-method.ballistic value="true"/></processing></configuration>'
+    )
+    return path
+
+
+def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
+    run, out = run_of(tmp_path / "run", "idm"), tmp_path / "out"
+    options = [f"run={run}", f"sumo={scene}", "program=traci", "lengths=true"]
+    done = script("drive", *options, "vehicles=own", f"hydra.run.dir={out}")
+    assert done.returncode == 0, done.stderr
+    account = json.loads((out / "drive.json").read_text())
+    assert (account["driven"], account["steps"], account["collisions"]) == (7, 200, 0)
+    assert "driven: 7 vehicles, mean " in done.stdout
+    assert "200 ballistic steps of 0.1 s" in done.stdout
+    (seen,) = read_sumo(out / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
+    assert (seen.n_agents, seen.n_samples) == (8, 200)
+    assert seen.kind == ("own",) * 7 + ("lead",)
+    store = prepare(SumoOptions(path=str(out / "fcd.xml.gz")), tmp_path / "store")
+    assert len(store) == 1
+
+    done = script("drive", *options, "vehicles=car", f"hydra.run.dir={out}")
+    assert done.returncode == 2
+    assert "error: vehicles=car is no vehicle type of the scenario, it has lead, own" in done.stderr
+
+
+def test_from_python(scene: Path, tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "idm")
+    found = nnode.drive(run, sumo=scene, vehicles=["own", "lead"], program="traci", lengths=True)
+    assert found.driven == 8
+    assert found.trajectories.is_file()
+    assert (found.step, found.method, found.seconds) == (0.1, "ballistic", pytest.approx(20.0))
+    assert 0 < found.in_sumo < found.wall
+
+
+def test_steps_are_those_of_the_run(scene: Path, tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "idm", dt=0.05, method="semi_implicit")
+    options: dict[str, Any] = {
+        "sumo": scene,
+        "vehicles": "own",
+        "program": "traci",
+        "lengths": True,
+    }
+    words = r"ballistic steps of 0\.1 s.*semi_implicit steps of 0\.05 s.*solver\.dt=0\.1"
+    with pytest.raises(ConfigError, match=words):
+        nnode.drive(run, folder=tmp_path, **options)
+    found = nnode.drive(run, folder=tmp_path, steps="run", **options)
+    assert (found.step, found.method, found.steps) == (0.05, "semi_implicit", 400)
+    found = nnode.drive(run, folder=tmp_path, steps="scenario", **options)
+    assert (found.step, found.method, found.steps) == (0.1, "ballistic", 200)
+    with pytest.raises(ConfigError, match="steps=any is unknown, expected match, run, scenario"):
+        nnode.drive(run, folder=tmp_path, steps="any", **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "expected"),
+    [
+        ("idm", {}, Steps(0.1, "ballistic")),
+        ("krauss", {}, Steps(0.1, "semi_implicit")),
+        ("idm", {"dt": None}, Steps(0.1, "ballistic")),
+        ("lin", {"dt": None}, Steps(0.002, "euler")),
+        ("lin", {"dt": 0.2}, Steps(0.2, "euler")),
+    ],
+)
+def test_which_steps_a_run_made(
+    name: str, given: dict[str, Any], expected: Steps, tmp_path: Path
+) -> None:
+    checkpoint = load_checkpoint(run_of(tmp_path, name, **given) / "checkpoints" / "best.pt")
+    found = steps_of(checkpoint, checkpoint.build())
+    assert (found.seconds, found.method) == (pytest.approx(expected.seconds), expected.method)
+
+
+def test_what_is_refused_before_sumo_runs(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"sumo": tmp_path / "a.sumocfg", "vehicles": "car"}
+    with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
+        nnode.drive(tmp_path / "none", **options)
+    with pytest.raises(ConfigError, match=r"one of people"):
+        nnode.drive(run_of(tmp_path / "sf", "sf"), **options)
+    with pytest.raises(ConfigError, match=r"leader_length needs longer"):
+        nnode.drive(run_of(tmp_path / "l", "lin", {"leader_length": {"beta": 0.2}}), **options)
+    with pytest.raises(ConfigError, match=r"rk4 steps of 0\.1 s, SUMO can make semi_implicit or"):
+        nnode.drive(run_of(tmp_path / "rk", "idm", method="rk4"), steps="run", **options)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_lengths_are_asked_for_as_the_data_had_them(known: bool, tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "idm")
+    checkpoint = load_checkpoint(run / "checkpoints" / "best.pt")
+    with pytest.raises(ConfigError, match=r"run/data, are not there.*lengths=true"):
+        _has_lengths(checkpoint, str(run), checkpoint.build())
+    k = np.arange(20)
+    rows = [pd.DataFrame({"sequence": "a", "time": 0.1 * k, "agent": n, "x": 30 * n + k})
+            for n in range(2)]  # fmt: skip
+    table = pd.concat(rows)
+    if known:
+        table["length"] = 4.5
+    table.to_csv(tmp_path / "a.csv", index=False)
+    prepare(TableOptions(domain="traffic", path=str(tmp_path / "a.csv")), run / "data")
+    assert _has_lengths(checkpoint, str(run), checkpoint.build()) is known
+    # a law that does not ask
+    assert _has_lengths(checkpoint, str(tmp_path), build_model(model_options("lin", "measured")))

@@ -1,0 +1,182 @@
+"""There and back: another program simulates, the toolkit calibrates, and the program simulates what
+was exported; the same paths, to the tolerance that each test derives."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.recovery import by_jupedsim, by_sumo
+from benchmarks.recovery.cases import SLOWLY
+from nnode.calibrate.ensemble import EnsembleCost
+from nnode.calibrate.least_squares import least_squares, trajectory_residuals
+from nnode.data.options import SumoOptions
+from nnode.data.readers.sumo import read_sumo
+from nnode.data.sequence import Sequence, collate
+from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
+from nnode.exchange.sumo import SAME, sumo_type
+from nnode.models import Crowd, Relaxation, SocialForce, System, Traffic
+from nnode.models.field import FIELD
+from nnode.models.field_crowd import PEOPLE
+from nnode.models.own_law import law_from
+from nnode.solvers import FusedSolver
+from tests.exchange.test_recovery import recovered
+
+
+def of_the_field(law: Any, name: str) -> Any:
+    """A law with the parameters that a search has found, in float64."""
+    found = recovered(name)
+    with torch.no_grad():
+        for own, value in zip(found.names, found.found, strict=True):
+            getattr(law, own).fill_(value)
+    return law.double()
+
+
+def vehicles(path: Path) -> Sequence:
+    (found,) = read_sumo(path, SumoOptions(path=str(path), dt=by_sumo.STEP))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "case", "values", "profile"),
+    [
+        ("idm", "idm_euler", {"v0": 28.0, "T": 1.1, "s0": 2.3, "a": 1.4, "b": 2.0},
+         by_sumo.PROFILE),
+        ("krauss", "krauss_moving", {"v0": 21.0, "T": 1.1, "s0": 2.3, "a": 1.9, "b": 3.5}, SLOWLY),
+    ],
+)  # fmt: skip
+def test_sumo_s_vehicles(
+    sumo: Path, tmp_path: Path, law: str, case: str, values: dict[str, float], profile: np.ndarray
+) -> None:
+    names = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel"}
+    typed = {names[p]: value for p, value in values.items()}
+    typed |= {} if law == "idm" else {"sigma": 0.0}
+    first = vehicles(by_sumo.platoon(sumo, tmp_path / "a", SAME[law], typed, profile=profile))
+    system = Traffic([of_the_field(law_from(law, FIELD[law]), case)], leader="measured")
+    text = sumo_type(system, "own", 15.0, by_sumo.LENGTH).text
+    (kind,) = ElementTree.fromstring(text).iter("vType")
+    written = dict(kind.attrib)
+    follow, length = written.pop("carFollowModel"), float(written.pop("length"))
+    assert (follow, length) == (SAME[law], by_sumo.LENGTH)
+    again = {k: float(v) for k, v in written.items() if k in {*names.values(), "sigma"}}
+    second = vehicles(by_sumo.platoon(sumo, tmp_path / "b", follow, again, profile=profile))
+    # parameters are found to 1e-9 and written with twelve digits: a micrometre in 60 s
+    assert np.abs(first.x - second.x).max() < 1e-6
+
+
+def people(
+    jupedsim: ModuleType, folder: Path, content: dict[str, Any], **scene: Any
+) -> list[Sequence]:
+    """What JuPedSim makes of an exported file, with everybody's preferred velocity."""
+    model, agent = (getattr(jupedsim, content["classes"][part]) for part in ("model", "agent"))
+    found = []
+    folder.mkdir()
+    for seed in range(2):
+        walked = by_jupedsim.groups(
+            jupedsim, folder / f"{seed}.sqlite", model(**content["model"]), agent,
+            content["agent"], seed=seed, **scene,
+        )  # fmt: skip
+        assert walked.destination is not None
+        way = np.sign(walked.destination[:, :1]) * np.array([[1.3, 0.0]])
+        found.append(replace(walked, preferred=way))
+    return found
+
+
+def content(model: str, arguments: dict[str, float], **agent: float) -> dict[str, Any]:
+    return {"classes": {"model": model, "agent": f"{model}AgentParameters"}, "model": arguments,
+            "agent": {"desired_speed": 1.3, **agent}}  # fmt: skip
+
+
+def exported(system: System, walked: list[Sequence]) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(jupedsim_parameters(system, scenes_of(walked, 0.25)).text)
+    return found
+
+
+@pytest.mark.slow
+def test_jupedsim_s_collision_free_people(jupedsim: ModuleType, tmp_path: Path) -> None:
+    arguments = {"strength_neighbor_repulsion": 8.0, "range_neighbor_repulsion": 0.1}
+    typed = content("CollisionFreeSpeedModel", arguments, time_gap=1.0, radius=0.2)
+    first = people(jupedsim, tmp_path / "a", typed)
+    system = Crowd([of_the_field(law_from("cfsm", PEOPLE["cfsm"]), "collision_free")])
+    second = people(jupedsim, tmp_path / "b", exported(system, first))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_allclose(a.x, b.x, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
+    # JuPedSim places people with the new velocity, Euler's steps here with the old one: what is
+    # found is off in proportion to the step, 8 mm in 8 s at 1 ms
+    dt = 0.001
+    typed = content(
+        "SocialForceModel", {"body_force": 0.0, "friction": 0.0}, mass=80.0, reaction_time=0.5,
+        agent_scale=160.0, force_distance=0.3, radius=0.3,
+    )  # fmt: skip
+    first = people(jupedsim, tmp_path / "a", typed, dt=dt)
+    force = SocialForce(24.0, 0.0, 0.0, r=0.3, B=0.3)  # 8 people: 16 is what was typed in
+    system = Crowd([Relaxation(0.5, preferred=True), force], desired="exit").double()
+    for name in ("k", "kappa"):
+        getattr(force, name).requires_grad_(False)
+    parts = [part for whole in first for part in by_jupedsim.pieces(whole, seconds=1.0)]
+    cost = EnsembleCost(system, collate(parts), FusedSolver(dt=dt))
+    end = least_squares(
+        trajectory_residuals(cost), cost.row(system).numpy(), cost.low.numpy(), cost.high.numpy(),
+        steps=30,
+    )  # fmt: skip
+    assert end.row == pytest.approx(16.0, rel=2e-3)
+    with torch.no_grad():
+        force.A.fill_(end.row[0])
+    second = people(jupedsim, tmp_path / "b", exported(system, first), dt=dt)
+    for a, b in zip(first, second, strict=True):
+        assert np.abs(a.x - b.x).max() < 0.01
+
+
+def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
+    jupedsim: ModuleType, tmp_path: Path
+) -> None:
+    """Head-on the distance of bodies is the same in both, and so are accelerations: where bodies
+    are farther apart than JuPedSim's interpolation begins, and centres nearer than the law fades.
+    """
+    import shapely
+
+    system = Crowd([law_from("gcfm", PEOPLE["gcfm"])])
+    apart, speed, dt = 1.4, 0.2, 1e-4
+    x = np.array([[0.0, 0.0], [apart, 0.0]])
+    v = np.array([[speed, 0.0], [-speed, 0.0]])
+    way = np.array([[1.3, 0.0], [-1.3, 0.0]])
+    s = Sequence(
+        name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), v=np.stack([v, v]),
+        destination=x + 100 * way, preferred=way,
+    )  # fmt: skip
+    written = exported(system, [s])
+    simulation = jupedsim.Simulation(
+        model=jupedsim.GeneralizedCentrifugalForceModel(**written["model"]),
+        geometry=shapely.box(-500, -500, 500, 500), dt=dt,
+    )  # fmt: skip
+    stage = simulation.add_direct_steering_stage()
+    journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
+    ids = []
+    for place, aim in zip(x, way, strict=True):
+        towards = tuple(np.sign(aim))
+        person = jupedsim.GeneralizedCentrifugalForceModelAgentParameters(
+            position=tuple(place), journey_id=journey, stage_id=stage, speed=speed,
+            orientation=towards, desired_direction=towards, **written["agent"],
+        )  # fmt: skip
+        ids.append(simulation.add_agent(person))
+        simulation.agent(ids[-1]).target = tuple(place + 200 * aim)
+    simulation.iterate()
+    theirs = np.array([simulation.agent(i).model.speed - speed for i in ids]) / dt
+    batch = collate([s])
+    rate = system(torch.tensor(0.0), system.initial(batch), system.scene(batch)).detach()[0]
+    ours = rate[:, 2].numpy() * np.sign(way[:, 0])
+    assert (ours < 1.3 / 0.5 - speed / 0.5 - 0.05).all()  # each pushes the other
+    np.testing.assert_allclose(theirs, ours, rtol=1e-3)
