@@ -233,7 +233,7 @@ def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]
     unsure = right.unknown and not names and nearest["verdict"] == "unknown"
     return {
         "scene": scene, "seed": seed, "asked": asked, "first": first,
-        "law_right": not right.first or first in right.first,
+        "law_known": bool(right.first), "law_right": not right.first or first in right.first,
         "verdict": nearest["verdict"], "names": names,
         "leads": [effect["name"] for effect in nearest["leads"]],
         "right": bool(alone or unsure),

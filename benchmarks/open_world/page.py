@@ -61,23 +61,48 @@ def by_law(rows: list[dict[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def scene_criteria(rows: list[dict[str, Any]]) -> pd.DataFrame:
+    """What is asked for of the scenes, and what was reached."""
+    known = [row for row in rows if row["law_known"]]
+    lines = [
+        ("the written answer", "85 %", share(sum(row["right"] for row in rows), len(rows))),
+        ("a false name", "5 %", share(sum(bool(row["false"]) for row in rows), len(rows))),
+        ("the law that SUMO drives comes first", "",
+         share(sum(row["law_right"] for row in known), len(known))),
+    ]  # fmt: skip
+    return pd.DataFrame(lines, columns=["what", "asked for", "reached"])
+
+
 def write(rows: list[dict[str, Any]], seeds_of: str | None, folder: Path) -> list[Path]:
     """The page, as Markdown, and its tables; returns their paths."""
-    flat = pd.DataFrame(rows).drop(columns="parameters")
-    blocks: list[Block] = [
-        Heading("The base law is wrong"),
-        Text(
-            "Platoons of one law, written out by hand, are diagnosed with `lin` or `idm`: which "
-            "law comes first, and is anything named that the true law lacks? What is right was "
-            "written down before (`benchmarks/open_world/laws.py`)."
-        ),
-        TableBlock("criteria", criteria(rows), "Shares with exact intervals of 95 %."),
-        TableBlock("laws", by_law(rows), "By the law that is true."),
-        TableBlock("worlds", flat, "Every world."),
-        Provenance(
-            {**how_made(("torch", "numpy", "scipy")), "Seeds of": seeds_of or "none: development"}
-        ),
-    ]
+    blocks: list[Block] = []
+    worlds, scenes = ([r for r in rows if kind in r] for kind in ("law", "scene"))
+    if worlds:
+        flat = pd.DataFrame(worlds).drop(columns="parameters")
+        blocks += [
+            Heading("The base law is wrong"),
+            Text(
+                "Platoons of one law, written out by hand, are diagnosed with `lin` or `idm`: which "
+                "law comes first, and is anything named that the true law lacks? What is right "
+                "was written down before (`benchmarks/open_world/laws.py`)."
+            ),
+            TableBlock("criteria", criteria(worlds), "Shares with exact intervals of 95 %."),
+            TableBlock("laws", by_law(worlds), "By the law that is true."),
+            TableBlock("worlds", flat, "Every world."),
+        ]
+    if scenes:
+        blocks += [
+            Heading("Scenes by SUMO"),
+            Text(
+                "Forty platoons each, whose followers SUMO drives, diagnosed with `idm` and with "
+                "the law that comes nearest, which is what is judged. The answers were written "
+                "down before (`benchmarks/open_world/by_sumo.py`)."
+            ),
+            TableBlock("scenes_criteria", scene_criteria(scenes), "Shares, 95 % intervals."),
+            TableBlock("scenes", pd.DataFrame(scenes), "Every scene."),
+        ]
+    made = how_made(("torch", "numpy", "scipy"))
+    blocks.append(Provenance({**made, "Seeds of": seeds_of or "none: development"}))
     return write_page(
         blocks, folder, title=TITLE, subtitle="Which law, and what beside it.", stem="open_world"
     )
