@@ -83,8 +83,8 @@ def write(rows: list[dict[str, Any]], seeds_of: str | None, folder: Path) -> lis
             Heading("The base law is wrong"),
             Text(
                 "Platoons of one law, written out by hand, are diagnosed with `lin` or `idm`: "
-                "which law comes first, and is anything named that the true law lacks? What is right "
-                "was written down before (`benchmarks/open_world/laws.py`)."
+                "which law comes first, and is anything named that the true law lacks? What is "
+                "right was written down before (`benchmarks/open_world/laws.py`)."
             ),
             TableBlock("criteria", criteria(worlds), "Shares with exact intervals of 95 %."),
             TableBlock("laws", by_law(worlds), "By the law that is true."),
