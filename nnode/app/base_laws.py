@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 from nnode.app.python.inputs import MODELS, model_options
@@ -21,13 +22,19 @@ LAWS = {
     "crowd": ("sf", "esf", "gcfm", "ttc"),
 }
 
+#: Options that say what is simulated, not by which law.
+SHARED = ("desired", "neighbours")
 
-def candidates(name: str, asked: System, options: DiscoverOptions) -> dict[str, System]:
+
+def candidates(
+    model: Mapping[str, Any], asked: System, options: DiscoverOptions
+) -> dict[str, System]:
     """Models by name, the one that was asked for among them; vehicles drive behind measured
-    leaders. None where nothing is to be compared.
+    leaders, people want to go where the one that was asked for says. None where nothing is to be
+    compared.
 
     Args:
-        name: of the model that was asked for.
+        model: options of the one that was asked for.
 
     Raises:
         ConfigError: an unknown name, or one of another domain.
@@ -40,27 +47,28 @@ def candidates(name: str, asked: System, options: DiscoverOptions) -> dict[str, 
                 f"discover.compare: there is no model {one}, expected some of "
                 f"{', '.join(LAWS[asked.domain])}, or another name as in conf/model"
             )
-        found[one] = build_model(law_options(one), options.seed)
+        found[one] = build_model(law_options(one, model), options.seed)
         if found[one].domain != asked.domain:
             raise ConfigError(
                 f"discover.compare: {one} is a {found[one].domain} model, the data and the model "
                 f"are of {asked.domain}; leave it out"
             )
     if found:
-        own = found[name] = copy.deepcopy(asked)
+        own = found[str(model["name"])] = copy.deepcopy(asked)
         if isinstance(own, Traffic):
             own.leader = "measured"
     return found
 
 
-def law_options(name: str) -> dict[str, Any]:
-    """Options of a model that is compared."""
-    return model_options(name, "measured")
+def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a model that is compared with another one."""
+    found = model_options(name, "measured")
+    return {**found, **{key: asked[key] for key in SHARED if key in asked and key in found}}
 
 
 def compared(
-    name: str, asked: System, sequences: list[Sequence], options: DiscoverOptions
+    model: Mapping[str, Any], asked: System, sequences: list[Sequence], options: DiscoverOptions
 ) -> Laws | None:
     """The ranking; None where nothing is to be compared."""
-    found = candidates(name, asked, options)
+    found = candidates(model, asked, options)
     return compare_laws(found, sequences, options) if found else None

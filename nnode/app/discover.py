@@ -212,7 +212,7 @@ def _job(
         )
     check_options(options, system.domain, system.order)  # type: ignore[arg-type]
     check_model(system)
-    candidates(str(model["name"]), system, options)
+    candidates(model, system, options)
     inputs = read()
     if data.prepared is None:  # a folder is taken as it is
         # what the extended model is trained and tested on are the sequences without a fault
@@ -228,7 +228,7 @@ def _diagnose(job: Job, stages: Stages | None = None) -> Found:
     start = time.monotonic()
     if stages is not None:
         stages.begin("comparing laws")
-    laws = compared(name, job.system, inputs.sequences, job.options)
+    laws = compared(job.model, job.system, inputs.sequences, job.options)
     seconds = {"reading": job.seconds, "laws": round(time.monotonic() - start, 3)}
     found = diagnose(job.system, inputs.sequences, job.options, stages=stages)
     diagnosis = found.diagnosis
@@ -244,7 +244,7 @@ def _nearest(job: Job, found: Found) -> Job | None:
     laws = found.diagnosis.laws
     if laws is None or laws.best in ("", str(job.model["name"])):
         return None
-    model = law_options(laws.best)
+    model = law_options(laws.best, job.model)
     options = replace(job.options, compare=[])
     if options.effects is not None or options.exclude:  # those that laws of its order know
         order = build_model(model, options.seed).order

@@ -270,7 +270,7 @@ class ComparedLaw:
     Attributes:
         parameters: that were calibrated, their number.
         error: mean square error of positions of whole sequences in clusters that a calibration to
-            nothing else left out, m²; in crowds of residuals.
+            nothing else left out, m²; in crowds of the clusters that it saw.
         behind: by what share its held-out cost lies above that of the best law, in the mean of
             logarithms over clusters.
         p_value: one-sided, paired by cluster, that it is as good as the best law.

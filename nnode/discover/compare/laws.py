@@ -22,7 +22,7 @@ from nnode.discover.division import divide
 from nnode.discover.judge.confirm import engine_of, plain_engine
 from nnode.discover.name.search import begun
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.residuals.engine import Engine, row_of
+from nnode.discover.residuals.engine import Engine, row_of, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.statistics.paired import compare, heldout
@@ -55,6 +55,8 @@ def compare_laws(
         return Laws([], refused, 0)
     number = np.bincount(whole.cluster)
     errors = {name: heldout(fit, whole.cluster) / number for name, fit in found.items()}
+    if domain == "crowd":  # whose residuals are no positions
+        errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in found.items()}
     first = min(errors, key=lambda name: float(errors[name].mean()))
     engine = engine_of(domain, chosen, label)
     costs: dict[str, np.ndarray] = {}

@@ -111,7 +111,7 @@ def _laws(d: Diagnosis) -> list[Block]:
     words += f" Costs are those of {clusters} clusters that calibrations left out in turn."
     if d.laws.refused:
         words += " Not compared: " + "; ".join(f"{k}: {v}" for k, v in d.laws.refused.items()) + "."
-    return [Heading("Which base law"), Text(words), tables.laws_table(d.laws)]
+    return [Heading("Which base law"), Text(words), tables.laws_table(d.laws, d.domain)]
 
 
 def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -63,13 +62,17 @@ def test_people_are_compared_too() -> None:
 
 def test_which_laws_are_candidates() -> None:
     asked = law("lin")
-    every = candidates("lin", asked, DiscoverOptions())
+    lin = {"name": "lin"}
+    every = candidates(lin, asked, DiscoverOptions())
     assert set(every) == set(LAWS["traffic"])
     assert every["lin"] is not asked
-    few = candidates("own", asked, DiscoverOptions(compare=["idm"]))
+    few = candidates({"name": "own"}, asked, DiscoverOptions(compare=["idm"]))
     assert list(few) == ["idm", "own"]
-    assert candidates("lin", asked, DiscoverOptions(compare=[])) == {}
+    assert candidates(lin, asked, DiscoverOptions(compare=[])) == {}
     with pytest.raises(ConfigError, match=r"no model idn.*expected some of lin"):
-        candidates("lin", asked, DiscoverOptions(compare=["idn"]))
+        candidates(lin, asked, DiscoverOptions(compare=["idn"]))
     with pytest.raises(ConfigError, match="sf is a crowd model"):
-        candidates("lin", asked, replace(DiscoverOptions(), compare=["sf"]))
+        candidates(lin, asked, DiscoverOptions(compare=["sf"]))
+    people = {**model_options("sf", "measured"), "desired": "direction"}
+    others = candidates(people, build_model(people, 0), DiscoverOptions())
+    assert {model.desired for model in others.values()} == {"direction"}
