@@ -17,6 +17,7 @@ from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
+from nnode.program import typed
 
 #: Stands before what is printed of each level.
 _SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
@@ -36,7 +37,7 @@ def check(config: DictConfig, folder: Path) -> None:
     path = Path(config.file).expanduser()
     found = examine(path, cast(Domain | None, config.domain), config.frame_rate)
     lines = command(found)
-    print(summary(found, lines))
+    print(typed(summary(found, lines)))
     page = write_page(
         [*blocks(found, lines), _made()], folder, title=f"Check of {path.name}",
         subtitle=sentence(found), stem="check",
@@ -140,9 +141,9 @@ def _usage(found: Examination, lines: list[str]) -> str:
             f"No reader takes the file as it is. In Python:\n\n```python\n{made}\n```\n\nThen:\n\n"
         )
     words = " \\\n    ".join(lines)
-    return (
+    return typed(
         f"{text}```sh\npython scripts/prepare_data.py {words}\n```\n\nThe same options go to "
-        "`scripts/train.py` and `scripts/discover.py`."
+        "`python scripts/train.py` and `python scripts/discover.py`."
     )
 
 

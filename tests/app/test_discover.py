@@ -277,10 +277,17 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path) -> None:
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     report = app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
-        options=DiscoverOptions(page=False),
-    ).plain()  # fmt: skip
+        options=DiscoverOptions(page=False, compare=["idm"]),
+    )  # fmt: skip
     names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert names == {"checkpoints", "model.yaml", "report.json"}
+    assert report.nearest is not None
+    assert report.nearest.diagnosis.model == "idm"
+    assert report.nearest.diagnosis.laws is None
+    nearest = json.loads((tmp_path / "run" / "nearest_law" / "report.json").read_text())
+    assert nearest == report.nearest.plain()
+    report = report.plain()
+    assert [one["name"] for one in report["laws"]["ranking"]] == ["idm", "lin"]
+    assert names == {"checkpoints", "model.yaml", "report.json", "nearest_law"}
     assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
 
