@@ -171,9 +171,13 @@ def _told(fitted: FittedNoise, order: int) -> str:
     def interval(ends: tuple[float, float] | None) -> str:
         return "" if ends is None else f" [{ends[0]:.3g}, {ends[1]:.3g}]"
 
+    drivers = ""
+    if noise.drivers:
+        what = "pace" if order == 1 else "time gap"
+        drivers = f"; drivers' {what} ± {100 * noise.drivers:.3g} %"
     return (
         f"{noise.sigma:.3g} {unit}{interval(fitted.sigma)} for {noise.tau:.3g} s"
-        f"{interval(fitted.tau)}; measured places ± {noise.measurement**0.5:.2g} m"
+        f"{interval(fitted.tau)}; measured places ± {noise.measurement**0.5:.2g} m{drivers}"
     )
 
 

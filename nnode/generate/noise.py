@@ -16,6 +16,7 @@ from nnode.exchange.drivers import drawn
 from nnode.laws.lane import Rule
 from nnode.models import Traffic
 from nnode.models.effects.base import IndividualEffect
+from nnode.models.effects.traffic import DriverHeterogeneity
 from nnode.models.own_law import law_from
 from nnode.models.system import System
 from nnode.models.term import State, Term
@@ -34,18 +35,18 @@ class Noise:
         sigma: standard deviation of the push, m/s (first order) or m/s² (second order).
         tau: its correlation time, s.
         measurement: variance of the white error of measured positions, m².
+        drivers: standard deviation of the pace (first order) or time gap (second order) among
+            drivers, as a share; of models without ``driver_heterogeneity``.
     """
 
     sigma: float
     tau: float
     measurement: float = 0.0
+    drivers: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.sigma >= 0 and self.tau > 0 and self.measurement >= 0):
-            raise ConfigError(
-                f"noise of size {self.sigma}, time {self.tau} s and measurement variance "
-                f"{self.measurement} m²: expected sizes from 0 on and a positive time"
-            )
+        if not (min(self.sigma, self.measurement, self.drivers) >= 0 and self.tau > 0):
+            raise ConfigError(f"{self}: expected sizes from 0 on and a positive time")
 
 
 class Push(Term):
@@ -86,6 +87,18 @@ def constant_speed() -> Traffic:
     """Baseline: every follower keeps its first measured speed."""
     law = law_from("constant_speed", {"parameters": {"change": "0 m/s^2"}, "rate": {"v": "change"}})
     return Traffic([law], leader="measured")
+
+
+def takes_drivers(system: Traffic) -> bool:
+    """Whether drivers may differ, and the model does not say how already."""
+    if any(isinstance(term, IndividualEffect) for term in system.terms):
+        return False
+    trial = copy.deepcopy(system)
+    trial.terms.append(DriverHeterogeneity())
+    try:
+        return trial.lane is not None or trial.order == 1
+    except ConfigError:  # a law without a time gap
+        return False
 
 
 def behind_measured(system: System) -> Traffic:
@@ -144,7 +157,10 @@ def sample(
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n
     kept = math.exp(-step / noise.tau)
-    noisy = _with_drivers(system, many, batch.names, rng)
+    noisy = copy.deepcopy(system)
+    if noise.drivers:
+        noisy.terms.append(DriverHeterogeneity(sigma=noise.drivers))
+    _give_drivers(noisy, many, batch.names, rng)
     # Euler's step of this time constant is exact for the given one
     noisy.terms.append(Push(step / (1 - kept)))
     rates = Rates(
@@ -172,18 +188,14 @@ def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:
     return tuple(f"{name}~{s + 1}" for s in range(samples) for name in names)
 
 
-def _with_drivers(
+def _give_drivers(
     system: Traffic, many: Batch, names: tuple[str, ...], rng: np.random.Generator
-) -> Traffic:
-    """A copy in which all drivers of effects that differ by driver have a number."""
-    found = copy.deepcopy(system)
-    for term in found.terms:
+) -> None:
+    """Give all drivers a number, in effects that differ by driver."""
+    for term in system.terms:
         if isinstance(term, IndividualEffect):
-            known = {name: term.people[name] for name in names if name in term.people}
-            cars = many.agent.shape[1]
             people = {}
             for i, name in enumerate(many.names):
-                own = known.get(names[i % len(names)])
-                people[name] = own or drawn(term, [()] * cars, rng).tolist()
+                own = term.people.get(names[i % len(names)])
+                people[name] = own or drawn(term, [()] * many.agent.shape[1], rng).tolist()
             term.people = people
-    return found

@@ -63,7 +63,7 @@ def test_intervals_of_means_go_by_cluster() -> None:
 
 def test_scores_of_known_samples() -> None:
     measured = np.stack([np.arange(4.0), np.arange(4.0) + 10], 1)
-    samples = np.broadcast_to(measured + [2.0, 0.0], (39, 4, 2))
+    samples = np.broadcast_to(measured + np.array([2.0, 0.0]), (39, 4, 2))
     scores = Scores(5.0)
     scores.add("a", samples, measured, np.zeros((39, 4, 2)))
     means = scores.means(np.zeros(1, int))

@@ -8,7 +8,7 @@ Examples:
   python scripts/simulate.py run=RUN table=false
 
 Results: scores.json, the noise, CRPS and what bands cover; bands.png; samples.parquet, which
-data=table reads. docs/exchange.md tells how noise is fitted. Data are those of the run.
+data=table reads. docs/sampling.md tells how noise is fitted. Data are those of the run.
 """
 
 from __future__ import annotations
