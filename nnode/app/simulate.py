@@ -119,8 +119,8 @@ class _Sampling:
         """Every sequence with places and speeds ``(S, K, N, 1)``; without noise those of one
         sample, repeated where no drivers are drawn."""
         places = self.indices if indices is None else indices
-        for batch, sequences in _batches(self.store, places, self.samples):
-            found = sample(system, batch, noise, self.samples, seed=self.seed, **steps)
+        for i, (batch, sequences) in enumerate(_batches(self.store, places, self.samples)):
+            found = sample(system, batch, noise, self.samples, seed=(self.seed, i), **steps)
             apart = (self.samples, len(batch))
             x = found.x.unflatten(1, apart).numpy()
             v = None if found.v is None else found.v.unflatten(1, apart).numpy()

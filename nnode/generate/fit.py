@@ -116,9 +116,9 @@ def fit_noise(
 
     def sampled(noise: Noise) -> _Sums:
         parts = [
-            sample(system, batch, noise, SAMPLES, seed=seed, **options).x
+            sample(system, batch, noise, SAMPLES, seed=(seed, i), **options).x
             - x.repeat(1, SAMPLES, 1, 1)
-            for batch, x in zip(batches, plain, strict=True)
+            for i, (batch, x) in enumerate(zip(batches, plain, strict=True))
         ]
         return _sums([e[..., 0] for e in parts], batches, groups, lags, number)
 
@@ -252,7 +252,7 @@ class _Search:
             size = 0.5 * float(np.mean(goal - at(start)))
             found = least_squares(
                 lambda p: np.log(moments(p)) - goal, [size, start, np.log(0.05)], x_scale="jac",
-                bounds=([-20.0, low, -7.0], [20.0, high, 0.0]),
+                bounds=([-20.0, low, -20.0], [20.0, high, 0.0]),
             )  # fmt: skip
             best = found if best is None or found.cost < best.cost else best
         assert best is not None

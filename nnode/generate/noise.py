@@ -124,7 +124,7 @@ def sample(
     noise: Noise,
     samples: int,
     *,
-    seed: int,
+    seed: int | tuple[int, ...],
     dt: float | None = None,
     method: str | None = None,
 ) -> Trajectory:
@@ -138,7 +138,7 @@ def sample(
         batch: B sequences.
         noise: its measurement error is not added: places are those of the vehicles.
         samples: S.
-        seed: of all that is drawn.
+        seed: of all that is drawn; batches that are to be independent need different ones.
         dt: step, s; None: the default of the model.
         method: of stepping; None, or one with stages, is the model's own: the motion is driven
             by noise, where stages gain nothing.
