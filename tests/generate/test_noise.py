@@ -17,6 +17,8 @@ from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, behind_measured, constant_speed, sample, takes_drivers
 from nnode.generate.scores import band
 from nnode.models import Traffic, build_model
+from nnode.models.term import State, Term
+from nnode.models.traffic import Linear
 from nnode.solvers import TorchdiffeqSolver
 from tests.app.following import TRUE, platoon
 
@@ -70,6 +72,25 @@ def test_a_push_stops_a_vehicle_and_does_not_turn_it() -> None:
     steps = torch.diff(x[:, :, :2, 0], dim=0)
     assert float(steps.min()) >= -1e-12
     assert float((steps == 0).double().mean()) > 0.1
+
+
+class Nothing(Term):
+    """A term that is Python code, so that the model has no formula."""
+
+    name = "nothing"
+
+    def forward(self, state: State) -> torch.Tensor:
+        return torch.zeros_like(state.x)
+
+
+def test_a_model_that_is_code_is_sampled_as_its_formula() -> None:
+    batch, noise = platoons(3, 10.0), Noise(0.5, 2.0, 0.0, 0.1)
+    by_formula = Traffic([Linear(25.0, 6.0, 0.0)], "measured")
+    by_code = Traffic([Linear(25.0, 6.0, 0.0), Nothing()], "measured")
+    assert by_code.lane is None
+    assert takes_drivers(by_code)
+    one, two = (sample(m, batch, noise, 3, seed=0, dt=0.05).x for m in (by_formula, by_code))
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 
 
 @cache
