@@ -126,6 +126,19 @@ class DriveConfig:
 
 
 @dataclass
+class SimulateConfig:
+    """``scripts/simulate.py``: sampled motion of a calibrated model, with its scores."""
+
+    run: str = MISSING  # folder of a training or a diagnosis
+    samples: int = 99  # of every sequence, at least 39
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
+    table: bool = True  # samples.parquet, which data=table reads
+    seed: int = 0  # of all that is drawn
+    data: Any = MISSING
+    solver: Any = MISSING
+
+
+@dataclass
 class PlotForcesConfig:
     """``scripts/plot_forces.py``: what calibrated models have learned."""
 
@@ -157,6 +170,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "evaluate_schema"): EvaluateConfig,
     (None, "export_schema"): ExportConfig,
     (None, "drive_schema"): DriveConfig,
+    (None, "simulate_schema"): SimulateConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "study_schema"): StudyConfig,
     (None, "discover_schema"): DiscoverConfig,

@@ -120,7 +120,7 @@ class Drivers:
         """
         n = len(kinds)
         for name, (place, _) in self.lane.inputs.items():
-            own = _drawn(self._terms[place], kinds, self._rng)
+            own = drawn(self._terms[place], kinds, self._rng)
             self._inputs[name] = np.concatenate([self._inputs[name], own])
         for state, known in self._states.items():
             self._states[state] = np.concatenate([known, np.zeros(n)])
@@ -341,7 +341,7 @@ def drivable(system: System) -> Lane:
     return lane
 
 
-def _drawn(term: Term, kinds: Sequence[Collection[str]], rng: np.random.Generator) -> np.ndarray:
+def drawn(term: Term, kinds: Sequence[Collection[str]], rng: np.random.Generator) -> np.ndarray:
     """``(n,)`` what new drivers have of an effect: whether they belong to its class, or a number
     drawn from its normal distribution, at least what leaves a tenth of a pace."""
     if isinstance(term, VehicleClass):

@@ -1,0 +1,23 @@
+"""Motion sampled from a calibrated model of vehicles, with its noise and its drivers.
+
+Examples:
+  # what the run held out, 99 times, scored beside the model without noise and constant speeds
+  python scripts/simulate.py run=RUN
+  python scripts/simulate.py run=RUN samples=399 seed=1
+  # scores alone
+  python scripts/simulate.py run=RUN table=false
+
+Results: scores.json, the noise, CRPS and what bands cover; bands.png; samples.parquet, which
+data=table reads. docs/sampling.md tells how noise is fitted. Data are those of the run.
+"""
+
+from __future__ import annotations
+
+from nnode.app.cli.run import run
+from nnode.app.export import groups_of_run
+from nnode.app.simulate import simulate
+
+
+def main() -> None:
+    """Run this command on the options of the command line."""
+    run("simulate", simulate, groups_of_run)

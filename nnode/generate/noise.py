@@ -1,0 +1,201 @@
+"""The noise of drivers: an Ornstein-Uhlenbeck process on each one's speed or acceleration."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError
+from nnode.exchange.drivers import drawn
+from nnode.laws.lane import Rule
+from nnode.models import Traffic
+from nnode.models.effects.base import IndividualEffect
+from nnode.models.effects.traffic import DriverHeterogeneity
+from nnode.models.own_law import law_from
+from nnode.models.system import System
+from nnode.models.term import State, Term
+from nnode.solvers.base import Trajectory, check_finite, substeps
+from nnode.solvers.rates import Rates
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What drivers do beside their law, and what measurements add.
+
+    In samples a step dt apart the push is autoregressive of first order with the factor
+    exp(-dt/tau), in any step.
+
+    Attributes:
+        sigma: standard deviation of the push, m/s (first order) or m/s² (second order).
+        tau: its correlation time, s.
+        measurement: variance of the white error of measured positions, m².
+        drivers: standard deviation of the pace (first order) or time gap (second order) among
+            drivers, as a share; of models without ``driver_heterogeneity``.
+    """
+
+    sigma: float
+    tau: float
+    measurement: float = 0.0
+    drivers: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (min(self.sigma, self.measurement, self.drivers) >= 0 and self.tau > 0):
+            raise ConfigError(f"{self}: expected sizes from 0 on and a positive time")
+
+
+class Push(Term):
+    """A state of each vehicle that is added to what the law and all effects say.
+
+    By itself it decays; :func:`sample` kicks it after each step. A push stops a vehicle, it does
+    not make it drive backwards.
+    """
+
+    tau: Tensor
+    name = "noise"
+    formula = "W + push, d push = -push/tau dt + sigma sqrt(2/tau) dB"
+    rule = Rule(rate="max(W + push, min(W, 0*W))", states={"push": ("m/s", "-push/tau")})
+    # whoever stands stays: steps end at a speed of 0 at the least
+    second = Rule(rate="W + push", states={"push": ("m/s^2", "-push/tau")})
+    source = "Uhlenbeck & Ornstein 1930; in car following: Treiber, Kesting & Helbing 2006"
+    memory = 1
+
+    def __init__(self, tau: float) -> None:
+        super().__init__()
+        self.declare("tau", tau, unit="s")
+
+    def forward(self, state: State) -> Tensor:
+        assert state.memory is not None
+        assert state.rate is not None
+        most = torch.maximum(state.rate + state.memory, state.rate.clamp(max=0.0))
+        return torch.where(state.scene.follower[..., None], most - state.rate, 0.0)
+
+    def memory_rate(self, state: State) -> Tensor:
+        assert state.memory is not None
+        return -state.memory / self.tau
+
+    def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
+        return torch.zeros_like(x)
+
+
+def constant_speed() -> Traffic:
+    """Baseline: every follower keeps its first measured speed."""
+    law = law_from("constant_speed", {"parameters": {"change": "0 m/s^2"}, "rate": {"v": "change"}})
+    return Traffic([law], leader="measured")
+
+
+def takes_drivers(system: Traffic) -> bool:
+    """Whether drivers may differ, and the model does not say how already."""
+    if any(isinstance(term, IndividualEffect) for term in system.terms):
+        return False
+    trial = copy.deepcopy(system)
+    trial.terms.append(DriverHeterogeneity())
+    try:
+        return trial.lane is not None or trial.order == 1
+    except ConfigError:  # a law without a time gap
+        return False
+
+
+def behind_measured(system: System) -> Traffic:
+    """A copy of a model of vehicles in which the first one drives as it was measured.
+
+    Raises:
+        ConfigError: people.
+    """
+    if not isinstance(system, Traffic):
+        raise ConfigError(
+            "the run's model is one of people, and simulate draws the motion of vehicles; "
+            "export.py trajectories=simulated writes people's motion without noise"
+        )
+    found = copy.deepcopy(system).double()
+    found.leader = "measured"
+    return found
+
+
+@torch.no_grad()
+def sample(
+    system: Traffic,
+    batch: Batch,
+    noise: Noise,
+    samples: int,
+    *,
+    seed: int | tuple[int, ...],
+    dt: float | None = None,
+    method: str | None = None,
+) -> Trajectory:
+    """Sampled motion from the measured start, each vehicle with its own push.
+
+    The push starts in its stationary distribution. Drivers who differ (``driver_heterogeneity``)
+    get numbers drawn from their distribution where the model knows none of them.
+
+    Args:
+        system: of :func:`behind_measured`.
+        batch: B sequences.
+        noise: its measurement error is not added: places are those of the vehicles.
+        samples: S.
+        seed: of all that is drawn; batches that are to be independent need different ones.
+        dt: step, s; None: the default of the model.
+        method: of stepping; None, or one with stages, is the model's own: the motion is driven
+            by noise, where stages gain nothing.
+
+    Returns:
+        ``(K, S * B, N, 1)``, sample by sample.
+
+    Raises:
+        SimulationError: no finite number.
+        ConfigError: a step that does not divide the sampling interval.
+    """
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    many = batch.select([b for _ in range(samples) for b in range(len(batch))])
+    many = replace(many, names=numbered(batch.names, samples))
+    n = substeps(batch.dt, dt, system)
+    step = batch.dt / n
+    kept = math.exp(-step / noise.tau)
+    noisy = copy.deepcopy(system)
+    if noise.drivers:
+        noisy.terms.append(DriverHeterogeneity(sigma=noise.drivers))
+    _give_drivers(noisy, many, batch.names, rng)
+    # Euler's step of this time constant is exact for the given one
+    noisy.terms.append(Push(step / (1 - kept)))
+    rates = Rates(
+        noisy, many, n, method if method in ("semi_implicit", "ballistic") else noisy.step
+    )
+    y = noisy.initial(many, step)
+
+    def normal() -> Tensor:
+        return torch.randn(y.shape[:2], generator=generator, dtype=y.dtype)
+
+    y[..., -1] = noise.sigma * normal()
+    kick = noise.sigma * math.sqrt(1 - kept**2)
+    states = [y]
+    for k in range(n * (batch.n_samples - 1)):
+        y = y + rates(torch.tensor(float(k), dtype=y.dtype), y)
+        y[..., -1] += kick * normal()
+        if not (k + 1) % n:
+            states.append(y)
+    x, v = noisy.observe(torch.stack(states), many)
+    return check_finite(Trajectory(x, v), many)
+
+
+def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:
+    """Names of sampled sequences: ``NAME~1`` is the first sample of ``NAME``."""
+    return tuple(f"{name}~{s + 1}" for s in range(samples) for name in names)
+
+
+def _give_drivers(
+    system: Traffic, many: Batch, names: tuple[str, ...], rng: np.random.Generator
+) -> None:
+    """Give all drivers a number, in effects that differ by driver."""
+    for term in system.terms:
+        if isinstance(term, IndividualEffect):
+            people = {}
+            for i, name in enumerate(many.names):
+                own = term.people.get(names[i % len(names)])
+                people[name] = own or drawn(term, [()] * many.agent.shape[1], rng).tolist()
+            term.people = people

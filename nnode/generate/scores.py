@@ -1,0 +1,141 @@
+"""Scores of sampled motion: the CRPS and what bands cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nnode.errors import ConfigError
+from nnode.study.statistics import DRAWS, group_weights
+
+#: Bands that are scored.
+BANDS = (0.5, 0.95)
+#: With so many samples the outer band ends at sampled values.
+LEAST = 39
+
+
+def crps(samples: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """``(...)`` continuous ranked probability score, in the samples' unit; less is better.
+
+    E|X - y| - E|X - X'|/2, both estimated without bias from S samples, so that scores do not
+    depend on how many were drawn. Of samples that are all alike it is the absolute error.
+
+    Args:
+        samples: ``(S, ...)``, S at least 2.
+        value: ``(...)`` what was measured.
+
+    Source: Gneiting & Raftery 2007, equation (21); without bias: Ferro 2014.
+    """
+    number = len(samples)
+    if number < 2:
+        raise ConfigError(f"samples={number}: a score needs at least 2")
+    ranks = np.arange(1, number + 1).reshape(-1, *[1] * value.ndim)
+    # the sum of |x_i - x_j| over all pairs i < j, of sorted samples
+    apart = ((2 * ranks - number - 1) * np.sort(samples, axis=0)).sum(0)
+    near = np.abs(samples - value).mean(0)
+    return np.asarray(near - apart / (number * (number - 1)))
+
+
+def band(samples: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper end ``(...)`` of the central band of samples ``(S, ...)``.
+
+    From the (S + 1) p-th smallest to the largest: it covers one more sample of the same kind with
+    probability ``level``, whatever the distribution.
+    """
+    ends = [(1 - level) / 2, (1 + level) / 2]
+    low, high = np.quantile(samples, ends, axis=0, method="weibull")
+    return low, high
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over sequences with its 95 % interval, clusters resampled."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray, seed: int = 0) -> Mean:
+    """The mean over all samples of several sequences.
+
+    Args:
+        total, number: ``(S,)`` sums over a sequence's samples, and their numbers.
+        label: ``(S,)`` clusters; with fewer than two there is no interval.
+    """
+    mean = float(total.sum() / number.sum())
+    _, label = np.unique(label, return_inverse=True)
+    if label.max() < 1:
+        return Mean(mean, None, None)
+    weights = group_weights(label, DRAWS, np.random.default_rng(seed))
+    low, high = np.quantile((weights @ total) / (weights @ number), [0.025, 0.975])
+    return Mean(mean, float(low), float(high))
+
+
+#: Times after the start, s, at which scores are shown.
+HORIZONS = (5.0, 10.0, 20.0, 30.0)
+
+
+class Scores:
+    """Scores of one way of sampling, gathered sequence by sequence.
+
+    Args:
+        dt: sampling interval, s.
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self._names: list[str] = []
+        self._parts: dict[str, list[tuple[float, int]]] = {}
+
+    def add(self, name: str, samples: np.ndarray, measured: np.ndarray, error: np.ndarray) -> None:
+        """Score one sequence.
+
+        Args:
+            name: of the sequence.
+            samples: ``(S, K, N)`` m, of places; the last vehicle leads and is not scored.
+            measured: ``(K, N)`` m.
+            error: ``(S, K, N)`` m, of measurement, which is added to what is scored.
+        """
+        self._names.append(name)
+        seen = samples + error
+        seen[:, :, -1] = measured[:, -1]
+        place, known = seen[:, 1:, :-1], measured[1:, :-1]
+        gap, known_gap = np.diff(seen[:, 1:], axis=2), np.diff(measured[1:], axis=1)
+        scored = crps(place, known)
+        self._put("crps_position_m", scored)
+        self._put("crps_gap_m", crps(gap, known_gap))
+        for level in BANDS:
+            for what, drawn, value in (("position", place, known), ("gap", gap, known_gap)):
+                low, high = band(drawn, level)
+                inside = (low <= value) & (value <= high)
+                self._put(f"coverage_{what}_{100 * level:g}", inside)
+                if what == "position":
+                    self._at_horizons(f"coverage_{what}_{100 * level:g}", inside)
+        self._at_horizons("crps_position_m", scored)
+
+    def sequence_means(self, what: str = "crps_position_m") -> np.ndarray:
+        """``(S,)`` means of sequences, in the order in which they were added."""
+        return np.array([total / number for total, number in self._parts[what]])
+
+    def means(self, label: np.ndarray) -> dict[str, Mean]:
+        """Score to its mean over all samples; ``score@T`` is that T s after the start.
+
+        Args:
+            label: ``(S,)`` clusters.
+        """
+        found = {}
+        for name, parts in sorted(self._parts.items()):
+            total, number = np.array(parts, float).T
+            if number.sum():
+                found[name] = mean_of(total[number > 0], number[number > 0], label[number > 0])
+        return found
+
+    def _at_horizons(self, name: str, values: np.ndarray) -> None:
+        for horizon in HORIZONS:
+            k = round(horizon / self.dt) - 1
+            self._put(f"{name}@{horizon:g}s", values[k : k + 1])
+
+    def _put(self, name: str, values: np.ndarray) -> None:
+        self._parts.setdefault(name, []).append((float(values.sum()), values.size))

@@ -1,0 +1,54 @@
+"""Bands of sampled gaps around what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from nnode.plots.style import OKABE_ITO, SMALL_FONT, dress, new_figure
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Of one vehicle.
+
+    Attributes:
+        name: of its sequence.
+        time: ``(K,)`` s after the start.
+        measured, median: ``(K,)`` gaps, m.
+        bands: level to ``(2, K)`` lower and upper end, m.
+    """
+
+    name: str
+    time: np.ndarray
+    measured: np.ndarray
+    median: np.ndarray
+    bands: Mapping[float, tuple[np.ndarray, np.ndarray]]
+
+
+def band_panels(vehicles: Sequence[Bands]) -> Figure:
+    """A panel per vehicle, two side by side."""
+    rows = -(-len(vehicles) // 2)
+    figure = new_figure(7.2, 1.9 * rows + 0.5)
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    blue = OKABE_ITO["blue"]
+    for ax, one in zip(panels, vehicles, strict=False):
+        for level, (low, high) in sorted(one.bands.items(), reverse=True):
+            ax.fill_between(
+                one.time, low, high, color=blue, alpha=0.4 if level < 0.9 else 0.18,
+                linewidth=0, label=f"{100 * level:g} % of samples",
+            )  # fmt: skip
+        ax.plot(one.time, one.median, color=blue, linewidth=1.0, label="median of samples")
+        ax.plot(one.time, one.measured, color="black", linewidth=1.2, label="measured")
+        dress(ax, x="time (s)", y="gap (m)", title=one.name)
+        ax.set_ylim(bottom=min(0.0, float(one.measured.min())))
+    for ax in panels[len(vehicles) :]:
+        ax.set_visible(False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, fontsize=SMALL_FONT, frameon=False, loc="outside upper center", ncols=4
+    )
+    return figure

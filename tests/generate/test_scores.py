@@ -1,0 +1,75 @@
+"""Scores against closed forms, and what bands cover of samples of their own kind."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from nnode.errors import ConfigError
+from nnode.generate.scores import Scores, band, crps, mean_of
+
+
+@pytest.mark.parametrize("value", [-1.3, 0.4, 2.5])
+def test_crps_of_a_gaussian_is_the_closed_form(value: float) -> None:
+    mean, sigma, repeats = 0.4, 1.7, 40_000
+    samples = np.random.default_rng(3).normal(mean, sigma, (5, repeats))
+    found = crps(samples, np.full(repeats, value))
+    z = (value - mean) / sigma
+    # Gneiting & Raftery 2007, equation (5), of a score that is to be small
+    closed = sigma * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / math.sqrt(math.pi))
+    # unbiased from as few as five samples
+    assert abs(found.mean() - closed) < 4 * found.std() / math.sqrt(repeats)
+
+
+def test_crps_is_the_double_sum_over_pairs() -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(7, 3)), rng.normal(size=3)
+    pairs = sum(abs(x[i] - x[j]) for i in range(7) for j in range(7)) / (7 * 6)
+    np.testing.assert_allclose(crps(x, y), abs(x - y).mean(0) - pairs / 2)
+
+
+def test_crps_of_equal_samples_is_the_absolute_error() -> None:
+    np.testing.assert_allclose(crps(np.full((9, 2), 3.0), np.array([1.0, 4.5])), [2.0, 1.5])
+
+
+def test_crps_of_one_sample_is_refused() -> None:
+    with pytest.raises(ConfigError, match="at least 2"):
+        crps(np.zeros((1, 3)), np.zeros(3))
+
+
+@pytest.mark.parametrize(("level", "number"), [(0.5, 39), (0.95, 39), (0.95, 99)])
+def test_bands_cover_their_level_whatever_the_distribution(level: float, number: int) -> None:
+    repeats = 20_000
+    drawn = np.random.default_rng(1).exponential(size=(number + 1, repeats))
+    low, high = band(drawn[1:], level)
+    covered = ((low <= drawn[0]) & (drawn[0] <= high)).sum()
+    assert abs(covered - level * repeats) < 4 * math.sqrt(repeats * level * (1 - level))
+
+
+def test_intervals_of_means_go_by_cluster() -> None:
+    rng = np.random.default_rng(0)
+    own = rng.normal(size=40).repeat(25)
+    label = np.arange(40).repeat(25)
+    found = mean_of(own, np.ones(1000), label)
+    assert found.low is not None
+    assert found.high is not None
+    spread = (found.high - found.low) / (2 * 1.96)
+    assert spread == pytest.approx(np.unique(own).std() / math.sqrt(40), rel=0.1)
+    assert mean_of(own, np.ones(1000), np.zeros(1000, int)).low is None
+
+
+def test_scores_of_known_samples() -> None:
+    measured = np.stack([np.arange(4.0), np.arange(4.0) + 10], 1)
+    samples = np.broadcast_to(measured + np.array([2.0, 0.0]), (39, 4, 2))
+    scores = Scores(5.0)
+    scores.add("a", samples, measured, np.zeros((39, 4, 2)))
+    means = scores.means(np.zeros(1, int))
+    assert means["crps_position_m"].mean == pytest.approx(2.0)
+    assert means["crps_gap_m"].mean == pytest.approx(2.0)
+    assert means["crps_position_m@10s"].mean == pytest.approx(2.0)
+    assert means["coverage_position_95"].mean == 0.0
+    # later than the sequence
+    assert "crps_position_m@20s" not in means
