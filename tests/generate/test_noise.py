@@ -105,7 +105,13 @@ def sampled(noise: Noise, number: int, seed: int) -> Batch:
     return replace(batch, x=found.x + torch.from_numpy(error), v=found.v)
 
 
-@pytest.mark.parametrize("noise", [Noise(0.3, 1.5, 0.0025), Noise(0.2, 2.0, 0.0, 0.2)])
+@pytest.mark.parametrize(
+    "noise",
+    [
+        pytest.param(Noise(0.3, 1.5, 0.0025), marks=pytest.mark.thorough),
+        Noise(0.2, 2.0, 0.0, 0.2),
+    ],
+)
 def test_noise_is_found_again(noise: Noise) -> None:
     batch = sampled(noise, 24, 5)
     found = fit_noise(idm(), [batch], np.arange(24), seed=2)

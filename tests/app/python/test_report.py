@@ -15,12 +15,16 @@ from tests.discover import stand_in
 from tests.discover.platoons import platoons
 from tests.discover.recorded import lane
 
+#: No other law beside it, and no page.
+ALONE = app.DiscoverOptions(page=False, compare=[])
+
 
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> nnode.Report:
     """Of results made by hand."""
     monkeypatch.setattr(app, "diagnose", stand_in.diagnose)
-    return nnode.diagnose(lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3))
+    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    return nnode.diagnose(table, options=ALONE)
 
 
 def test_what_was_named_is_a_table(found: nnode.Report) -> None:
@@ -61,7 +65,7 @@ def test_nothing_missing_is_an_empty_table() -> None:
         for i, x in enumerate(one.x[k, :, 0])
     ]
     frame = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
-    found = nnode.diagnose(frame, "traffic", model="lin")
+    found = nnode.diagnose(frame, "traffic", model="lin", options=ALONE)
     assert found.verdict == "none"
     assert found.effects == []
     assert found.to_dataframe().empty
@@ -71,10 +75,10 @@ def test_nothing_missing_is_an_empty_table() -> None:
 @pytest.mark.usefixtures("found")
 def test_sequences_and_data_frames_are_diagnosed_alike(tmp_path: Path) -> None:
     tidy = table(platoons=4, seconds=4.0)
-    of_frame = nnode.diagnose(tidy).plain()
-    of_sequences = nnode.diagnose(nnode.sequences(tidy, faults="keep")).plain()
+    of_frame = nnode.diagnose(tidy, options=ALONE).plain()
+    of_sequences = nnode.diagnose(nnode.sequences(tidy, faults="keep"), options=ALONE).plain()
     assert of_frame["split"] == of_sequences["split"]
-    written = nnode.diagnose(tidy, folder=tmp_path / "run", options=app.DiscoverOptions(page=False))
+    written = nnode.diagnose(tidy, folder=tmp_path / "run", options=ALONE)
     assert written.plain()["split"] == of_frame["split"]
     # a data frame is kept as a table, for the commands that the report tells
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "run" / "table.parquet"), tidy)

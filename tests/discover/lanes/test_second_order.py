@@ -61,7 +61,14 @@ def near(found: Tensor, expected: Tensor, share: float) -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("law", "close"), [("idm", 2e-3), ("fvdm", 1e-3), ("gipps", 1e-2)])
+@pytest.mark.parametrize(
+    ("law", "close"),
+    [
+        ("idm", 2e-3),
+        pytest.param("fvdm", 1e-3, marks=pytest.mark.thorough),
+        pytest.param("gipps", 1e-2, marks=pytest.mark.thorough),
+    ],
+)
 def test_runs_are_those_of_small_steps(sequences: list[Sequence], law: str, close: float) -> None:
     system, engine = model(law), TrafficEngine(sequences, np.inf)
     found = engine.simulate(system, row_of(system)[None])[0][..., 0]
