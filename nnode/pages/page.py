@@ -199,7 +199,7 @@ def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
                 parts.append(f"![{alt}]({FIGURES}/{block.name}.png)")
                 parts.append(f'<a id="figure-{block.name}"></a>{block.caption.strip()}')
             case ReplayBlock():
-                place = f"[Player]({stem}.html#figure-{block.name})"
+                place = f"Player (in {stem}.html)"  # sites of Markdown have no such page
                 parts.append(f'<a id="figure-{block.name}"></a>{place}: {block.caption.strip()}')
     facts = _facts(blocks)
     if facts:

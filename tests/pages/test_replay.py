@@ -109,7 +109,7 @@ def test_a_player_alone_and_on_a_page(tmp_path: Path) -> None:
     one = block([scene(platoon())])
     write_page([Heading("H"), one], tmp_path, title="T")
     assert {p.name for p in tmp_path.iterdir()} == {"study.html", "study.md"}
-    assert "[Player](study.html#figure-player): Caption." in (tmp_path / "study.md").read_text()
+    assert "Player (in study.html): Caption." in (tmp_path / "study.md").read_text()
     page = (tmp_path / "study.html").read_text(encoding="utf-8")
     assert page.count("class Replay") == 1
     write_page([Heading("H")], tmp_path, title="T")
