@@ -24,6 +24,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
+from benchmarks.truths.laws.case import accelerations
+
 #: Roads, vehicles on each with the leader, seconds before and of the recording, SUMO's step (s).
 ROADS, CARS, WARM, SECONDS, STEP = 40, 5, 20.0, 30.0, 0.1
 #: Samples are so many steps apart. Errors of measured places, m.
@@ -186,13 +188,9 @@ def _simulated(command: list[str], home: Path, scene: Scene, rng: np.random.Gene
 
 
 def _speeds(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """``(K,)`` m/s of a leader: for some seconds each it keeps its speed, speeds up or brakes."""
-    rates: list[float] = []
-    while len(rates) < steps:
-        rate = float(rng.choice([0.0, rng.uniform(0.3, 1.2), -rng.uniform(0.3, 2.0)]))
-        rates += [rate] * round(rng.uniform(2, 7) / STEP)
+    """``(K,)`` m/s of a leader."""
     found = [12.0]
-    for rate in rates[: steps - 1]:
+    for rate in accelerations(rng, steps, STEP)[: steps - 1]:
         found.append(float(np.clip(found[-1] + STEP * rate, 4.0, 18.0)))
     return np.array(found)
 

@@ -7,10 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from nnode.app.python.inputs import MODELS, model_options
-from nnode.data.sequence import Sequence
-from nnode.discover.compare.laws import compare_laws
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.result import Laws
 from nnode.errors import ConfigError
 from nnode.models import System, build_model
 from nnode.models.system import Traffic
@@ -64,11 +61,3 @@ def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a model that is compared with another one."""
     found = model_options(name, "measured")
     return {**found, **{key: asked[key] for key in SHARED if key in asked and key in found}}
-
-
-def compared(
-    model: Mapping[str, Any], asked: System, sequences: list[Sequence], options: DiscoverOptions
-) -> Laws | None:
-    """The ranking; None where nothing is to be compared."""
-    found = candidates(model, asked, options)
-    return compare_laws(found, sequences, options) if found else None

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.base_laws import candidates, compared, law_options
+from nnode.app.base_laws import candidates, law_options
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, shell_override
@@ -28,6 +28,7 @@ from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
 from nnode.data.sequences import Sequences
 from nnode.discover.able import check_model
+from nnode.discover.compare.laws import compare_laws
 from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, inputs_of, read_inputs, with_faulty
@@ -70,6 +71,7 @@ class Job:
         system: the model, not calibrated.
         inputs: the data.
         options: checked.
+        laws: models to compare before, by name; none where nothing is to be compared.
         seconds: that reading took.
     """
 
@@ -79,6 +81,7 @@ class Job:
     system: System
     inputs: Inputs
     options: DiscoverOptions
+    laws: dict[str, System]
     seconds: float
 
 
@@ -212,13 +215,13 @@ def _job(
         )
     check_options(options, system.domain, system.order)  # type: ignore[arg-type]
     check_model(system)
-    candidates(model, system, options)
+    laws = candidates(model, system, options)
     inputs = read()
     if data.prepared is None:  # a folder is taken as it is
         # what the extended model is trained and tested on are the sequences without a fault
         plain_data = {**plain_data, "faults": Faults.drop.value}
     seconds = time.monotonic() - start
-    return Job(model, plain_data, groups, system, inputs, options, seconds)
+    return Job(model, plain_data, groups, system, inputs, options, laws, seconds)
 
 
 def _diagnose(job: Job, stages: Stages | None = None) -> Found:
@@ -228,7 +231,7 @@ def _diagnose(job: Job, stages: Stages | None = None) -> Found:
     start = time.monotonic()
     if stages is not None:
         stages.begin("comparing laws")
-    laws = compared(job.model, job.system, inputs.sequences, job.options)
+    laws = compare_laws(job.laws, inputs.sequences, job.options) if job.laws else None
     seconds = {"reading": job.seconds, "laws": round(time.monotonic() - start, 3)}
     found = diagnose(job.system, inputs.sequences, job.options, stages=stages)
     diagnosis = found.diagnosis
@@ -244,20 +247,18 @@ def _nearest(job: Job, found: Found) -> Job | None:
     laws = found.diagnosis.laws
     if laws is None or laws.best in ("", str(job.model["name"])):
         return None
-    model = law_options(laws.best, job.model)
-    options = replace(job.options, compare=[])
-    if options.effects is not None or options.exclude:  # those that laws of its order know
-        order = build_model(model, options.seed).order
-        known = {e.name for e in CATALOGUE.of(found.diagnosis.domain, order)}  # type: ignore[arg-type]
-        effects = None if options.effects is None else [e for e in options.effects if e in known]
-        out = [e for e in options.exclude if e in known]
-        options = replace(options, effects=effects, exclude=out)
+    system, options = job.laws[laws.best], job.options
+    # effects that laws of its order know
+    known = {e.name for e in CATALOGUE.of(found.diagnosis.domain, system.order)}  # type: ignore[arg-type]
+    effects = None if options.effects is None else [e for e in options.effects if e in known]
+    out = [e for e in options.exclude if e in known]
     return replace(
         job,
-        model=model,
+        model=law_options(laws.best, job.model),
         groups={**job.groups, "model": laws.best},
-        system=build_model(model, options.seed),
-        options=options,
+        system=system,
+        options=replace(options, effects=effects, exclude=out),
+        laws={},
     )
 
 

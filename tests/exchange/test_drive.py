@@ -205,20 +205,25 @@ def test_a_network_of_speeds(sumo: Path, program: str, tmp_path: Path) -> None:
     assert apart(system, seen, "euler") < ROUNDED
 
 
-def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path: Path) -> None:
-    """Two lanes over two edges, a slow vehicle that is overtaken, a flow that leaves at the end."""
-    (tmp_path / "a.nod.xml").write_text(
-        '<nodes><node id="a" x="0" y="0"/><node id="b" x="400" y="0"/>'
-        '<node id="c" x="800" y="0"/></nodes>'
+def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) -> None:
+    """A road of two edges of a length, m: two lanes, then so many."""
+    (folder / "a.nod.xml").write_text(
+        f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/>'
+        f'<node id="c" x="{2 * length}" y="0"/></nodes>'
     )
-    (tmp_path / "a.edg.xml").write_text(
-        '<edges><edge id="e" from="a" to="b" numLanes="2" speed="30"/>'
-        '<edge id="f" from="b" to="c" numLanes="2" speed="30"/></edges>'
+    (folder / "a.edg.xml").write_text(
+        f'<edges><edge id="e" from="a" to="b" numLanes="2" speed="{speed}"/>'
+        f'<edge id="f" from="b" to="c" numLanes="{lanes}" speed="{speed}"/></edges>'
     )
     by_sumo.call(
-        sumo / "bin" / "netconvert", "-n", tmp_path / "a.nod.xml", "-e", tmp_path / "a.edg.xml",
-        "-o", tmp_path / "a.net.xml",
+        home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
+        "-o", folder / "a.net.xml",
     )  # fmt: skip
+
+
+def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path: Path) -> None:
+    """Two lanes over two edges, a slow vehicle that is overtaken, a flow that leaves at the end."""
+    two_edges(sumo, tmp_path, length=400, lanes=2, speed=30)
     (tmp_path / "a.rou.xml").write_text(
         '<routes><vType id="own" speedDev="0"/><vType id="slow" maxSpeed="6" sigma="0"/>'
         '<route id="r" edges="e f"/><vehicle id="s" type="slow" route="r" depart="0"/>'
@@ -244,18 +249,7 @@ def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path:
 
 
 def test_who_stands_where_a_lane_does_not_lead_on(sumo: Path, program: str, tmp_path: Path) -> None:
-    (tmp_path / "a.nod.xml").write_text(
-        '<nodes><node id="a" x="0" y="0"/><node id="b" x="200" y="0"/>'
-        '<node id="c" x="400" y="0"/></nodes>'
-    )
-    (tmp_path / "a.edg.xml").write_text(
-        '<edges><edge id="e" from="a" to="b" numLanes="2" speed="20"/>'
-        '<edge id="f" from="b" to="c" numLanes="1" speed="20"/></edges>'
-    )
-    by_sumo.call(
-        sumo / "bin" / "netconvert", "-n", tmp_path / "a.nod.xml", "-e", tmp_path / "a.edg.xml",
-        "-o", tmp_path / "a.net.xml",
-    )  # fmt: skip
+    two_edges(sumo, tmp_path, length=200, lanes=1, speed=20)
     (tmp_path / "a.rou.xml").write_text(
         '<routes><vType id="own"/><route id="r" edges="e f"/>'
         + "".join(

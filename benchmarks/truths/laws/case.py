@@ -74,12 +74,19 @@ def measured(case: LawCase) -> tuple[pd.DataFrame, dict[str, float]]:
     return pd.concat(tables, ignore_index=True), p
 
 
+def accelerations(rng: np.random.Generator, steps: int, step: float) -> list[float]:
+    """Of a leader, m/s², at least so many: for 2 to 7 s each it keeps its speed, speeds up or
+    brakes."""
+    found: list[float] = []
+    while len(found) < steps:
+        rate = rng.choice([0.0, rng.uniform(0.3, 1.2), -rng.uniform(0.3, 2.0)])
+        found += [float(rate)] * round(rng.uniform(2, 7) / step)
+    return found
+
+
 def _leader(rng: np.random.Generator, steps: int, fastest: float) -> np.ndarray:
     """``(K,)`` place, m: it accelerates and brakes for some seconds each."""
-    rates: list[float] = []
-    while len(rates) < steps:
-        rate = rng.choice([0.0, rng.uniform(0.3, 1.2), -rng.uniform(0.3, 2.0)])
-        rates += [float(rate)] * round(rng.uniform(2, 7) / STEP)
+    rates = accelerations(rng, steps, STEP)
     speed = [float(rng.uniform(0.3, 0.9) * fastest)]
     for rate in rates[: steps - 1]:
         speed.append(min(max(speed[-1] + STEP * rate, 0.0), fastest))

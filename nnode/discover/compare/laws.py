@@ -19,7 +19,7 @@ import numpy as np
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model
 from nnode.discover.division import divide
-from nnode.discover.judge.confirm import engine_of, plain_engine
+from nnode.discover.judge.confirm import engine_of
 from nnode.discover.name.search import begun
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, row_of, square_of
@@ -49,7 +49,7 @@ def compare_laws(
     division = divide(sequences, options)
     chosen, label = [sequences[i] for i in division.open], division.label[division.open]
     domain = cast(Domain, next(iter(candidates.values())).domain)
-    whole = plain_engine(domain, chosen, label)
+    whole = engine_of(domain, chosen, label, whole=True)
     found, refused = _calibrated(whole, candidates)
     if not found:
         return Laws([], refused, 0)

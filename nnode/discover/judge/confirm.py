@@ -34,22 +34,13 @@ def engine_of(
     clusters: np.ndarray | None = None,
     whole: bool = False,
 ) -> Engine:
-    """The engine of a domain; ``whole`` compares whole sequences where that makes sense."""
+    """The engine of a domain; ``whole`` compares whole sequences, all errors alike, as most
+    calibrations do; people are compared as always."""
     if domain == "crowd":
         return CrowdEngine(sequences, clusters=clusters)
     if whole:
-        return TrafficEngine(sequences, np.inf, clusters)
+        return TrafficEngine(sequences, np.inf, clusters, np.inf)
     return TrafficEngine(sequences, clusters=clusters)
-
-
-def plain_engine(
-    domain: str, sequences: list[Sequence], clusters: np.ndarray | None = None
-) -> Engine:
-    """What most calibrations look at: positions of whole sequences, all errors alike; in crowds
-    the engine's own."""
-    if domain == "crowd":
-        return CrowdEngine(sequences, clusters=clusters)
-    return TrafficEngine(sequences, np.inf, clusters, np.inf)
 
 
 class Comparing:

@@ -11,7 +11,7 @@ import numpy as np
 
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.indirect_inference import unbiased
-from nnode.discover.judge.confirm import LEVEL, Comparing, improvement, plain_engine, too_few
+from nnode.discover.judge.confirm import LEVEL, Comparing, engine_of, improvement, too_few
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.judge.verdict import named
 from nnode.discover.name.search import Search, Step, settled
@@ -227,10 +227,12 @@ class Sealed:
             {"name": self.sealed[i].name, "before": float(a), "after": float(b)}
             for i, a, b in zip(used, before, after, strict=True)
         ]
-        plain = self._plain(self.base)
-        changed = not own and extended is not self.base
-        plain_after = self._plain(extended) if changed else float("nan") if own else plain
-        return Gap(first, last, floor, closed, float("nan") if own else plain, plain_after), each
+        gap = Gap(first, last, floor, closed)
+        if not own:
+            gap.plain = gap.plain_after = self._plain(self.base)
+            if extended is not self.base:
+                gap.plain_after = self._plain(extended)
+        return gap, each
 
     def _plain(self, system: System) -> float:
         """Mean square error of positions, m², of a calibration to whole open sequences, from a
@@ -238,7 +240,8 @@ class Sealed:
         if self.domain == "crowd":
             return float("nan")
         try:
-            found = refine(plain_engine(self.domain, self.opened), copy.deepcopy(system)).system
+            engine = engine_of(self.domain, self.opened, whole=True)
+            found = refine(engine, copy.deepcopy(system)).system
         except SimulationError:
             return float("nan")
         return float(np.nanmean(self.comparing.squares(found)))

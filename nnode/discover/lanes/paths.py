@@ -26,10 +26,11 @@ def smooth(x: np.ndarray) -> np.ndarray:
     """
     if len(x) < 6:
         return x.copy()
-    columns, values = x.reshape(len(x), -1), _sizes(len(x))
+    columns, values, penalty = x.reshape(len(x), -1), _sizes(len(x)), _penalty(len(x))
+    one = np.eye(ORDER + 1, 1)
     found, least = columns, np.inf
     for weight in WEIGHTS:
-        smoothed = solveh_banded(_banded(len(x), weight), columns, lower=True)
+        smoothed = solveh_banded(one + weight * penalty, columns, lower=True)
         kept = (1 / (1 + weight * values)).sum()
         score = ((columns - smoothed) ** 2).sum() / (len(x) - kept) ** 2
         if score < least:
@@ -37,14 +38,14 @@ def smooth(x: np.ndarray) -> np.ndarray:
     return found.reshape(x.shape)
 
 
-def _banded(samples: int, weight: float) -> np.ndarray:
-    """1 and the weighted penalty on differences, as lower diagonals ``(ORDER + 1, K)``."""
+@cache
+def _penalty(samples: int) -> np.ndarray:
+    """That on differences, as lower diagonals ``(ORDER + 1, K)``."""
     step = np.diff(np.eye(ORDER + 1), ORDER, axis=0)[0]
     found = np.zeros((ORDER + 1, samples))
     for i in range(ORDER + 1):
         for j in range(i + 1):
-            found[i - j, j : samples - ORDER + j] += weight * step[i] * step[j]
-    found[0] += 1
+            found[i - j, j : samples - ORDER + j] += step[i] * step[j]
     return found
 
 
