@@ -7,9 +7,9 @@ from typing import cast
 
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from nnode.app.cli.typed import changes, group_defaults
+from nnode.app.cli.typed import changes, group_defaults, plain_options
 from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.check.findings import Finding
 from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
@@ -48,18 +48,12 @@ def check(config: DictConfig, folder: Path) -> None:
 def command(found: Examination) -> list[str]:
     """The overrides, as they can be typed, with which scripts read the file."""
     source = found.source
-    values = _plain(source.options)
+    values = plain_options(source.options)
     defaults = group_defaults("data", source.group, "prepare_data")
-    own = _plain(type(source.options)())
+    own = plain_options(type(source.options)())
     # what was not found here stays as the group has it
     kept = {k: v for k, v in values.items() if v != own[k] and k != "name"}
     return [f"data={source.group}", *changes("data", kept, defaults)]
-
-
-def _plain(options: object) -> dict[str, object]:
-    plain = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
 
 
 def sentence(found: Examination) -> str:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.app.base_laws import candidates, law_options
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
-from nnode.app.cli.typed import changes, group_defaults, shell_override
+from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
 from nnode.app.python.inputs import Table, data_of, model_options, table_options
 from nnode.app.python.report import Report
 from nnode.app.training import brief, set_threads
@@ -174,7 +174,7 @@ def diagnose_table(
     def read() -> Inputs:
         return inputs_of(Sequences.of(data, with_faulty(told)), told)
 
-    job = _job(own, told, _plain(told), groups, chosen, read)
+    job = _job(own, told, plain_options(told), groups, chosen, read)
     found = _diagnose(job)
     report = Report(diagnosis=found.diagnosis, model=found.extended)
     other = _nearest(job, found)
@@ -188,13 +188,6 @@ def diagnose_table(
             _write(other, second, beside, _drawn(other, second, beside) if chosen.page else None)
         _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
     return report
-
-
-def _plain(options: Any) -> dict[str, Any]:
-    """A dataclass of options in plain types."""
-    found = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
 
 
 def _job(
@@ -267,9 +260,9 @@ def training_config(job: Job, found: Found) -> dict[str, Any]:
     return {
         "model": extended_options(job.model, found.extended),
         "data": job.data,
-        "solver": _plain(TorchdiffeqOptions()),
-        "optimizer": _plain(AdadeltaOptions()),
-        "trainer": _plain(TrainerOptions()),
+        "solver": plain_options(TorchdiffeqOptions()),
+        "optimizer": plain_options(AdadeltaOptions()),
+        "trainer": plain_options(TrainerOptions()),
         "seed": job.options.seed,
         "groups": {**job.groups, "solver": "torchdiffeq", "optimizer": "adadelta"},
     }

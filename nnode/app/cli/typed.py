@@ -53,6 +53,13 @@ def _name(key: object) -> str:
     return _SPECIAL.sub(r"\\\1", str(key))
 
 
+def plain_options(options: object) -> dict[str, Any]:
+    """A dataclass of options in plain types."""
+    found = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
 def group_defaults(section: str, group: str, script: str | None = None) -> dict[str, Any]:
     """What a configuration group has where nothing is said, ``???`` where something must be.
 
