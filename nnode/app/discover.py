@@ -7,6 +7,7 @@ import shlex
 import signal
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
 from nnode.data.sequences import Sequences
 from nnode.discover.able import check_model
-from nnode.discover.compare.laws import compare_laws
+from nnode.discover.compare.laws import Nearer, compare_laws, with_effects
 from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, inputs_of, read_inputs, with_faulty
@@ -47,11 +48,13 @@ from nnode.discover.report.files import (
     sentence,
     write_report,
 )
+from nnode.discover.result import Laws
 from nnode.errors import ConfigError
 from nnode.files import write_text
 from nnode.models import System, build_model
 from nnode.models.effects import CATALOGUE
 from nnode.models.effects.own import load_own
+from nnode.models.extend import effects_of
 from nnode.program import scripts, typed
 from nnode.progress import Stages
 
@@ -102,17 +105,10 @@ def discover(config: DictConfig, folder: Path) -> None:
             data = cast(DataOptions, OmegaConf.to_object(config.data))
             read = partial(read_inputs, data, folder / "data")
             job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
-            with Stages("diagnosis", STAGES) as stages:
-                found = _diagnose(job, stages)
+            done = _diagnosed(job, Stages)
+            with Stages("drawing", {"drawing": 5.0}) as stages:
                 stages.begin("drawing")
-                drawn = _drawn(job, found, folder) if options.page else None
-            other = _nearest(job, found)
-            if other is not None:
-                place = folder / NEAREST
-                with Stages(f"diagnosis of {other.model['name']}", STAGES) as stages:
-                    second = _diagnose(other, stages)
-                    stages.begin("drawing")
-                    drawn_too = _drawn(other, second, place) if options.page else None
+                written = [_drawn(one, found, place) for one, found, place in _places(done, folder)]
         except KeyboardInterrupt:
             number = guard.requested or signal.SIGINT
             raise Interrupted(
@@ -121,13 +117,11 @@ def discover(config: DictConfig, folder: Path) -> None:
                 number,
             ) from None
     with InterruptGuard() as guard:
-        if other is not None:
-            beside = _write(other, second, place, drawn_too)
-        paths = _write(job, found, folder, drawn)
-    _print(found, paths, time.monotonic() - start)
-    if other is not None:
-        print(f"\nthe law that comes nearest, {other.model['name']}:")
-        _print(second, beside, time.monotonic() - start)
+        paths = [write() for write in reversed(written)][::-1]
+    _print(done[0][1], paths[0], time.monotonic() - start)
+    if len(done) > 1:
+        print(f"\nthe law that comes nearest, {done[1][0].model['name']}:")
+        _print(done[1][1], paths[1], time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
         raise Interrupted(f"stopped by {name} when all was written", guard.requested)
@@ -175,19 +169,12 @@ def diagnose_table(
         return inputs_of(Sequences.of(data, with_faulty(told)), told)
 
     job = _job(own, told, plain_options(told), groups, chosen, read)
-    found = _diagnose(job)
-    report = Report(diagnosis=found.diagnosis, model=found.extended)
-    other = _nearest(job, found)
-    if other is not None:
-        second = _diagnose(other)
-        nearest = Report(diagnosis=second.diagnosis, model=second.extended)
-        report = replace(report, nearest=nearest)
+    done = _diagnosed(job, _unwatched)
     if place is not None:
-        if other is not None:
-            beside = place / NEAREST
-            _write(other, second, beside, _drawn(other, second, beside) if chosen.page else None)
-        _write(job, found, place, _drawn(job, found, place) if chosen.page else None)
-    return report
+        for one, found, where in reversed(_places(done, place)):
+            _drawn(one, found, where)()
+    first, *others = [Report(diagnosis=found.diagnosis, model=found.extended) for _, found in done]
+    return replace(first, nearest=others[0]) if others else first
 
 
 def _job(
@@ -217,42 +204,93 @@ def _job(
     return Job(model, plain_data, groups, system, inputs, options, laws, seconds)
 
 
-def _diagnose(job: Job, stages: Stages | None = None) -> Found:
-    """Run the diagnosis, and add what only its caller knows."""
+#: Shows the stages of a work by its name and their seconds.
+_Watch = Callable[[str, dict[str, float]], AbstractContextManager[Stages | None]]
+
+
+def _unwatched(name: str, stages: dict[str, float]) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
+def _diagnosed(job: Job, watch: _Watch) -> list[tuple[Job, Found]]:
+    """The law that was asked for, then the one that comes nearest, where that is another one.
+
+    Laws are compared first as they are, then with what the nearest of them lacks: a strong effect
+    may bring another law to the front, which can imitate it.
+    """
     set_threads(None, job.system.domain)
-    inputs, name = job.inputs, str(job.model["name"])
+    asked, nearest, laws, again = str(job.model["name"]), job, None, None
+    hints: dict[str, System] = {}
     start = time.monotonic()
-    if stages is not None:
-        stages.begin("comparing laws")
-    laws = compare_laws(job.laws, inputs.sequences, job.options) if job.laws else None
-    seconds = {"reading": job.seconds, "laws": round(time.monotonic() - start, 3)}
-    found = diagnose(job.system, inputs.sequences, job.options, stages=stages)
-    diagnosis = found.diagnosis
-    diagnosis.laws = laws
-    diagnosis.data_faults = inputs.data_faults
-    diagnosis.model = name
-    diagnosis.seconds = {**seconds, **diagnosis.seconds}
+    if job.laws:
+        laws, systems = _compared(job, job.laws, watch)
+        nearest = _with_law(job, laws.best or asked)
+    seconds = time.monotonic() - start
+    found = _diagnose(nearest, watch)
+    own = {effect.name for effect in effects_of(nearest.system)}
+    effects = [effect for effect in effects_of(found.searched) if effect.name not in own]
+    if laws is not None and laws.ranking and effects:
+        start = time.monotonic()
+        again, hints = _compared(job, with_effects(systems, effects), watch)
+        again.effects = [effect.name for effect in effects]
+        seconds += time.monotonic() - start
+        if again.best != nearest.model["name"]:
+            nearest = _with_law(job, again.best)
+            found = _diagnose(nearest, watch, hint=hints[again.best])
+    done = [(nearest, found)]
+    if nearest.model["name"] != asked:
+        nearer = Nearer(str(nearest.model["name"]), found.searched)
+        done.insert(0, (job, _diagnose(job, watch, nearer, hints.get(asked))))
+    first = done[0][1].diagnosis
+    first.laws, first.laws_again = laws, again
+    first.seconds = {"reading": job.seconds, "laws": round(seconds, 3), **first.seconds}
+    return done
+
+
+def _compared(job: Job, laws: dict[str, System], watch: _Watch) -> tuple[Laws, dict[str, System]]:
+    with watch("laws", {"comparing laws": 10.0}) as stages:
+        if stages is not None:
+            stages.begin("comparing laws")
+        return compare_laws(laws, job.inputs.sequences, job.options)
+
+
+def _diagnose(
+    job: Job, watch: _Watch, nearer: Nearer | None = None, hint: System | None = None
+) -> Found:
+    """Run the diagnosis, and add what only its caller knows."""
+    inputs, name = job.inputs, str(job.model["name"])
+    with watch(f"diagnosis of {name}", STAGES) as stages:
+        found = diagnose(job.system, inputs.sequences, job.options, stages=stages, nearer=nearer)
+    found.diagnosis.data_faults = inputs.data_faults
+    found.diagnosis.model = name
     return found
 
 
-def _nearest(job: Job, found: Found) -> Job | None:
-    """The diagnosis of the law that comes nearest; None where it is the one that was asked for."""
-    laws = found.diagnosis.laws
-    if laws is None or laws.best in ("", str(job.model["name"])):
-        return None
-    system, options = job.laws[laws.best], job.options
+def _with_law(job: Job, name: str) -> Job:
+    """The same with another law."""
+    if name == job.model["name"]:
+        return job
+    system, options = job.laws[name], job.options
     # effects that laws of its order know
-    known = {e.name for e in CATALOGUE.of(found.diagnosis.domain, system.order)}  # type: ignore[arg-type]
+    known = {e.name for e in CATALOGUE.of(job.inputs.domain, system.order)}
     effects = None if options.effects is None else [e for e in options.effects if e in known]
     out = [e for e in options.exclude if e in known]
     return replace(
         job,
-        model=law_options(laws.best, job.model),
-        groups={**job.groups, "model": laws.best},
+        model=law_options(name, job.model),
+        groups={**job.groups, "model": name},
         system=system,
         options=replace(options, effects=effects, exclude=out),
         laws={},
     )
+
+
+def _places(done: list[tuple[Job, Found]], folder: Path) -> list[tuple[Job, Found, Path]]:
+    """Where each diagnosis is written."""
+    return [
+        (job, found, place)
+        for (job, found), place in zip(done, (folder, folder / NEAREST), strict=False)
+    ]
 
 
 def training_config(job: Job, found: Found) -> dict[str, Any]:
@@ -268,39 +306,39 @@ def training_config(job: Job, found: Found) -> dict[str, Any]:
     }
 
 
-def _write(
-    job: Job, found: Found, folder: Path, drawn: Callable[[], dict[str, Path]] | None
-) -> dict[str, Path]:
-    """Write all results, the report last; returns their paths."""
+def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]]:
+    """Draw the figures, where they are asked for; returns what writes all results, the report
+    last, and gives their paths."""
     config = training_config(job, found)
+    pages = None
+    if job.options.page:
+        from nnode.discover.report.page import draw  # loads Matplotlib, which takes a second
+
+        pages = draw(job.inputs, found, job.options, config, _commands(config, folder), folder)
     checkpoint = checkpoint_of(
         found, job.inputs.sequences, config, brief(job.inputs.manifest), AdadeltaOptions()
     )
     path, text = folder / CHECKPOINT, model_yaml(config["model"], has_network(found.base))
     report = plain_report(found.diagnosis)
-    try:
-        (folder / REPORT).unlink(missing_ok=True)  # of an earlier run: it is there when all is
-        save_checkpoint(checkpoint, path)
-        model = write_text(folder / MODEL, text)
-        pages = {} if drawn is None else drawn()
-        return {
-            "report": write_report(report, folder / REPORT),
-            **pages,
-            "extended model": model,
-            "checkpoint": path,
-        }
-    except OSError as error:
-        raise ConfigError(
-            f"the report cannot be written to {folder} ({error}); choose another hydra.run.dir"
-        ) from error
 
+    def write() -> dict[str, Path]:
+        try:
+            (folder / REPORT).unlink(missing_ok=True)  # of an earlier run: it is there when all is
+            save_checkpoint(checkpoint, path)
+            model = write_text(folder / MODEL, text)
+            drawn = {} if pages is None else pages()
+            return {
+                "report": write_report(report, folder / REPORT),
+                **drawn,
+                "extended model": model,
+                "checkpoint": path,
+            }
+        except OSError as error:
+            raise ConfigError(
+                f"the report cannot be written to {folder} ({error}); choose another hydra.run.dir"
+            ) from error
 
-def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]]:
-    """Draw the figures; returns what writes the page and TensorBoard's events."""
-    from nnode.discover.report.page import draw  # loads Matplotlib, which takes a second
-
-    config = training_config(job, found)
-    return draw(job.inputs, found, job.options, config, _commands(config, folder), folder)
+    return write
 
 
 def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
@@ -324,8 +362,12 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
 def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:
     d = found.diagnosis
     print(f"verdict: {d.verdict}")
-    if d.laws is not None and d.laws.ranking:
-        print(f"laws, by held-out cost: {ranked(d.laws)}")
+    for laws in (d.laws, d.laws_again):
+        if laws is not None and laws.ranking:
+            beside = f", with {', '.join(laws.effects)}" if laws.effects else ""
+            print(f"laws{beside}, by held-out cost: {ranked(laws)}")
+    for note in d.notes:
+        print(note)
     print(sentence(d))
     for effect in d.effects or d.leads:
         print(f"  {effect.name}: {interval(effect)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from dataclasses import dataclass, replace
 from itertools import count
@@ -13,6 +14,7 @@ import numpy as np
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model, not_offered
+from nnode.discover.compare.laws import Nearer, imitated
 from nnode.discover.division import Division, divide
 from nnode.discover.found import Found
 from nnode.discover.judge.confirm import LEVEL, engine_of
@@ -26,12 +28,19 @@ from nnode.discover.judge.verdict import (
     structure,
 )
 from nnode.discover.locate.curves import curves, weighed
-from nnode.discover.name.search import BETTER, Search, begun, search, settled
+from nnode.discover.name.search import BETTER, Search, begun, search, settled, without_steps
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.residuals.engine import Engine, of_residuals, square_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Curves, Variable
-from nnode.discover.result import Clusters, Diagnosis, FirstScreen, Place, Verdict
+from nnode.discover.result import (
+    Clusters,
+    Diagnosis,
+    FirstScreen,
+    NamedEffect,
+    Place,
+    Verdict,
+)
 from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
@@ -51,12 +60,10 @@ LEADS = 3
 
 #: Stages of a diagnosis, with the seconds that they take on the motorway recordings.
 STAGES = {
-    "comparing laws": 10.0,
     "calibrating": 2.0,
     "locating": 1.5,
     "naming": 11.5,
     "comparing on sealed sequences": 1.0,
-    "drawing": 5.0,
 }
 
 
@@ -99,6 +106,8 @@ def diagnose(
     options: DiscoverOptions,
     *,
     stages: Stages | None = None,
+    nearer: Nearer | None = None,
+    hint: System | None = None,
 ) -> Found:
     """Find out what a model lacks on some sequences.
 
@@ -107,6 +116,9 @@ def diagnose(
         sequences: without faults, at least three of them.
         options: see :class:`~nnode.discover.options.DiscoverOptions`.
         stages: shows how far the work is.
+        nearer: a law that comes nearer to these sequences; what the model lacks only because it is
+            another law is a lead, and no finding.
+        hint: the model, calibrated with effects that another law lacks.
 
     Raises:
         ConfigError: options that do not fit.
@@ -122,12 +134,25 @@ def diagnose(
     refused = {e.name: reason for e in known if (reason := not_offered(e, system))}
     wanted = [effect for effect in known if effect.name not in refused]
     effects = [effect for effect in wanted if not issubclass(effect, IndividualEffect)]
-    look = _looked_for(system, sequences, options, effects, clock, stages)
+    look = _looked_for(system, sequences, options, effects, clock, stages, hint)
     if look.tested.together:
-        again = _looked_for(system, sequences, options, effects, clock, stages, together=True)
+        again = _looked_for(system, sequences, options, effects, clock, stages, hint, True)
         look = replace(again, tested=look.tested)
     division, engine, base, found = look.division, look.engine, look.base, look.found
-    base_system = look.base_system
+    base_system, searched = look.base_system, look.found.fit.system
+    notes: list[str] = [division.note] if division.note else []
+    imitations: list[NamedEffect] = []
+    if nearer is not None and found.steps:
+        label = division.label[division.open]
+        steps, p_value = imitated(engine, found, label, nearer)
+        imitations = [named(engine, found.fit, step, math.nan) for step in steps]
+        found = without_steps(engine, found, steps, base_system)
+        if steps:
+            them = ", ".join(step.chosen.name for step in steps)
+            notes.append(
+                f"{them}: {nearer.name} does without and predicts left-out clusters better than "
+                f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
+            )
     numbers = _clusters(look, options, len(effects))
     enough = numbers.open >= numbers.least
     stages.begin("comparing on sealed sequences")
@@ -166,12 +191,14 @@ def diagnose(
         for step, one in zip(found.steps, sealed.tried, strict=False)
     ]
     effects_found += [named_agents(one, agent.confirmed) for one, agent in both if agent.named]
-    leads_found = sealed.leads(engine, leads)
+    leads_found = [*sealed.leads(engine, leads), *imitations]
     leads_found += [
         named_agents(one, agent.confirmed) for one, agent in both if agent.found and not agent.named
     ]
     diagnosis = Diagnosis(
-        verdict=_verdict(found, left, removed, bool(own), bool(leads_found), enough),
+        verdict=_verdict(
+            found, left, removed, bool(own), bool(leads_found), enough, bool(imitations)
+        ),
         domain=domain,
         model="",
         clusters=numbers,
@@ -191,7 +218,7 @@ def diagnose(
             "open": [sequences[i].name for i in division.open],
             "sealed": [sequences[i].name for i in division.sealed],
         },
-        notes=[division.note] if division.note else [],
+        notes=notes,
         not_offered=refused,
         seconds=clock.seconds,
         sealed=each,
@@ -200,6 +227,7 @@ def diagnose(
         diagnosis=diagnosis,
         base=base_system,
         extended=extended,
+        searched=searched,
         open=division.open,
         sealed=division.sealed,
     )
@@ -212,6 +240,7 @@ def _looked_for(
     effects: list[type[Effect]],
     clock: _Clock,
     stages: Stages,
+    hint: System | None,
     together: bool = False,
 ) -> _Look:
     """Calibrate, locate, and search for the population's effects.
@@ -243,7 +272,7 @@ def _looked_for(
     found = search(
         engine, base, effects, alpha=options.alpha, most=options.max_effects if enough else 0,
         seed=options.seed, variables=variables, levels=_levels(engine, effects),
-        within=stages.within,
+        within=stages.within, hint=hint,
     )  # fmt: skip
     # what a missing effect leaves is common to all clusters: only what the search leaves tells
     tested = simultaneous(engine, found.fit, options.seed)
@@ -309,10 +338,17 @@ def _excess(engine: Engine, fit: Fit) -> float:
 
 
 def _verdict(
-    found: Search, left: list[Curves], removed: float, own: bool, leads: bool, enough: bool
+    found: Search,
+    left: list[Curves],
+    removed: float,
+    own: bool,
+    leads: bool,
+    enough: bool,
+    imitated: bool,
 ) -> Verdict:
     """Args: ``removed``: share of the squared errors that the named effects removed; ``own``:
-    whether agents' own numbers were confirmed; ``leads``: whether something was not."""
+    whether agents' own numbers were confirmed; ``leads``: whether something was not; ``imitated``:
+    whether something was found that a nearer law does without."""
     if not enough:
         return "not_testable"
     if found.steps:
@@ -321,7 +357,7 @@ def _verdict(
         return "indistinguishable" if any(step.rivals for step in found.steps) else "named"
     if own:
         return "named"
-    if left:
+    if left or imitated:
         return "unknown"
     return "unconfirmed" if leads else "none"
 

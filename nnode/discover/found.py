@@ -18,6 +18,8 @@ class Found:
         base: the model as it was given, calibrated on the open sequences.
         extended: the same with the accepted effects, calibrated together; without any it may
             be ``base`` itself.
+        searched: with all effects that the open clusters asked for, before the sealed ones were
+            looked at.
         open, sealed: positions of the sequences that were used, and of those kept for the end.
         maps: ``before`` and ``after``: :class:`nnode.discover.report.deviation.Deviation` of
             ``base`` and ``extended``, where the diagnosis has them; they are computed where it has
@@ -27,6 +29,7 @@ class Found:
     diagnosis: Diagnosis
     base: System
     extended: System
+    searched: System
     open: list[int]
     sealed: list[int]
     maps: dict[str, Any] = field(default_factory=dict)

@@ -292,11 +292,13 @@ class Laws:
     Attributes:
         refused: law to the reason why it was not compared.
         clusters: that they were compared on.
+        effects: that every law has which has a place for them.
     """
 
     ranking: list[ComparedLaw]
     refused: dict[str, str]
     clusters: int
+    effects: list[str] = field(default_factory=list)
 
     @property
     def best(self) -> str:
@@ -330,6 +332,7 @@ class Diagnosis:
     sealed: list[dict[str, Any]] = field(default_factory=list)  # name, before, after of each
     not_offered: dict[str, str] = field(default_factory=dict)  # effect to why the law has no place
     laws: Laws | None = None  # base laws compared with each other
+    laws_again: Laws | None = None  # the same with the effects that the first of them lacks
 
     def plain(self) -> dict[str, Any]:
         """Plain types for JSON."""

@@ -273,7 +273,8 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
 
 
 @pytest.mark.usefixtures("by_hand")
-def test_without_a_page_nothing_is_drawn(tmp_path: Path) -> None:
+def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(app, "with_effects", lambda laws, effects: laws)
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     report = app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
@@ -290,6 +291,22 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path) -> None:
     assert names == {"checkpoints", "model.yaml", "report.json", "nearest_law"}
     assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
+
+
+@pytest.mark.usefixtures("by_hand")
+def test_laws_are_compared_again_with_what_the_nearest_lacks(tmp_path: Path) -> None:
+    """Behind a zone that lin does not have idm comes first; with the zone, lin does."""
+    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    report = app.diagnose_table(
+        table, "traffic", model={"term": "lin"}, options=DiscoverOptions(compare=["idm"])
+    )
+    assert report.nearest is None
+    first, again = report.diagnosis.laws, report.diagnosis.laws_again
+    assert first is not None
+    assert again is not None
+    assert (first.best, first.effects) == ("idm", [])
+    assert (again.best, again.effects) == ("lin", ["speed_zone"])
+    assert again.ranking[1].behind > 0
 
 
 @pytest.mark.usefixtures("by_hand")

@@ -66,6 +66,8 @@ def diagnose(
     options: DiscoverOptions,
     *,
     stages: object = None,
+    nearer: object = None,
+    hint: object = None,
 ) -> Found:
     """Results that a right diagnosis of :mod:`tests.discover.recorded` would come to."""
     if os.environ.get(WAIT):
@@ -169,6 +171,7 @@ def diagnose(
         ),
         base=base,
         extended=extended,
+        searched=extended,
         open=[i for i in range(len(sequences)) if i not in sealed],
         sealed=sealed,
     )

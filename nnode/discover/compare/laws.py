@@ -12,21 +12,24 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model
+from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import divide
 from nnode.discover.judge.confirm import engine_of
-from nnode.discover.name.search import begun
+from nnode.discover.name.search import APART, Search, Step, begun
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, row_of, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.errors import ConfigError
+from nnode.models.effects import CATALOGUE, Effect
+from nnode.models.extend import effects_of, extended
 from nnode.models.system import System
 
 #: Rounds of choosing the law that tells the whitening.
@@ -35,13 +38,16 @@ ROUNDS = 3
 
 def compare_laws(
     candidates: Mapping[str, System], sequences: list[Sequence], options: DiscoverOptions
-) -> Laws:
+) -> tuple[Laws, dict[str, System]]:
     """Rank laws on the open clusters of a diagnosis with the same options.
 
     Args:
         candidates: models by name; they are not changed. Those that the diagnosis cannot simulate
             are told as refused, with the reason.
         sequences: without faults, at least three of them.
+
+    Returns:
+        The ranking, and the laws, calibrated.
 
     Raises:
         DataError: too few sequences.
@@ -52,7 +58,7 @@ def compare_laws(
     whole = engine_of(domain, chosen, label, whole=True)
     found, refused = _calibrated(whole, candidates)
     if not found:
-        return Laws([], refused, 0)
+        return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
     errors = {name: heldout(fit, whole.cluster) / number for name, fit in found.items()}
     if domain == "crowd":  # whose residuals are no positions
@@ -82,7 +88,65 @@ def compare_laws(
                 values={k: (float(v), unit) for k, (v, unit) in system.physical().items()},
             )
         )
-    return Laws(ranking, refused, int(engine.cluster.max()) + 1)
+    systems = {name: fit.system for name, fit in found.items()}
+    return Laws(ranking, refused, int(engine.cluster.max()) + 1), systems
+
+
+def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str, System]:
+    """Copies of laws with those effects that they have a place for, from the values given."""
+    found = {}
+    for name, law in laws.items():
+        known = CATALOGUE.of(cast(Domain, law.domain), law.order)
+        own = {effect.name for effect in effects_of(law)}
+        for effect in effects:
+            kind = type(effect)
+            if kind in known and effect.name not in own and not not_offered(kind, law):
+                law, _ = extended(law, kind(**effect.options()))
+        found[name] = copy.deepcopy(law)
+    return found
+
+
+@dataclass(frozen=True)
+class Nearer:
+    """A law that comes nearer than the one that is diagnosed, with what was found missing in it.
+
+    Attributes:
+        system: calibrated on the same open clusters.
+    """
+
+    name: str
+    system: System
+
+
+def imitated(
+    engine: Engine, found: Search, label: np.ndarray, nearer: Nearer
+) -> tuple[list[Step], float]:
+    """Effects that a nearer law does without: they imitate that law, and are nothing of their own.
+
+    None where the nearer law does not predict left-out clusters better than the diagnosed one with
+    its effects. Effects that laws have in themselves stay, and those that the nearer one lacks too.
+
+    Args:
+        label: ``(S,)`` clusters of the engine's sequences.
+
+    Returns:
+        The effects, and the one-sided p-value of that comparison.
+    """
+    common = engine_of(str(nearer.system.domain), engine.sequences, label)
+    common.settle(nearer.system, row_of(nearer.system))
+    costs = [
+        heldout(refine(common, copy.deepcopy(system)), common.cluster)
+        for system in (found.fit.system, nearer.system)
+    ]
+    p_value = compare(*costs).p_value
+    if p_value > APART:
+        return [], p_value
+    shared = {effect.name for effect in effects_of(nearer.system)}
+    steps = [
+        step for step in found.steps
+        if not step.chosen.score.effect.of_laws and step.chosen.name not in shared
+    ]  # fmt: skip
+    return steps, p_value
 
 
 def _level(costs: np.ndarray) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from nnode.discover.crowds.indirect_inference import unbiased
 from nnode.discover.judge.confirm import LEVEL, Comparing, engine_of, improvement, too_few
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.judge.verdict import named
-from nnode.discover.name.search import Search, Step, settled
+from nnode.discover.name.search import Search, Step, without_steps
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
@@ -110,10 +110,9 @@ class Sealed:
         if passed == len(found.steps):
             return found, []
         leads = found.steps[passed:]
-        system = self._without(engine, found.fit, leads).system if passed else self.base
-        kept = settled(engine, copy.deepcopy(system), rounds=1)
-        self._corrected = best or kept
-        return replace(found, fit=kept, steps=found.steps[:passed]), leads
+        kept = without_steps(engine, found, leads, self.base)
+        self._corrected = best or kept.fit
+        return kept, leads
 
     def _path(self, engine: Engine, found: Search, whole: Fit) -> Iterator[Fit]:
         """The models with the first, the first two, ... effects, each made when it is asked for;

@@ -14,6 +14,7 @@ from nnode.discover.statistics.score import Score, Screen, traces
 from nnode.errors import SimulationError
 from nnode.models.effects import Effect
 from nnode.models.extend import extended, place_of
+from nnode.models.system import System
 
 #: An interval is moved at most so many times.
 SHIFTS = 3
@@ -63,10 +64,29 @@ class Candidate:
         return not known or any(low > neutral or high < neutral for neutral, low, high in known)
 
 
-def calibrated(engine: Engine, before: Fit, score: Score, hopeless: float) -> Fit:
-    """The model with one more effect."""
+def calibrated(
+    engine: Engine, before: Fit, score: Score, hopeless: float, hint: System | None = None
+) -> Fit:
+    """The model with one more effect, from where its score found it and from a hint.
+
+    Args:
+        hopeless: see :func:`~nnode.discover.residuals.fit.refine`.
+        hint: the extended model with other parameters.
+
+    Raises:
+        SimulationError: it blows up.
+    """
     system, place = extended(before.system, score.effect(**score.options))
-    fit = refine(engine, system, tolerance=ROUGH, hopeless=hopeless)
+    fits = []
+    for start in (system, hint):
+        try:
+            if start is not None:
+                fits.append(refine(engine, start, tolerance=ROUGH, hopeless=hopeless))
+        except SimulationError:
+            continue
+    if not fits:
+        raise SimulationError(f"the model with {score.effect.name} blows up on these data")
+    fit = min(fits, key=lambda one: one.cost)
     if score.effect.consecutive:
         # a strong effect bends the paths, so that the interval of a weak one would be off
         for _ in range(SHIFTS):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -121,6 +121,7 @@ def search(
     variables: list[Variable] | None = None,
     levels: dict[str, np.ndarray] | None = None,
     within: Callable[[float], None] = lambda part: None,
+    hint: System | None = None,
 ) -> Search:
     """Forwards until no effect passes, then backwards.
 
@@ -136,6 +137,8 @@ def search(
         levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser
             than the engine's.
         within: is told, now and then, about which part of the search is done.
+        hint: the model with effects that another law lacks, calibrated: their calibration begins
+            from there as well.
     """
     found, levels = Search(fit), levels or {}
     while True:
@@ -150,7 +153,7 @@ def search(
         found.first = found.first or found.scores
         if len(found.steps) >= most:
             break
-        step = _round(engine, found, alpha if not found.steps else LATER * alpha)
+        step = _round(engine, found, alpha if not found.steps else LATER * alpha, hint)
         if step is None or _outdone(engine, found.fit, step.chosen, variables or []):
             break
         found.steps.append(step)
@@ -161,13 +164,15 @@ def search(
     return _pruned(engine, found)
 
 
-def _round(engine: Engine, found: Search, alpha: float) -> Step | None:
+def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> Step | None:
     scores, screen = found.scores, found.screen
     assert screen is not None
     if not scores or min(score.p_value for score in scores) > alpha:
         return None
     most = max(score.gain for score in scores)
+    hinted = set() if hint is None else {effect.name for effect in effects_of(hint)}
     tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
+    tried += [score for score in scores if score.effect.name in hinted and score not in tried]
     square = square_of(engine, found.fit.system)
     found.square = found.square or square
     if square < EXACT:
@@ -175,8 +180,9 @@ def _round(engine: Engine, found: Search, alpha: float) -> Step | None:
     candidates: list[Candidate] = []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
+        start = _hinted(hint, found.fit.system, score.effect.name)
         try:
-            fit = calibrated(engine, found.fit, score, least)
+            fit = calibrated(engine, found.fit, score, least, start)
         except SimulationError:
             continue
         removed = (square - square_of(engine, fit.system)) / found.square
@@ -203,6 +209,17 @@ def _round(engine: Engine, found: Search, alpha: float) -> Step | None:
         if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals)
+
+
+def _hinted(hint: System | None, system: System, name: str) -> System | None:
+    """The hint with the effects that a model has and one more; None where it lacks any."""
+    wanted = {effect.name for effect in effects_of(system)} | {name}
+    known = set() if hint is None else {effect.name for effect in effects_of(hint)}
+    if hint is None or not wanted <= known:
+        return None
+    for other in known - wanted:
+        hint = without(hint, other)
+    return copy.deepcopy(hint)
 
 
 def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:
@@ -261,6 +278,21 @@ def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
 def _contains(wider: Candidate, narrower: Candidate) -> bool:
     """Whether one effect is a special case of the other."""
     return narrower.name in wider.score.effect.contains
+
+
+def without_steps(engine: Engine, found: Search, steps: list[Step], base: System) -> Search:
+    """A search without some of its effects, calibrated anew.
+
+    Args:
+        base: the calibrated model without any.
+    """
+    if not steps:
+        return found
+    kept, system = [step for step in found.steps if step not in steps], found.fit.system
+    for step in steps:
+        system = without(system, step.chosen.name)
+    start = copy.deepcopy(system if kept else base)
+    return replace(found, fit=settled(engine, start, rounds=1), steps=kept)
 
 
 def _pruned(engine: Engine, found: Search) -> Search:

@@ -96,22 +96,31 @@ def _laws(d: Diagnosis) -> list[Block]:
     """Which base law comes nearest, before anything is said to be missing."""
     if d.laws is None or not d.laws.ranking:
         return []
-    best, clusters = d.laws.best, d.laws.clusters
-    own = next((one for one in d.laws.ranking if one.name == d.model), None)
-    if best == d.model:
-        words = f"Of the laws that were compared, {best} comes nearest to the open sequences."
+    compared = [d.laws] if d.laws_again is None else [d.laws, d.laws_again]
+    last = compared[-1]
+    own = next((one for one in last.ranking if one.name == d.model), None)
+    beside = f", with {', '.join(last.effects)}," if last.effects else ""
+    if last.best == d.model:
+        words = f"Of the laws that were compared, {d.model}{beside} comes nearest."
     elif own is None:
-        words = f"{best} comes nearest to the open sequences; {d.model} was not compared."
+        words = f"{last.best}{beside} comes nearest; {d.model} was not compared."
     else:
         words = (
-            f"**{best} comes nearer than {d.model}**, whose held-out cost is "
+            f"**{last.best}{beside} comes nearer than {d.model}**, whose held-out cost is "
             f"{100 * own.behind:.3g} % higher (p = {amount(own.p_value, 2)}). What {d.model} "
             f"lacks may be no effect but the other law: `nearest_law/` holds its diagnosis."
         )
-    words += f" Costs are those of {clusters} clusters that calibrations left out in turn."
+    words += (
+        f" Costs are those of {last.clusters} open clusters that calibrations left out in turn."
+    )
     if d.laws.refused:
         words += " Not compared: " + "; ".join(f"{k}: {v}" for k, v in d.laws.refused.items()) + "."
-    return [Heading("Which base law"), Text(words), tables.laws_table(d.laws, d.domain)]
+    names = ("laws", "laws_again")
+    return [
+        Heading("Which base law"),
+        Text(words),
+        *(tables.laws_table(*one, d.domain) for one in zip(compared, names, strict=False)),
+    ]
 
 
 def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:

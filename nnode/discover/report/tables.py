@@ -53,7 +53,7 @@ _ERRORS = {
 }
 
 
-def laws_table(laws: Laws, domain: str) -> TableBlock:
+def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
     """Base laws, the best first."""
     rows = [
         {
@@ -69,10 +69,13 @@ def laws_table(laws: Laws, domain: str) -> TableBlock:
         }
         for one in laws.ranking
     ]
+    beside = ""
+    if laws.effects:
+        beside = f", those that have a place for it with {', '.join(laws.effects)}"
     return _table(
-        "laws",
+        name,
         rows,
-        "Base laws on the open sequences, behind measured leaders. *held-out cost*: of whitened "
+        f"Base laws on the open sequences{beside}. *held-out cost*: of whitened "
         "residuals, mean of logarithms over clusters; *p*: one-sided, that the law is as good as "
         f"the first. {_ERRORS[domain]}",
     )

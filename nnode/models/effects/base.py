@@ -100,6 +100,8 @@ class Effect(Term):
         individual: every agent has a strength of its own, with mean zero over the agents; the
             reported strength is their standard deviation.
         sought: orders of the laws in which a diagnosis looks for it.
+        of_laws: whether other laws of its domain have something like it in themselves, so that
+            finding it in one of them is right where another law is nearer to the truth.
     """
 
     domain: ClassVar[Domain]
@@ -113,6 +115,7 @@ class Effect(Term):
     covariate: ClassVar[str | None] = None
     individual: ClassVar[bool] = False
     sought: ClassVar[tuple[int, ...]] = (1, 2)
+    of_laws: ClassVar[bool] = False
 
     def __init__(self, **values: float) -> None:
         super().__init__()

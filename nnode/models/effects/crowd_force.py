@@ -59,6 +59,7 @@ class FieldOfView(ForceEffect):
         where={"less": "(1 - lambda_)*((1 - (e_x*n_x + e_y*n_y))/2 - 1)"},
     )
     source = "Helbing, Farkas, Molnár & Vicsek 2002"
+    of_laws = True
     strengths = {"lambda_": Strength(1.0, -0.1, Interval(-0.5, 1.5), "1", usual=0.25)}
     separated_by = "people who follow others closely, so that some are behind and some ahead"
 
@@ -79,6 +80,7 @@ class Anticipation(ForceEffect):
         },
     )
     source = "Zanlungo, Ikeda & Kanda 2011 (positions at a later time)"
+    of_laws = True
     strengths = {"T_a": Strength(0.0, 0.1, Interval(-0.5, 2.0), "s", usual=0.2)}
     separated_by = "approaches at different speeds that come equally near"
 

@@ -46,6 +46,7 @@ class PairRepulsion(PairEffect):
         where={"push": "A_2*exp((2*r - d)/B_2)"},
     )
     source = "Helbing, Buzna, Johansson & Werner 2005 (two ranges)"
+    of_laws = True
     strengths = {"A_2": Strength(0.0, 0.05, Interval(-0.2, 20.0), "m/s²", usual=0.2)}
     settings = {"B_2": Setting(0.8, Interval(0.1, 3.0), "m")}
     kin = "pair_force"

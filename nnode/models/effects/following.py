@@ -40,6 +40,7 @@ class RelativeSpeed(Effect):
     rule = Rule(rate="W + kappa*(dx_1 - W)")
     second = Rule(rate="W - kappa*dv/per", constants=_PER)
     source = "full velocity difference: Jiang, Wu & Zhu 2001"
+    of_laws = True
     strengths = {"kappa": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2)}
     rank = 50
     kin = _KIN
@@ -58,6 +59,7 @@ class AsymmetricResponse(Effect):
     rule = Rule(rate="W + kappa_open*max(dx_1 - W, 0) + kappa_close*min(dx_1 - W, 0)")
     second = Rule(rate="W + (kappa_open*max(-dv, 0) + kappa_close*min(-dv, 0))/per", constants=_PER)
     source = "Gong, Liu & Wang 2008"
+    of_laws = True
     strengths = {
         "kappa_open": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2),
         "kappa_close": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2),
@@ -95,6 +97,7 @@ class ReactionDelay(Effect):
         },
     )
     source = "Newell 1961; Padé's approximation of the delay"
+    of_laws = True
     strengths = {"T": Strength(0.0, 0.3, Interval(0.2, 3.0), "s", usual=0.3)}
     rank = 35
     memory = 2
@@ -123,6 +126,7 @@ class Inertia(Effect):
     rule = Rule(rate="u", states={"u": ("m/s", "(W - u)/tau_v")})
     second = Rule(rate="u", states={"u": ("m/s^2", "(W - u)/tau_v", "W")})
     source = "optimal velocity: Bando et al. 1995"
+    of_laws = True
     strengths = {"tau_v": Strength(0.0, 0.3, Interval(0.2, 10.0), "s", usual=0.3)}
     rank = 60
     memory = 1
@@ -159,6 +163,11 @@ class PureDelay(Effect):
     sought = ()  # a map from step to step; reaction_delay is looked for
 
 
+#: The time gap that a driver is seen to have in the first state.
+_SEEN_GAP = "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)"
+_SEEN = {"slowest": (2.0, "m/s"), "shortest": (0.1, "s"), "longest": (5.0, "s")}
+
+
 @CATALOGUE.add
 class Memory(Effect):
     """A driver starts with the time gap that he is seen to have, and relaxes to the common one.
@@ -173,14 +182,8 @@ class Memory(Effect):
     formula = "law with time gap q in place of T; tau_m dq/dt = T - q"
     second = Rule(
         rate="W + law(T=q) - law()",
-        states={
-            "q": (
-                "s",
-                "(T - q)/tau_m",
-                "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)",
-            )
-        },
-        constants={"slowest": (2.0, "m/s"), "shortest": (0.1, "s"), "longest": (5.0, "s")},
+        states={"q": ("s", "(T - q)/tau_m", _SEEN_GAP)},
+        constants=_SEEN,
     )
     source = "after the memory effects of Treiber & Helbing 2003"
     strengths = {}
@@ -194,3 +197,26 @@ class Memory(Effect):
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
         return [Probe({"tau_m": tau}, {}) for tau in (5.0, 20.0, 80.0)]
+
+
+@CATALOGUE.add
+class LastingTimeGap(Effect):
+    """Every driver has a time gap of his own and keeps it; what is seen of it in the first state,
+    as for ``memory``, counts with a share, since that state tells of passing things too."""
+
+    share: Tensor
+    name = "lasting_time_gap"
+    domain = "traffic"
+    formula = "law with time gap T + share (q - T), q as seen at first"
+    second = Rule(
+        rate="W + law(T=T + share*(q - T)) - law()",
+        states={"q": ("s", "0*T/per", _SEEN_GAP)},
+        constants={**_SEEN, **_PER},
+    )
+    source = "Ossen & Hoogendoorn 2011 (drivers differ)"
+    strengths = {"share": Strength(0.0, 0.1, Interval(-0.5, 1.5), "1", usual=0.2)}
+    rank = 15
+    memory = 1
+    sought = (2,)
+    kin = "who"
+    separated_by = "the same drivers for a longer time"

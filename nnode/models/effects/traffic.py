@@ -252,6 +252,7 @@ class FreeFlowSpeed(Effect):
     formula = "min(W, v_max)"
     rule = Rule(rate="W - max(W - v_max, 0)")
     source = "Newell 2002"
+    of_laws = True
     strengths = {}
     settings = {"v_max": Setting(30.0, Interval(1.0, 60.0), "m/s")}
     rank = 20
@@ -347,6 +348,7 @@ class TimeGap(Effect):
         constants={"least": (0.1, "m")},
     )
     source = "constant time headway: Pipes 1953; Treiber, Hennecke & Helbing 2000"
+    of_laws = True
     strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s", usual=0.2)}
     rank = 40
     kin = "reaction to the vehicle ahead"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from benchmarks.truths.laws.case import LawCase, measured
@@ -11,11 +14,16 @@ from nnode.app.base_laws import LAWS, candidates
 from nnode.app.python.inputs import model_options, table_options
 from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
-from nnode.discover.compare.laws import compare_laws
+from nnode.discover.compare.laws import Nearer, compare_laws, imitated, with_effects
+from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.name.search import Search, Step, begun, settled, without_steps
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import row_of
+from nnode.discover.residuals.fit import refine
 from nnode.errors import ConfigError
 from nnode.models import System, build_model
+from nnode.models.effects import CATALOGUE
+from nnode.models.extend import effects_of, extended
 from tests.discover import walkers
 from tests.discover.platoons import platoons
 
@@ -30,7 +38,9 @@ def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     table.to_csv(path, index=False)
     sequences = read_table(path, table_options(path, "traffic", None, tmp_path))
-    found = compare_laws({n: law(n) for n in ("lin", "idm", "helly")}, sequences, DiscoverOptions())
+    laws = {n: law(n) for n in ("lin", "idm", "helly")}
+    found, calibrated = compare_laws(laws, sequences, DiscoverOptions())
+    assert set(calibrated) == set(laws)
     assert found.ranking[0].name == found.best == true
     assert found.ranking[0].behind == 0.0 < found.ranking[1].behind
     assert found.ranking[1].p_value < 0.01
@@ -42,7 +52,7 @@ def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
 def test_what_cannot_be_simulated_is_told(platoons_of_lin: list[Sequence]) -> None:
     models = {"lin": law("lin"), "newell": law("newell")}
     before = row_of(models["lin"])
-    found = compare_laws(models, platoons_of_lin, DiscoverOptions())
+    found, _ = compare_laws(models, platoons_of_lin, DiscoverOptions())
     assert [one.name for one in found.ranking] == ["lin"]
     assert "step by step" in found.refused["newell"]
     assert row_of(models["lin"]).tolist() == before.tolist()
@@ -55,7 +65,8 @@ def platoons_of_lin() -> list[Sequence]:
 
 def test_people_are_compared_too() -> None:
     sequences = walkers.crowd()
-    found = compare_laws({n: law(n) for n in ("sf", "ttc", "cfsm")}, sequences, DiscoverOptions())
+    laws = {n: law(n) for n in ("sf", "ttc", "cfsm")}
+    found, _ = compare_laws(laws, sequences, DiscoverOptions())
     assert {one.name for one in found.ranking} == {"sf", "ttc"}
     assert "first order" in found.refused["cfsm"]
 
@@ -76,3 +87,50 @@ def test_which_laws_are_candidates() -> None:
     people = {**model_options("sf", "measured"), "desired": "direction"}
     others = candidates(people, build_model(people, 0), DiscoverOptions())
     assert {model.desired for model in others.values()} == {"direction"}
+
+
+def test_effects_go_to_the_laws_that_have_a_place_for_them() -> None:
+    laws = {"lin": law("lin"), "idm": law("idm"), "fvdm": law("fvdm")}
+    memory, zone = (
+        CATALOGUE.effects["memory"](tau_m=12.0),
+        CATALOGUE.effects["speed_zone"](alpha=0.5, a=10.0, b=90.0),
+    )
+    found = with_effects(laws, [memory, zone])
+    names = {n: [effect.name for effect in effects_of(one)] for n, one in found.items()}
+    assert names == {"lin": ["speed_zone"], "idm": ["speed_zone", "memory"], "fvdm": ["speed_zone"]}
+    assert effects_of(found["lin"])[0].options() == zone.options()
+    assert not effects_of(laws["idm"])
+    again = with_effects(found, [zone])
+    assert [effect.name for effect in effects_of(again["lin"])] == ["speed_zone"]
+
+
+def test_what_a_nearer_law_does_without_is_no_finding(tmp_path: Path) -> None:
+    """Behind ``ovm`` a law of the gap alone answers late, which it imitates by looking two ahead;
+    what laws have in themselves, such as an inertia, is right to be missed."""
+    table, _ = measured(LawCase("ovm", 3, sequences=12, vehicles=4, seconds=20.0))
+    path = tmp_path / "table.csv"
+    table.to_csv(path, index=False)
+    sequences = read_table(path, table_options(path, "traffic", None, tmp_path))
+    label = np.arange(len(sequences))
+    engine = TrafficEngine(sequences, clusters=label)
+    base = settled(engine, begun(engine, law("lin").double()).system)
+
+    def added(name: str) -> Search:
+        kind = CATALOGUE.effects[name]
+        fit = refine(engine, extended(base.system, kind())[0])
+        chosen = SimpleNamespace(name=name, score=SimpleNamespace(effect=kind))
+        return Search(fit, [Step(chosen, [])])
+
+    other = begun(engine, law("ovm").double())
+    nearer = Nearer("ovm", other.system)
+    ahead = added("multi_anticipation")
+    taken, p_value = imitated(engine, ahead, label, nearer)
+    assert [step.chosen.name for step in taken] == ["multi_anticipation"]
+    assert p_value < 0.05
+    assert imitated(engine, added("inertia"), label, nearer)[0] == []
+    # the other way round nothing is taken back: lin predicts no better than ovm
+    far = Nearer("lin", base.system)
+    assert imitated(engine, replace(ahead, fit=other), label, far)[0] == []
+    left = without_steps(engine, ahead, taken, base.system)
+    assert left.steps == []
+    assert effects_of(left.fit.system) == []
