@@ -260,7 +260,9 @@ def _diagnose(
     """Run the diagnosis, and add what only its caller knows."""
     inputs, name = job.inputs, str(job.model["name"])
     with watch(f"diagnosis of {name}", STAGES) as stages:
-        found = diagnose(job.system, inputs.sequences, job.options, stages=stages, nearer=nearer)
+        found = diagnose(
+            job.system, inputs.sequences, job.options, stages=stages, nearer=nearer, hint=hint
+        )
     found.diagnosis.data_faults = inputs.data_faults
     found.diagnosis.model = name
     return found
