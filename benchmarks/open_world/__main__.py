@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 from benchmarks.discovery.task import sources
-from benchmarks.open_world import by_sumo, laws
+from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.page import write
 from benchmarks.truths.arms import first_seed
 from nnode.study.runner import Task, run_tasks
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--seeds-of", help="full hash of a commit")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--number", type=int, default=5, help="worlds of every law")
-    parser.add_argument("--scenes", type=int, default=2, help="of every kind, simulated by SUMO")
+    parser.add_argument("--scenes", type=int, default=2, help="of every kind, by SUMO and JuPedSim")
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     seed = given.first_seed if given.seeds_of is None else first_seed(given.seeds_of)
@@ -33,6 +33,10 @@ def main() -> None:
     tasks += [
         Task(f"{one['scene']}-s{one['seed']}", by_sumo.diagnosed_scene, one)
         for one in by_sumo.cases(seed, given.scenes)
+    ]
+    tasks += [
+        Task(f"people-{one['scene']}-s{one['seed']}", by_jupedsim.diagnosed_people, one)
+        for one in by_jupedsim.cases(seed, given.scenes)
     ]
     found = run_tasks(
         tasks, given.folder, workers=given.workers, fingerprint=sources(), title="worlds"

@@ -229,14 +229,14 @@ def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]
     given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
     report = given.plain()
     nearest = report if given.nearest is None else given.nearest.plain()
-    first = report["laws"]["ranking"][0]["name"]
+    first = (report["laws_again"] or report["laws"])["ranking"][0]["name"]
     names = [_called(effect, right.right) for effect in nearest["effects"]]
     alone = set(names) == set(right.right) or (
         right.unknown and set(names) <= set(right.right) and (names or not right.right)
     )
     unsure = right.unknown and not names and nearest["verdict"] == "unknown"
     return {
-        "scene": scene, "seed": seed, "asked": asked, "first": first,
+        "program": "SUMO", "scene": scene, "seed": seed, "asked": asked, "first": first,
         "law_known": bool(right.first), "law_right": not right.first or first in right.first,
         "verdict": nearest["verdict"], "names": names,
         "leads": [effect["name"] for effect in nearest["leads"]],

@@ -13,6 +13,18 @@ from nnode.pages.page import Block, Heading, Provenance, TableBlock, Text, write
 
 TITLE = "Open worlds"
 
+_JUDGED = (
+    "What is judged is the diagnosis of the law that comes nearest. The answers were written down "
+    "before"
+)
+#: Programs that simulate scenes, and what is done with them.
+PROGRAMS = {
+    "SUMO": "Forty platoons each, whose followers SUMO drives, diagnosed with `idm`. "
+    f"{_JUDGED} (`benchmarks/open_world/by_sumo.py`).",
+    "JuPedSim": "Twenty-four meetings of two groups each, whom JuPedSim moves, diagnosed with "
+    f"`sf`. {_JUDGED} (`benchmarks/open_world/by_jupedsim.py`).",
+}
+
 
 def share(number: int, of: int) -> str:
     """A proportion with its exact interval of 95 %."""
@@ -90,17 +102,16 @@ def write(rows: list[dict[str, Any]], seeds_of: str | None, folder: Path) -> lis
             TableBlock("laws", by_law(worlds), "By the law that is true."),
             TableBlock("worlds", flat, "Every world."),
         ]
-    if scenes:
-        blocks += [
-            Heading("Scenes by SUMO"),
-            Text(
-                "Forty platoons each, whose followers SUMO drives, diagnosed with `idm` and with "
-                "the law that comes nearest, which is what is judged. The answers were written "
-                "down before (`benchmarks/open_world/by_sumo.py`)."
-            ),
-            TableBlock("scenes_criteria", scene_criteria(scenes), "Shares, 95 % intervals."),
-            TableBlock("scenes", pd.DataFrame(scenes), "Every scene."),
-        ]
+    for program, words in PROGRAMS.items():
+        own = [row for row in scenes if row["program"] == program]
+        if own:
+            stem = program.lower()
+            blocks += [
+                Heading(f"Scenes by {program}"),
+                Text(words),
+                TableBlock(f"{stem}_criteria", scene_criteria(own), "Shares, 95 % intervals."),
+                TableBlock(stem, pd.DataFrame(own), "Every scene."),
+            ]
     made = how_made(("torch", "numpy", "scipy"))
     blocks.append(Provenance({**made, "Seeds of": seeds_of or "none: development"}))
     return write_page(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.open_world import by_sumo, laws
+from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.page import by_law, criteria, scene_criteria, share, write
 from benchmarks.truths.laws.motion import RANGES
 from nnode.app.base_laws import LAWS
@@ -28,6 +28,9 @@ def test_names_that_are_right() -> None:
 
 
 def test_scenes_expect_names_of_the_catalogue() -> None:
+    for people in by_jupedsim.SCENES.values():
+        assert {*people.right, *people.allowed} <= set(CATALOGUE.effects)
+        assert set(people.first) <= set(LAWS["crowd"])
     for scene in by_sumo.SCENES.values():
         assert set(scene.right) <= set(CATALOGUE.effects)
         assert set(scene.first) <= set(LAWS["traffic"])
@@ -53,8 +56,49 @@ def test_what_was_reached() -> None:
     assert table.loc["idm", "of these false"] == "inertia"
 
 
+def test_equals_of_the_right_name_count_as_said() -> None:
+    def effect(name: str, *others: str) -> dict[str, Any]:
+        return {"name": name, "alternatives": [{"name": other} for other in others]}
+
+    late = ("reaction_delay", "inertia")
+    assert by_sumo._called(effect("memory", "lasting_time_gap"), ("driver_heterogeneity",)) == (
+        "driver_heterogeneity"
+    )
+    assert by_sumo._called(effect("memory", "inertia"), ()) == "memory"
+    assert by_sumo._called(effect("multi_anticipation", "inertia"), late) == "inertia"
+
+
+def test_what_is_said_of_people() -> None:
+    scene = by_jupedsim.SCENES["gcfm_pillar"]
+    laws = {"ranking": [{"name": "gcfm"}]}
+
+    def said(*effects: tuple[str, ...]) -> dict[str, Any]:
+        found = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
+        report = {
+            "laws": laws,
+            "laws_again": None,
+            "verdict": "named",
+            "effects": found,
+            "leads": [],
+        }
+        return by_jupedsim.judged("gcfm_pillar", 1, scene, report, None, 0.0)
+
+    assert said(("obstacle",))["right"]
+    assert said(("anticipation",), ("attraction", "obstacle"))["right"]
+    assert not said(("anticipation",))["right"]
+    assert said(("drift",))["false"] == ["drift"]
+    assert said()["right"] is False
+
+
 def test_the_page(tmp_path: Path) -> None:
-    scene = {"scene": "idm", "right": True, "false": [], "law_known": True, "law_right": False}
+    scene = {
+        "program": "SUMO",
+        "scene": "idm",
+        "right": True,
+        "false": [],
+        "law_known": True,
+        "law_right": False,
+    }
     paths = write([row("idm", "idm"), scene], None, tmp_path)
     text = next(p for p in paths if p.suffix == ".md").read_text()
     assert "1 of 1 (100 %" in text

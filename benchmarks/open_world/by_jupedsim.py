@@ -1,0 +1,233 @@
+"""People whom JuPedSim moves, in scenes from a seed, and what each should be called.
+
+Two groups walk towards each other through a wide room, a corridor or past a pillar, again and again
+with other people. What is right to say was written down before anything was run: the names of
+:attr:`Scene.right`, all of them; those of :attr:`Scene.allowed`, which the true law has in itself,
+may stand beside them or alone. Silence is right where nothing is hidden but another law.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+#: Sequences of a scene, people of a group, JuPedSim's step and that of the recording (s), seconds
+#: before the recording and of it.
+SEQUENCES, GROUP, STEP, SAMPLE, WARM, SECONDS = 24, 5, 0.01, 0.1, 2.0, 5.0
+#: Half the width of the room and of a corridor, and how far the goals are, m.
+ROOM, HALF, GOAL = 30.0, 1.6, 60.0
+#: Errors of measured places, m.
+ERROR = (0.005, 0.02)
+
+Draw = Callable[[np.random.Generator], tuple[str, dict[str, float], dict[str, float]]]
+
+
+def _social(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
+    person = {"mass": 80.0, "radius": 0.25, "reaction_time": rng.uniform(0.4, 0.7),
+              "agent_scale": rng.uniform(80, 240), "force_distance": rng.uniform(0.2, 0.4),
+              "obstacle_scale": rng.uniform(150, 400)}  # fmt: skip
+    # no bodies: contacts are rare and stiff
+    return "SocialForceModel", {"body_force": 0.0, "friction": 0.0}, person
+
+
+def _centrifugal(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
+    person = {"mass": 1.0, "tau": rng.uniform(0.4, 0.7), "a_v": rng.uniform(0.3, 0.8)}
+    return (
+        "GeneralizedCentrifugalForceModel",
+        {"strength_neighbor_repulsion": rng.uniform(0.2, 0.5)},
+        person,
+    )
+
+
+def _free(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
+    model = {"strength_neighbor_repulsion": rng.uniform(4, 8),
+             "range_neighbor_repulsion": rng.uniform(0.1, 0.3)}  # fmt: skip
+    return "CollisionFreeSpeedModel", model, {"time_gap": rng.uniform(0.8, 1.3), "radius": 0.2}
+
+
+def _foreseeing(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
+    person = {"time_gap": rng.uniform(0.8, 1.2), "anticipation_time": rng.uniform(0.6, 1.4),
+              "reaction_time": rng.uniform(0.2, 0.4)}  # fmt: skip
+    return "AnticipationVelocityModel", {}, person
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What JuPedSim simulates.
+
+    Attributes:
+        draw: its model, the model's parameters and those of a person.
+        first: laws that are right to come first; empty: any.
+        right: names that are right, all of them; empty: none.
+        allowed: names that the true law has in itself.
+        corridor: walls near the groups; ``known``: they are measured, and the model has none.
+        pillar: radius of a pillar in the middle, which nobody measured, m.
+        speeds: of the two groups, desired, m/s.
+    """
+
+    draw: Draw
+    first: tuple[str, ...] = ()
+    right: tuple[str, ...] = ()
+    allowed: tuple[str, ...] = ()
+    corridor: bool = False
+    known: bool = False
+    pillar: float = 0.0
+    speeds: tuple[float, float] = (1.3, 1.3)
+
+
+#: ``sf`` does not calibrate the range of its force.
+_RANGE = ("pair_repulsion",)
+#: Laws whose force turns with the view as well.
+_VIEW = ("field_of_view", *_RANGE)
+SCENES: dict[str, Scene] = {
+    "sf": Scene(_social, allowed=_RANGE),
+    "gcfm": Scene(_centrifugal, allowed=(*_VIEW, "anticipation")),
+    "cfsm": Scene(_free, allowed=_VIEW),
+    "avm": Scene(_foreseeing, allowed=(*_VIEW, "anticipation")),
+    "sf_walls": Scene(
+        _social, right=("wall_repulsion",), allowed=_RANGE, corridor=True, known=True
+    ),
+    "sf_walls_withheld": Scene(_social, allowed=_RANGE, corridor=True),
+    "cfsm_walls_withheld": Scene(_free, allowed=_VIEW, corridor=True),
+    "sf_pillar": Scene(_social, right=("obstacle",), allowed=_RANGE, pillar=0.4),
+    "sf_speeds": Scene(_social, allowed=_RANGE, speeds=(1.0, 1.6)),
+    "gcfm_pillar": Scene(
+        _centrifugal, right=("obstacle",), allowed=(*_VIEW, "anticipation"), pillar=0.4
+    ),
+}  # fmt: skip
+
+
+def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    """The table of a scene (sequence, time, agent, x, y), and the walls where they are known.
+
+    Raises:
+        ImportError: JuPedSim is not installed.
+    """
+    import shapely
+
+    jupedsim = import_module("jupedsim")
+    scene = SCENES[name]
+    digest = hashlib.sha256(f"{name} {seed}".encode()).digest()
+    rng = np.random.default_rng(list(digest))
+    kind, values, person = scene.draw(rng)
+    half = HALF if scene.corridor else ROOM
+    room = shapely.box(-1.5 * GOAL, -half, 1.5 * GOAL, half)
+    if scene.pillar:
+        room = room.difference(shapely.Point(0, 0).buffer(scene.pillar, quad_segs=4))
+    error = rng.uniform(*ERROR)
+    rows: list[pd.DataFrame] = []
+    with TemporaryDirectory() as place:
+        for number in range(SEQUENCES):
+            path = Path(place) / f"{number}.sqlite"
+            simulation = jupedsim.Simulation(
+                model=getattr(jupedsim, kind)(**values), geometry=room, dt=STEP,
+                trajectory_writer=jupedsim.SqliteTrajectoryWriter(
+                    output_file=path, every_nth_frame=round(SAMPLE / STEP)
+                ),
+            )  # fmt: skip
+            rows.append(_moved(jupedsim, simulation, scene, f"{kind}AgentParameters", person, rng))
+            rows[-1].insert(0, "sequence", f"s{number:03d}")
+    table = pd.concat(rows, ignore_index=True)
+    table["agent"] = table["sequence"] + "-" + table["agent"].astype(str)
+    table[["x", "y"]] += error * rng.standard_normal((len(table), 2))
+    walls = None
+    if scene.known:
+        end = 1.5 * GOAL
+        walls = pd.DataFrame(
+            [(-end, -half, end, -half), (-end, half, end, half)], columns=["x1", "y1", "x2", "y2"]
+        )
+    return table, walls
+
+
+def _moved(
+    jupedsim: Any, simulation: Any, scene: Scene, kind: str, person: dict[str, float],
+    rng: np.random.Generator,
+) -> pd.DataFrame:  # fmt: skip
+    """One sequence: time, agent, x, y."""
+    stage = simulation.add_direct_steering_stage()
+    journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
+    places: list[np.ndarray] = []
+    agents = {}
+    while len(places) < 2 * GROUP:
+        side = -1.0 if len(places) < GROUP else 1.0
+        at = np.array([side * rng.uniform(3.0, 9.0), rng.uniform(-1.1, 1.1)])
+        if any(np.linalg.norm(at - other) < 1.2 for other in places):
+            continue
+        speed = scene.speeds[int(side > 0)] * rng.uniform(0.95, 1.05)
+        more: dict[str, Any] = {"position": tuple(at), "desired_speed": speed}
+        if "Centrifugal" in kind:
+            more |= {"speed": speed, "orientation": (-side, 0.0), "desired_direction": (-side, 0.0)}
+        own = simulation.add_agent(
+            getattr(jupedsim, kind)(journey_id=journey, stage_id=stage, **person, **more)
+        )
+        simulation.agent(own).target = (-side * GOAL, float(at[1]))
+        agents[own] = len(places)
+        places.append(at)
+    every, rows = round(SAMPLE / STEP), []
+    for step in range(round((WARM + SECONDS) / STEP) + 1):
+        if step % every == 0 and step * STEP >= WARM - 1e-9:
+            rows += [
+                (round(step * STEP, 3), agents[one.id], *one.position)
+                for one in simulation.agents()
+            ]
+        simulation.iterate()
+    return pd.DataFrame(rows, columns=["time", "agent", "x", "y"])
+
+
+def diagnosed_people(scene: str, seed: int) -> dict[str, Any]:
+    """One scene, diagnosed with the social force; plain JSON, see
+    :func:`benchmarks.open_world.by_sumo.diagnosed_scene`."""
+    from nnode.app.discover import diagnose_table
+    from nnode.discover.options import DiscoverOptions
+
+    own = SCENES[scene]
+    table, walls = recorded(scene, seed)
+    start = time.monotonic()
+    model = {"name": "sf", "term": "social_force", "desired": "direction", "walls": False}
+    with TemporaryDirectory() as place:
+        path = None
+        if walls is not None:
+            path = Path(place) / "walls.csv"
+            walls.to_csv(path, index=False)
+        given = diagnose_table(
+            table, "crowd", model=model, seed=seed, walls=path,
+            options=DiscoverOptions(page=False, replay=False),
+        )  # fmt: skip
+    return judged(scene, seed, own, given.plain(), given.nearest, time.monotonic() - start)
+
+
+def judged(
+    name: str, seed: int, scene: Scene, report: dict[str, Any], nearest: Any, seconds: float
+) -> dict[str, Any]:
+    """What was said against what was written down."""
+    last = report if nearest is None else nearest.plain()
+    first = (report["laws_again"] or report["laws"])["ranking"][0]["name"]
+    names = [effect["name"] for effect in last["effects"]]
+    equals = {e["name"]: {e["name"], *(a["name"] for a in e["alternatives"])}
+              for e in last["effects"]}  # fmt: skip
+    missing = [r for r in scene.right if not any(r in equals[n] for n in names)]
+    false = [n for n in names if not equals[n] & {*scene.right, *scene.allowed}]
+    return {
+        "program": "JuPedSim", "scene": name, "seed": seed, "asked": "sf", "first": first,
+        "law_known": bool(scene.first), "law_right": not scene.first or first in scene.first,
+        "verdict": last["verdict"], "names": names,
+        "leads": [effect["name"] for effect in last["leads"]],
+        "right": not missing and not false, "false": false,
+        "asked_verdict": report["verdict"],
+        "asked_names": [effect["name"] for effect in report["effects"]],
+        "seconds": seconds,
+    }  # fmt: skip
+
+
+def cases(first_seed: int, number: int) -> list[dict[str, Any]]:
+    """Arguments of :func:`diagnosed_people`."""
+    return [{"scene": name, "seed": first_seed + i} for name in SCENES for i in range(number)]
