@@ -375,7 +375,8 @@ def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:
         print(f"  {effect.name}: {interval(effect)}")
         print(f"    {effect.formula}; {effect.where}")
         for other in effect.alternatives:
-            print(f"    not to be told from {other.name}: {other.separated_by}")
+            number = f", or about {other.clusters} open clusters" if other.clusters else ""
+            print(f"    not to be told from {other.name}: {other.separated_by}{number}")
     for what, path in paths.items():
         print(f"{what}: {path}")
     print(f"time: {seconds:.1f} s")

@@ -27,12 +27,15 @@ class Alternative:
         loss: its held-out cost over that of the effect that was chosen.
         p_value: of the hypothesis that it is as good.
         separated_by: data that would tell the two apart.
+        clusters: about how many open clusters like these would tell them apart with a probability
+            of 90 %, if the difference that was seen is the true one; None where no number would.
     """
 
     name: str
     loss: float
     p_value: float
     separated_by: str = ""
+    clusters: int | None = None
 
 
 @dataclass

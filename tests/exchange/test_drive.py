@@ -160,6 +160,7 @@ def test_laws_of_first_order(sumo: Path, program: str, tmp_path: Path, name: str
 SECOND_ORDER = {
     "relative_speed": {"kappa": 0.3},
     "memory": {"tau_m": 60.0},
+    "lasting_time_gap": {"share": 0.6},
     "pure_delay": {"T": 0.35},
     "reaction_delay": {"T": 0.5},
     "inertia": {"tau_v": 0.5},

@@ -11,7 +11,7 @@ from scipy import stats
 
 from nnode.discover.locate.curves import tail
 from nnode.discover.locate.symbolic import symbolic
-from nnode.discover.name.search import Search, Step
+from nnode.discover.name.search import Search, Step, apart_at
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Curves
@@ -23,6 +23,7 @@ from nnode.discover.result import (
     Place,
     Structure,
 )
+from nnode.discover.statistics.paired import clusters_to_tell
 from nnode.discover.statistics.power import POWER, Way
 from nnode.discover.statistics.profile import intervals as edge_intervals
 from nnode.discover.statistics.random_effects import Individuals
@@ -56,6 +57,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
                 loss=float(other.losses.sum() / step.chosen.losses.sum()),
                 p_value=test.p_value,
                 separated_by=effect.separated_by,
+                clusters=clusters_to_tell(test, apart_at(step.chosen, other)),
             )
             for other, test in step.rivals
         ],

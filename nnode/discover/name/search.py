@@ -204,11 +204,15 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         if other is best or other.gain.gain < CLOSE * best.gain.gain:
             continue
         test = _between(other, best, screen)
-        kin = best.score.effect.kin
-        alike = bool(kin) and kin == other.score.effect.kin
-        if test.p_value > (KIN_APART if alike else APART) and not _contains(other, best):
+        if test.p_value > apart_at(best, other) and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals)
+
+
+def apart_at(one: Candidate, other: Candidate) -> float:
+    """The level at which two effects are told apart."""
+    kin = one.score.effect.kin
+    return KIN_APART if kin and kin == other.score.effect.kin else APART
 
 
 def _hinted(hint: System | None, system: System, name: str) -> System | None:

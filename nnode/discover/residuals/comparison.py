@@ -13,9 +13,11 @@ class Comparison:
         gain: mean over the clusters of (first - second) / max(first, second).
         low, high: its interval of 95 %.
         p_value: that the second is not better, one-sided.
+        clusters: their number.
     """
 
     gain: float
     low: float
     high: float
     p_value: float
+    clusters: int = 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy import stats
 
@@ -43,8 +45,39 @@ def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
     number = len(share)
     mean = float(share.mean())
     if number < 2:
-        return Comparison(mean, -np.inf, np.inf, 1.0)
+        return Comparison(mean, -np.inf, np.inf, 1.0, number)
     error = float(share.std(ddof=1) / np.sqrt(number))
     half = float(stats.t.ppf(0.975, number - 1)) * error
     p_value = float(stats.t.sf(mean / error, number - 1)) if error > 0 else float(mean <= 0)
-    return Comparison(mean, mean - half, mean + half, p_value)
+    return Comparison(mean, mean - half, mean + half, p_value, number)
+
+
+def clusters_to_tell(test: Comparison, level: float, power: float = 0.9) -> int | None:
+    """About how many clusters of the same kind tell two models apart with a probability, if the
+    observed difference is the true one.
+
+    That of the one-sided t-test: (n mean²/variance)^½ is the sum of the quantiles of the level and
+    of the power, of Student's distribution with n - 1 degrees of freedom. The observed difference
+    is uncertain itself, and so is this number.
+
+    Args:
+        test: of the two models.
+        level: of the test.
+        power: the probability.
+
+    Returns:
+        None where the second model is no better: no number would.
+    """
+    if test.clusters < 2 or not test.gain > 0 or not math.isfinite(test.high):
+        return None
+    error = (test.high - test.gain) / float(stats.t.ppf(0.975, test.clusters - 1))
+    ratio = error**2 * test.clusters / test.gain**2
+    number = 2
+    for _ in range(50):  # the quantiles depend on the number
+        free = max(number - 1, 1)
+        quantiles = float(stats.t.ppf(1 - level, free) + stats.t.ppf(power, free))
+        wanted = max(2, math.ceil(ratio * quantiles**2))
+        if wanted == number:
+            break
+        number = max(wanted, 2) if wanted < number else (number + wanted + 1) // 2
+    return max(number, test.clusters)

@@ -124,6 +124,20 @@ def _seen(i: int) -> float:
     return float(np.clip((net - P.s0) / max(SPEEDS[i], 2.0), 0.1, 5.0))
 
 
+@pytest.mark.parametrize("share", [0.4, 1.0, -0.2])
+def test_a_lasting_time_gap_is_a_share_of_what_was_seen_and_stays(share: float) -> None:
+    system = model("idm", {"name": "lasting_time_gap", "share": share})
+    own = [idm(i, P, T=P.T + share * (_seen(i) - P.T)) for i in range(3)]
+    np.testing.assert_allclose(accelerations(system, platoon())[0, :3], own, rtol=1e-12)
+    batch = path(6.0)
+    start = [(gap - LONG - P.s0) / float(batch.v[0, 0, 0, 0]) for gap in (26.0, 30.0)]
+    found = simulated(system, batch)
+    # a memory that never fades, from the same share
+    kept = [P.T + share * (one - P.T) for one in start]
+    wanted = _remembered(batch, kept, np.inf, DT)
+    np.testing.assert_allclose(found.x[-1, 0, :2, 0], wanted, rtol=1e-12)
+
+
 def simulated(system: Any, batch: Batch, step: float = DT) -> Any:
     with torch.no_grad():
         return TorchdiffeqSolver(None, "discrete", step)(system, batch)
