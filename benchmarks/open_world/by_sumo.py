@@ -133,7 +133,7 @@ def _written(
             )
         x = rng.uniform(320.0, 720.0)
         for i in range(CARS):
-            truck = scene.trucks > 0 and rng.random() < scene.trucks
+            truck = i > 0 and scene.trucks > 0 and rng.random() < scene.trucks
             own = {**values, **{key: rng.uniform(*ends) for key, ends in scene.each.items()}}
             if truck:
                 own["tau"] += 0.8

@@ -111,15 +111,20 @@ def ranked(laws: Laws) -> str:
 
 
 def sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one sentence, and one for the faults of the measurement."""
+    """The verdict in one sentence, one for a law that comes nearer, and one for the faults of the
+    measurement."""
+    text, laws = _verdict(diagnosis), diagnosis.laws_again or diagnosis.laws
+    if laws is not None and laws.best not in ("", diagnosis.model):
+        beside = f" with {_listed(laws.effects)}" if laws.effects else ""
+        text += f" Of the laws that were compared, {laws.best}{beside} comes nearer."
     faults = diagnosis.data_faults
-    if not faults:
-        return _verdict(diagnosis)
-    where = len({fault.sequence for fault in faults})
-    return (
-        f"{_verdict(diagnosis)} Beside that the measurement holds {_count(len(faults), 'fault')} "
-        f"in {_count(where, 'sequence')}, which were left out."
-    )
+    if faults:
+        where = len({fault.sequence for fault in faults})
+        text += (
+            f" Beside that the measurement holds {_count(len(faults), 'fault')} in "
+            f"{_count(where, 'sequence')}, which were left out."
+        )
+    return text
 
 
 def _verdict(d: Diagnosis) -> str:
