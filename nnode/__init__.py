@@ -9,6 +9,8 @@ from nnode.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from nnode.app.calibration import Calibration
+    from nnode.app.check import Check
+    from nnode.app.check import check_file as check
     from nnode.app.discover import diagnose_table as diagnose
     from nnode.app.drive import drive_run as drive
     from nnode.app.python.estimator import Calibrator, fit
@@ -22,10 +24,12 @@ if TYPE_CHECKING:
 __all__ = [
     "Calibration",
     "Calibrator",
+    "Check",
     "Report",
     "Sequence",
     "Sequences",
     "__version__",
+    "check",
     "diagnose",
     "drive",
     "fit",
@@ -41,6 +45,8 @@ _HOMES = {
     "Report": ("nnode.app.python.report", "Report"),
     "Sequence": ("nnode.data.sequence", "Sequence"),
     "Sequences": ("nnode.data.sequences", "Sequences"),
+    "Check": ("nnode.app.check", "Check"),
+    "check": ("nnode.app.check", "check_file"),
     "diagnose": ("nnode.app.discover", "diagnose_table"),
     "drive": ("nnode.app.drive", "drive_run"),
     "fit": ("nnode.app.python.estimator", "fit"),

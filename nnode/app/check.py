@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import cast
 
@@ -23,26 +25,75 @@ from nnode.program import typed
 _SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
 
 
-def check(config: DictConfig, folder: Path) -> None:
-    """Examine a file, print what was found, and write ``check.html`` into ``folder``.
+@dataclass(frozen=True, repr=False)
+class Check:
+    """What a file of trajectories holds; printed, it is the summary, a notebook shows the findings.
+
+    Attributes:
+        examination: all that was found, in SI units.
+        options: overrides with which scripts, and ``nnode COMMAND``, read the file.
+    """
+
+    examination: Examination
+    options: list[str]
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is wrong, the worst first: ``level``, ``kind``, ``text``."""
+        return self.examination.findings
+
+    @property
+    def probability(self) -> float:
+        """Of the units, whatever the rate of frames."""
+        return _probability(self.examination)
+
+    def __repr__(self) -> str:
+        return typed(summary(self.examination, self.options))
+
+    def _repr_html_(self) -> str:
+        table = _rows(self.findings).to_html() if self.findings else ""
+        return f"<p>{escape(sentence(self.examination))}</p>{table}"
+
+    def write(self, folder: str | Path) -> Path:
+        """Write the page ``check.html`` with its tables; returns its path."""
+        return write_page(
+            [*blocks(self.examination, self.options), _made()], Path(folder),
+            title=f"Check of {self.examination.path.name}", subtitle=sentence(self.examination),
+            stem="check",
+        )[0]  # fmt: skip
+
+
+def check_file(
+    file: str | Path, domain: Domain | None = None, frame_rate: float | None = None
+) -> Check:
+    """Examine a file before anything is made of it.
+
+    Args:
+        file: a table, or trajectories in a format that nnode reads.
+        domain: ``traffic`` or ``crowd``; None guesses.
+        frame_rate: 1/s, where time is counted in frames; None guesses.
 
     Raises:
         ConfigError: no such file, or an option out of its range.
         DataError: a file that is no table of trajectories.
     """
-    if config.domain not in (None, "traffic", "crowd"):
-        raise ConfigError(f"domain={config.domain}: expected traffic, crowd, or null to guess")
-    if config.frame_rate is not None and not 0 < config.frame_rate < float("inf"):
-        raise ConfigError(f"frame_rate={config.frame_rate}: expected a positive number, 1/s")
-    path = Path(config.file).expanduser()
-    found = examine(path, cast(Domain | None, config.domain), config.frame_rate)
-    lines = command(found)
-    print(typed(summary(found, lines)))
-    page = write_page(
-        [*blocks(found, lines), _made()], folder, title=f"Check of {path.name}",
-        subtitle=sentence(found), stem="check",
-    )[0]  # fmt: skip
-    print(f"page: {page}")
+    if domain not in (None, "traffic", "crowd"):
+        raise ConfigError(f"domain={domain}: expected traffic, crowd, or null to guess")
+    if frame_rate is not None and not 0 < frame_rate < float("inf"):
+        raise ConfigError(f"frame_rate={frame_rate}: expected a positive number, 1/s")
+    found = examine(Path(file).expanduser(), domain, frame_rate)
+    return Check(found, command(found))
+
+
+def check(config: DictConfig, folder: Path) -> None:
+    """Examine a file, print what was found, and write ``check.html`` into ``folder``.
+
+    Raises:
+        NNodeError: see :func:`check_file`.
+    """
+    found = check_file(config.file, cast(Domain | None, config.domain), config.frame_rate)
+    print(found)
+    print(f"page: {found.write(folder)}")
 
 
 def command(found: Examination) -> list[str]:
@@ -116,15 +167,18 @@ def blocks(found: Examination, lines: list[str]) -> list[Block]:
     ]
 
 
-def _findings(findings: list[Finding]) -> list[Block]:
+def _rows(findings: list[Finding]) -> pd.DataFrame:
     rows = [{"": one.level, "what": one.kind, "in words": one.text} for one in findings]
-    if not rows:
+    return pd.DataFrame(rows).set_index("")
+
+
+def _findings(findings: list[Finding]) -> list[Block]:
+    if not findings:
         return [Text("Nothing.")]
-    table = pd.DataFrame(rows).set_index("")
     caption = (
         "*error*: results would be wrong. *warning*: look at it before you go on. *note*: to know."
     )
-    return [TableBlock("findings", table, caption)]
+    return [TableBlock("findings", _rows(findings), caption)]
 
 
 def _usage(found: Examination, lines: list[str]) -> str:

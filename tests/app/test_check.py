@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+import nnode
 from nnode.app.check import sentence, summary
 from nnode.data.check.examine import examine
 from nnode.data.store import Store
+from nnode.errors import ConfigError
 from tests.app.conftest import Script
 from tests.data.check.planted import cars, people, saved, text
 
@@ -70,3 +72,19 @@ def test_the_text_says_all(tmp_path: Path) -> None:
     assert told.endswith("  python scripts/prepare_data.py data=pedpy data.path=X")
     for one in found.findings:
         assert one.text in told
+
+
+def test_in_python_it_is_an_object(tmp_path: Path) -> None:
+    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
+    path = text(people(), tmp_path, head, 100.0)
+    found = nnode.check(path)
+    assert isinstance(found, nnode.Check)
+    assert repr(found).splitlines()[0] == f"{path}: {sentence(found.examination)}"
+    assert found.options[0] == "data=pedpy"
+    assert found.probability > 0.99
+    assert "<p>40 people, " in found._repr_html_()
+    for one in found.findings:
+        assert one.kind in found._repr_html_()
+    assert found.write(tmp_path / "page").name == "check.html"
+    with pytest.raises(ConfigError, match="domain=sea: expected traffic, crowd, or null"):
+        nnode.check(path, "sea")  # type: ignore[arg-type]

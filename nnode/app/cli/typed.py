@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, make_absolute
+from nnode.program import configuration
 
 #: Texts of these characters need no quotes, unless they would be read as something else.
 _PLAIN = re.compile(r"[\w./:+-]*", re.ASCII)
@@ -63,24 +64,29 @@ def plain_options(options: object) -> dict[str, Any]:
 def group_defaults(section: str, group: str, script: str | None = None) -> dict[str, Any]:
     """What a configuration group has where nothing is said, ``???`` where something must be.
 
-    Without Hydra these are its schema's values.
-
     Args:
         script: that has such groups, where the one that runs has not.
     """
-    from nnode.config import SCHEMAS
-
     if in_hydra():
         name = script or HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:
-        config = OmegaConf.structured(SCHEMAS[section, f"{group}_schema"])
+        config = _written(section, group)
     plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
     assert isinstance(plain, dict)
     found = {str(key): value for key, value in plain.items()}
     if section == "data":
         make_absolute(found)
     return found
+
+
+def _written(section: str, group: str) -> Any:
+    """A group as its file has it, without Hydra."""
+    from nnode.config import SCHEMAS
+
+    own = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
+    schema = SCHEMAS[section, str(own.pop("defaults")[0])]
+    return OmegaConf.merge(OmegaConf.structured(schema), own)
 
 
 def changes(prefix: str, values: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
