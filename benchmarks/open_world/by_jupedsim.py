@@ -1,9 +1,8 @@
 """People whom JuPedSim moves, in scenes from a seed, and what each should be called.
 
 Two groups walk towards each other through a wide room, a corridor or past a pillar, again and again
-with other people. What is right to say was written down before anything was run: the names of
-:attr:`Scene.right`, all of them; those of :attr:`Scene.allowed`, which the true law has in itself,
-may stand beside them or alone. Silence is right where nothing is hidden but another law.
+with other people. What is right to say was written down before anything was run. Silence is right
+where nothing is hidden but another law.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +18,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+
+from benchmarks.open_world.answers import Answer
 
 #: Sequences of a scene, people of a group, JuPedSim's step and that of the recording (s), seconds
 #: before the recording and of it.
@@ -66,18 +67,14 @@ class Scene:
 
     Attributes:
         draw: its model, the model's parameters and those of a person.
-        first: laws that are right to come first; empty: any.
-        right: names that are right, all of them; empty: none.
-        allowed: names that the true law has in itself.
+        answer: what is right to say.
         corridor: walls near the groups; ``known``: they are measured, and the model has none.
         pillar: radius of a pillar in the middle, which nobody measured, m.
         speeds: of the two groups, desired, m/s.
     """
 
     draw: Draw
-    first: tuple[str, ...] = ()
-    right: tuple[str, ...] = ()
-    allowed: tuple[str, ...] = ()
+    answer: Answer
     corridor: bool = False
     known: bool = False
     pillar: float = 0.0
@@ -88,21 +85,21 @@ class Scene:
 _RANGE = ("pair_repulsion",)
 #: Laws whose force turns with the view as well.
 _VIEW = ("field_of_view", *_RANGE)
+_OTHER, _SEEN = Answer(allowed=_RANGE), Answer(allowed=_VIEW)
+_FORESEEN = Answer(allowed=(*_VIEW, "anticipation"))
 SCENES: dict[str, Scene] = {
-    "sf": Scene(_social, allowed=_RANGE),
-    "gcfm": Scene(_centrifugal, allowed=(*_VIEW, "anticipation")),
-    "cfsm": Scene(_free, allowed=_VIEW),
-    "avm": Scene(_foreseeing, allowed=(*_VIEW, "anticipation")),
+    "sf": Scene(_social, _OTHER),
+    "gcfm": Scene(_centrifugal, _FORESEEN),
+    "cfsm": Scene(_free, _SEEN),
+    "avm": Scene(_foreseeing, _FORESEEN),
     "sf_walls": Scene(
-        _social, right=("wall_repulsion",), allowed=_RANGE, corridor=True, known=True
+        _social, replace(_OTHER, right=("wall_repulsion",)), corridor=True, known=True
     ),
-    "sf_walls_withheld": Scene(_social, allowed=_RANGE, corridor=True),
-    "cfsm_walls_withheld": Scene(_free, allowed=_VIEW, corridor=True),
-    "sf_pillar": Scene(_social, right=("obstacle",), allowed=_RANGE, pillar=0.4),
-    "sf_speeds": Scene(_social, allowed=_RANGE, speeds=(1.0, 1.6)),
-    "gcfm_pillar": Scene(
-        _centrifugal, right=("obstacle",), allowed=(*_VIEW, "anticipation"), pillar=0.4
-    ),
+    "sf_walls_withheld": Scene(_social, _OTHER, corridor=True),
+    "cfsm_walls_withheld": Scene(_free, _SEEN, corridor=True),
+    "sf_pillar": Scene(_social, replace(_OTHER, right=("obstacle",)), pillar=0.4),
+    "sf_speeds": Scene(_social, _OTHER, speeds=(1.0, 1.6)),
+    "gcfm_pillar": Scene(_centrifugal, replace(_FORESEEN, right=("obstacle",)), pillar=0.4),
 }  # fmt: skip
 
 
@@ -184,12 +181,10 @@ def _moved(
 
 
 def diagnosed_people(scene: str, seed: int) -> dict[str, Any]:
-    """One scene, diagnosed with the social force; plain JSON, see
-    :func:`benchmarks.open_world.by_sumo.diagnosed_scene`."""
+    """One scene, diagnosed with the social force; plain JSON, see :meth:`Answer.judge`."""
     from nnode.app.discover import diagnose_table
     from nnode.discover.options import DiscoverOptions
 
-    own = SCENES[scene]
     table, walls = recorded(scene, seed)
     start = time.monotonic()
     model = {"name": "sf", "term": "social_force", "desired": "direction", "walls": False}
@@ -202,29 +197,11 @@ def diagnosed_people(scene: str, seed: int) -> dict[str, Any]:
             table, "crowd", model=model, seed=seed, walls=path,
             options=DiscoverOptions(page=False, replay=False),
         )  # fmt: skip
-    return judged(scene, seed, own, given.plain(), given.nearest, time.monotonic() - start)
-
-
-def judged(
-    name: str, seed: int, scene: Scene, report: dict[str, Any], nearest: Any, seconds: float
-) -> dict[str, Any]:
-    """What was said against what was written down."""
-    last = report if nearest is None else nearest.plain()
-    first = (report["laws_again"] or report["laws"])["ranking"][0]["name"]
-    names = [effect["name"] for effect in last["effects"]]
-    equals = {e["name"]: {e["name"], *(a["name"] for a in e["alternatives"])}
-              for e in last["effects"]}  # fmt: skip
-    missing = [r for r in scene.right if not any(r in equals[n] for n in names)]
-    false = [n for n in names if not equals[n] & {*scene.right, *scene.allowed}]
+    nearest = None if given.nearest is None else given.nearest.plain()
     return {
-        "program": "JuPedSim", "scene": name, "seed": seed, "asked": "sf", "first": first,
-        "law_known": bool(scene.first), "law_right": not scene.first or first in scene.first,
-        "verdict": last["verdict"], "names": names,
-        "leads": [effect["name"] for effect in last["leads"]],
-        "right": not missing and not false, "false": false,
-        "asked_verdict": report["verdict"],
-        "asked_names": [effect["name"] for effect in report["effects"]],
-        "seconds": seconds,
+        "program": "JuPedSim", "scene": scene, "seed": seed, "asked": "sf",
+        **SCENES[scene].answer.judge(given.plain(), nearest),
+        "seconds": time.monotonic() - start,
     }  # fmt: skip
 
 

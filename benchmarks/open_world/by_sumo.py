@@ -1,9 +1,9 @@
 """Platoons whose followers SUMO drives, in scenes from a seed, and what each should be called.
 
 Every platoon has a road of its own. Its leader is told its speed at every step; the rest is SUMO's.
-What is right to say was written down before anything was run: the names of :attr:`Scene.right`, all
-of them and no other; or, where the catalogue may lack it, ``unknown`` as well. A name that is
-listed as not to be told from the one that was chosen counts as said.
+What is right to say was written down before anything was run: see
+:class:`~benchmarks.open_world.answers.Answer`. A name that is listed as not to be told from the one
+that was chosen counts as said.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
+from benchmarks.open_world.answers import NOTHING, Answer
 from benchmarks.truths.laws.case import accelerations
 
 #: Roads, vehicles on each with the leader, seconds before and of the recording, SUMO's step (s).
@@ -56,9 +57,7 @@ class Scene:
     Attributes:
         follow: its name of the car-following model.
         draw: attributes of the vehicles' type.
-        first: laws that are right to come first; empty: any.
-        right: names that are right, all of them.
-        unknown: whether ``unknown`` is right as well, then with any of ``right``.
+        answer: what is right to say.
         stretch: in the stretch there is a limit.
         period: the limit falls for some seconds, everywhere.
         more: attributes that are drawn besides: of all, or of each vehicle.
@@ -67,9 +66,7 @@ class Scene:
 
     follow: str
     draw: Draw
-    first: tuple[str, ...] = ()
-    right: tuple[str, ...] = ()
-    unknown: bool = False
+    answer: Answer = NOTHING
     stretch: bool = False
     period: bool = False
     more: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -77,22 +74,27 @@ class Scene:
     trucks: float = 0.0
 
 
-#: Names of one thing: a time gap of everybody's own, as it is seen at first or as it is estimated.
-SAME = {"lasting_time_gap": "driver_heterogeneity"}
 _LATE = ("reaction_delay", "inertia")
+_SOON = Answer(right=_LATE, unknown=True)
 IDM, KRAUSS = partial(Scene, "IDM", _idm), partial(Scene, "Krauss", _krauss)
+
+
+def _says(law: str, *right: str) -> Answer:
+    return Answer(first=(law,), right=right)
+
+
 SCENES: dict[str, Scene] = {
-    "idm": IDM(first=("idm",)),
-    "krauss": KRAUSS(first=("krauss",)),
-    "eidm": Scene("EIDM", _idm, unknown=True),
-    "idm_stretch": IDM(first=("idm",), right=("speed_zone",), stretch=True),
-    "krauss_stretch": KRAUSS(first=("krauss",), right=("speed_zone",), stretch=True),
-    "idm_period": IDM(first=("idm",), right=("speed_period",), period=True),
-    "krauss_period": KRAUSS(first=("krauss",), right=("speed_period",), period=True),
-    "idm_late": IDM(right=_LATE, unknown=True, more={"actionStepLength": (0.8, 1.5)}),
-    "krauss_late": KRAUSS(right=_LATE, unknown=True, more={"actionStepLength": (0.8, 1.5)}),
-    "idm_trucks": IDM(first=("idm",), right=("vehicle_class",), trucks=0.4),
-    "idm_drivers": IDM(first=("idm",), right=("driver_heterogeneity",), each={"tau": (0.7, 2.2)}),
+    "idm": IDM(_says("idm")),
+    "krauss": KRAUSS(_says("krauss")),
+    "eidm": Scene("EIDM", _idm, Answer(unknown=True)),
+    "idm_stretch": IDM(_says("idm", "speed_zone"), stretch=True),
+    "krauss_stretch": KRAUSS(_says("krauss", "speed_zone"), stretch=True),
+    "idm_period": IDM(_says("idm", "speed_period"), period=True),
+    "krauss_period": KRAUSS(_says("krauss", "speed_period"), period=True),
+    "idm_late": IDM(_SOON, more={"actionStepLength": (0.8, 1.5)}),
+    "krauss_late": KRAUSS(_SOON, more={"actionStepLength": (0.8, 1.5)}),
+    "idm_trucks": IDM(_says("idm", "vehicle_class"), trucks=0.4),
+    "idm_drivers": IDM(_says("idm", "driver_heterogeneity"), each={"tau": (0.7, 2.2)}),
     "krauss_dawdling": KRAUSS(more={"sigma": (0.3, 0.7)}),
 }
 
@@ -219,40 +221,20 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]:
-    """One scene, diagnosed; plain JSON: which law came ``first``, and what is said with it."""
+    """One scene, diagnosed; plain JSON, see :meth:`Answer.judge`."""
     from nnode.app.discover import diagnose_table
     from nnode.discover.options import DiscoverOptions
 
-    right, table = SCENES[scene], recorded(scene, seed)
+    table = recorded(scene, seed)
     start = time.monotonic()
     options = DiscoverOptions(page=False, replay=False)
     given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
-    report = given.plain()
-    nearest = report if given.nearest is None else given.nearest.plain()
-    first = (report["laws_again"] or report["laws"])["ranking"][0]["name"]
-    names = [_called(effect, right.right) for effect in nearest["effects"]]
-    alone = set(names) == set(right.right) or (
-        right.unknown and set(names) <= set(right.right) and (names or not right.right)
-    )
-    unsure = right.unknown and not names and nearest["verdict"] == "unknown"
+    nearest = None if given.nearest is None else given.nearest.plain()
     return {
-        "program": "SUMO", "scene": scene, "seed": seed, "asked": asked, "first": first,
-        "law_known": bool(right.first), "law_right": not right.first or first in right.first,
-        "verdict": nearest["verdict"], "names": names,
-        "leads": [effect["name"] for effect in nearest["leads"]],
-        "right": bool(alone or unsure),
-        "false": [name for name in names if name not in right.right],
-        "asked_verdict": report["verdict"],
-        "asked_names": [effect["name"] for effect in report["effects"]],
+        "program": "SUMO", "scene": scene, "seed": seed, "asked": asked,
+        **SCENES[scene].answer.judge(given.plain(), nearest),
         "seconds": time.monotonic() - start,
     }  # fmt: skip
-
-
-def _called(effect: dict[str, Any], right: tuple[str, ...]) -> str:
-    """The right name, where it is the effect's or one of its equals'; else the effect's."""
-    names = [effect["name"], *(other["name"] for other in effect["alternatives"])]
-    names = [SAME.get(name, name) for name in names]
-    return next((name for name in names if name in right), names[0])
 
 
 def cases(first_seed: int, number: int) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.open_world import by_jupedsim, by_sumo, laws
+from benchmarks.open_world.answers import Answer
 from benchmarks.open_world.page import by_law, criteria, scene_criteria, share, write
 from benchmarks.truths.laws.motion import RANGES
 from nnode.app.base_laws import LAWS
@@ -28,13 +29,13 @@ def test_names_that_are_right() -> None:
 
 
 def test_scenes_expect_names_of_the_catalogue() -> None:
-    for people in by_jupedsim.SCENES.values():
-        assert {*people.right, *people.allowed} <= set(CATALOGUE.effects)
-        assert set(people.first) <= set(LAWS["crowd"])
-    for scene in by_sumo.SCENES.values():
-        assert set(scene.right) <= set(CATALOGUE.effects)
-        assert set(scene.first) <= set(LAWS["traffic"])
+    for domain, scenes in (("traffic", by_sumo.SCENES), ("crowd", by_jupedsim.SCENES)):
+        for scene in scenes.values():
+            answer = scene.answer
+            assert {*answer.right, *answer.allowed} <= set(CATALOGUE.effects)
+            assert set(answer.first) <= set(LAWS[domain])
     assert len(by_sumo.cases(5, 2)) == 2 * len(by_sumo.SCENES)
+    assert len(by_jupedsim.cases(5, 2)) == 2 * len(by_jupedsim.SCENES)
 
 
 def test_what_was_reached() -> None:
@@ -56,38 +57,51 @@ def test_what_was_reached() -> None:
     assert table.loc["idm", "of these false"] == "inertia"
 
 
-def test_equals_of_the_right_name_count_as_said() -> None:
-    def effect(name: str, *others: str) -> dict[str, Any]:
-        return {"name": name, "alternatives": [{"name": other} for other in others]}
+def said(answer: Answer, *effects: tuple[str, ...], verdict: str = "named") -> dict[str, Any]:
+    """What is judged where effects, each with its equals, are named."""
+    found = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
+    laws = {"ranking": [{"name": "idm"}]}
+    report = {"laws": laws, "laws_again": None, "verdict": verdict, "effects": found, "leads": []}
+    return answer.judge(report, None)
 
-    late = ("reaction_delay", "inertia")
-    assert by_sumo._called(effect("memory", "lasting_time_gap"), ("driver_heterogeneity",)) == (
-        "driver_heterogeneity"
+
+def test_what_is_right_to_say() -> None:
+    pillar = Answer(right=("obstacle",), allowed=("anticipation",))
+    assert said(pillar, ("obstacle",))["right"]
+    assert said(pillar, ("anticipation",), ("attraction", "obstacle"))["right"]
+    assert not said(pillar, ("anticipation",))["right"]
+    assert not said(pillar, verdict="unknown")["right"]
+    assert said(pillar, ("obstacle",), ("drift",))["false"] == ["drift"]
+    assert not said(pillar, ("obstacle",), ("drift",))["right"]
+    late = Answer(right=("reaction_delay", "inertia"), unknown=True)
+    assert said(late, ("multi_anticipation", "inertia"))["names"] == ["inertia"]
+    assert said(late, ("inertia",))["right"]
+    assert said(late, verdict="unknown")["right"]
+    assert not said(late, verdict="none")["right"]
+    own = Answer(first=("idm",), right=("driver_heterogeneity",))
+    assert said(own, ("memory", "lasting_time_gap"))["right"]
+    assert said(own, ("memory", "inertia"))["false"] == ["memory"]
+    assert said(own)["law_right"]
+    assert not said(Answer(first=("krauss",)))["law_right"]
+    assert said(Answer(), verdict="none")["right"]
+
+
+def test_the_nearest_law_is_judged_and_the_last_ranking() -> None:
+    report: dict[str, Any] = {
+        "laws": {"ranking": [{"name": "gipps"}]}, "laws_again": {"ranking": [{"name": "krauss"}]},
+        "verdict": "unknown", "effects": [], "leads": [],
+    }  # fmt: skip
+    zone = {"name": "speed_zone", "alternatives": []}
+    found = Answer(first=("krauss",), right=("speed_zone",)).judge(
+        report, {"verdict": "named", "effects": [zone], "leads": [{"name": "inertia"}]}
     )
-    assert by_sumo._called(effect("memory", "inertia"), ()) == "memory"
-    assert by_sumo._called(effect("multi_anticipation", "inertia"), late) == "inertia"
-
-
-def test_what_is_said_of_people() -> None:
-    scene = by_jupedsim.SCENES["gcfm_pillar"]
-    laws = {"ranking": [{"name": "gcfm"}]}
-
-    def said(*effects: tuple[str, ...]) -> dict[str, Any]:
-        found = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
-        report = {
-            "laws": laws,
-            "laws_again": None,
-            "verdict": "named",
-            "effects": found,
-            "leads": [],
-        }
-        return by_jupedsim.judged("gcfm_pillar", 1, scene, report, None, 0.0)
-
-    assert said(("obstacle",))["right"]
-    assert said(("anticipation",), ("attraction", "obstacle"))["right"]
-    assert not said(("anticipation",))["right"]
-    assert said(("drift",))["false"] == ["drift"]
-    assert said()["right"] is False
+    assert found["first"] == "krauss"
+    assert found["law_right"]
+    assert found["right"]
+    assert (found["verdict"], found["asked_verdict"]) == ("named", "unknown")
+    assert (found["names"], found["asked_names"], found["leads"]) == (
+        ["speed_zone"], [], ["inertia"],
+    )  # fmt: skip
 
 
 def test_the_page(tmp_path: Path) -> None:
