@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -72,6 +73,7 @@ def run(
             _insert(extra + (inject([*given, *extra]) if inject else []), first=True)
     except NNodeError as error:
         end(error)
+    GlobalHydra.instance().clear()  # of a job that has forked this process
     with _out_of_sight():
         hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_task(job))()
     World().part()
