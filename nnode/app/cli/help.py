@@ -53,8 +53,9 @@ def help_text(name: str, conf: Path, *, _root_: DictConfig) -> str:
     config = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
     plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
     parts.append("\n".join(_options(_root_, plain)))
-    place = _row("hydra.run.dir=FOLDER", f"folder of the results; without it {hydra.run.dir}")
-    parts.append("\n".join(["Running", place, *(_row(*flag) for flag in _FLAGS.items())]))
+    place = re.sub(r"\d{4}(-\d\d){2}_\d\d(-\d\d){2}", "TIME", hydra.run.dir)
+    flags = {"hydra.run.dir=FOLDER": f"folder of the results; without it {place}", **_FLAGS}
+    parts.append("\n".join(["Running", *(_row(*flag) for flag in flags.items())]))
     return "\n\n".join(parts).replace("$", "$$")
 
 
