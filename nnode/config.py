@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
 
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
@@ -217,5 +217,10 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
 def register() -> None:
     """Make all schemas known to Hydra; harmless when repeated."""
     store = ConfigStore.instance()
-    for (group, name), node in SCHEMAS.items():
+    for (group, name), schema in SCHEMAS.items():
+        node = OmegaConf.structured(schema)
+        for key in node:
+            if OmegaConf.get_type(node, key) is dict:
+                # so that data.columns.time=t can be typed without the plus that Hydra asks for
+                OmegaConf.set_struct(node[key], False)
         store.store(group=group, name=name, node=node)

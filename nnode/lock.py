@@ -16,13 +16,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from nnode.errors import FolderInUseError
 from nnode.files import PARTIAL, disk_words
-
-try:
-    import fcntl
-except ImportError:  # pragma: no cover - Windows has no such locks, and goes without
-    fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +31,8 @@ _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
 
 _REST = re.compile(rf"\..+\.\d+\{PARTIAL}")
 
-#: Locks by process and folder: file descriptor and how often it was taken.
-_held: dict[tuple[int, Path], list[int]] = {}
+#: Locks of this process by folder; one that was forked holds none.
+_held: dict[tuple[int, Path], FileLock] = {}
 
 
 def take(folder: Path) -> None:
@@ -49,13 +46,31 @@ def take(folder: Path) -> None:
     """
     key = os.getpid(), folder.resolve()
     if key in _held:
-        _held[key][1] += 1
+        _held[key].acquire()
         return
     with disk_words(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = _locked(folder)
-        if descriptor is not None:
-            _held[key] = [descriptor, 1]
+        # a moment, for a file that its holder removes just now
+        lock = FileLock(key[1] / LOCK, timeout=0.1, thread_local=False, fallback_to_soft=False)
+        try:
+            lock.acquire()
+        except Timeout:
+            holder = ""
+            with suppress(OSError):
+                holder = (folder / LOCK).read_text(errors="replace")
+            raise FolderInUseError(
+                f"another run works in {folder} ({holder or 'it does not say which'}); wait for "
+                "its end, or choose another folder with hydra.run.dir="
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            log.warning("%s cannot be locked (%s): use it for one run at a time", folder, error)
+        else:
+            _held[key] = lock
+            since = time.strftime("%Y-%m-%d %H:%M:%S")
+            words = f"process {os.getpid()} on {socket.gethostname()}, since {since}"
+            (folder / LOCK).write_text(words)
         for path in folder.rglob(f".*{PARTIAL}"):
             if _REST.fullmatch(path.name):
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
@@ -66,12 +81,12 @@ def give(folder: Path) -> None:
     key = os.getpid(), folder.resolve()
     if key not in _held:
         return
-    _held[key][1] -= 1
-    if _held[key][1] == 0:
-        descriptor = _held.pop(key)[0]
+    lock = _held[key]
+    if lock.lock_counter == 1:
+        del _held[key]
         with suppress(OSError):  # while it is still held: a later one makes a new file
             (folder / LOCK).unlink()
-        os.close(descriptor)
+    lock.release()
 
 
 @contextmanager
@@ -86,32 +101,3 @@ def alone(folder: Path) -> Iterator[None]:
         yield
     finally:
         give(folder)
-
-
-def _locked(folder: Path) -> int | None:
-    """A locked descriptor of the folder's lock file; None where there are no locks."""
-    path = folder / LOCK
-    while fcntl is not None:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            # not inherited by processes that are forked, so that none of them can outlive it
-            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = os.read(descriptor, 200).decode(errors="replace").strip()
-            os.close(descriptor)
-            if error.errno in _NO_LOCKS:
-                log.warning("%s cannot be locked (%s): use it for one run at a time", folder, error)
-                return None
-            raise FolderInUseError(
-                f"another run works in {folder} ({holder or 'it does not say which'}); wait for "
-                "its end, or choose another folder with hydra.run.dir="
-            ) from None
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
-                os.ftruncate(descriptor, 0)
-                since = time.strftime("%Y-%m-%d %H:%M:%S")
-                words = f"process {os.getpid()} on {socket.gethostname()}, since {since}"
-                os.write(descriptor, words.encode())
-                return descriptor
-        os.close(descriptor)  # it was given back, and removed, between opening and locking
-    return None  # pragma: no cover

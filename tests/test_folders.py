@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.app.conftest import composed
+
 ROOT = Path(__file__).parents[1]
 PAGES = ("runs/README.md", "data/README.md")
 
@@ -35,12 +37,11 @@ def test_the_page_is_committed_and_nothing_else_of_the_folder(page: str) -> None
 
 def test_every_folder_that_a_script_writes_to_is_listed() -> None:
     pages = {page.partition("/")[0]: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
-    for config in (ROOT / "conf").glob("*.yaml"):
-        for line in config.read_text(encoding="utf-8").splitlines():
-            _, found, place = line.partition("dir: ")
-            top, _, rest = place.strip(' "}').partition("/")
-            if found and top in pages:
-                assert f"`{rest.partition('/')[0]}/" in pages[top], line
+    for script in (ROOT / "scripts").glob("*.py"):
+        settings = composed(script.stem).hydra
+        for place in (settings.run.dir, settings.sweep.dir):
+            top, _, rest = place.partition("/")
+            assert f"`{rest.partition('/')[0]}/" in pages[top], place
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")

@@ -15,8 +15,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.runs import RESULT
 from nnode.app.cli.saved import merge_saved, path_given, saved_groups
-from nnode.app.cli.sweep import RESULT
 from nnode.app.evaluate import choose
 from nnode.app.training import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint

@@ -10,8 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import calibrated
 from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.runs import RESULT
 from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
-from nnode.app.cli.sweep import RESULT
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver, check, model_of, trainer_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint

@@ -88,7 +88,7 @@ class DataOptions:
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop
-    # auto | sequence | global: whether one identifier in two sequences of a recording is one agent
+    # whether one identifier in two sequences of a recording is one agent
     agents: Agents = Agents.auto
     split: SplitOptions = field(default_factory=SplitOptions)
     loader: LoaderOptions = field(default_factory=LoaderOptions)

@@ -10,11 +10,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig
 
+from benchmarks.config import register
 from nnode.data.synthetic import demo_data
 from tests.app.forked import Forks
 
 ROOT = Path(__file__).resolve().parents[2]
+CONF = ROOT / "conf"
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -33,6 +38,20 @@ def examples(words: str) -> list[str]:
     lines = [line.strip() for line in joined.splitlines() if "scripts/" in line]
     commands = [line for line in lines if re.match(r"(python|torchrun) ", line)]
     return [re.sub(r"\s+", " ", line) for line in commands]
+
+
+def composed(name: str, *words: str) -> DictConfig:
+    """The configuration that a command line gives; of a sweep that of its first run."""
+    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    first = [
+        f"{o.get_key_element()}={next(o.sweep_iterator())}" if o.is_sweep_override() else text
+        for text, o in zip(
+            overrides, OverridesParser.create().parse_overrides(overrides), strict=True
+        )
+    ]
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(name, first, return_hydra_config=True)
 
 
 def environment() -> dict[str, str]:

@@ -136,11 +136,9 @@ def typed(order: dict[str, Any]) -> None:
 def main() -> None:
     for module in LOADED:
         importlib.import_module(module)
-    from nnode.app.cli.run import check_overrides
-    from nnode.config import register
+    from tests.app.conftest import composed
 
-    register()
-    check_overrides([], ROOT / "conf", "train")  # the children share what Hydra looks up once
+    composed("train")  # the children share what Hydra looks up once
     gc.collect()
     gc.freeze()
     children: dict[int, Child] = {}

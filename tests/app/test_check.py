@@ -47,7 +47,7 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
         (["file=$T/junk.csv"], "is no text"),
         (["file=$T/junk.csv", "domain=sea"], "domain=sea: expected traffic, crowd, or null"),
         (["file=$T/junk.csv", "frame_rate=-1"], "frame_rate=-1.0: expected a positive number"),
-        ([], "file is not set"),
+        ([], "Missing mandatory value: file"),
     ],
 )
 def test_what_cannot_be_looked_at_is_told_in_a_line(

@@ -14,16 +14,14 @@ import pandas as pd
 import pytest
 
 from nnode.app import discover as app
-from nnode.app.cli.run import check_overrides
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.config import register
 from nnode.data.options import EsimasOptions, TableOptions
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report import page
 from nnode.errors import ConfigError
-from tests.app.conftest import ROOT, Script
+from tests.app.conftest import Script, composed
 from tests.app.forked import Forks
 from tests.discover import stand_in
 from tests.discover.recorded import ALPHA, ZONE, corridor, lane
@@ -190,25 +188,9 @@ def test_a_signal_leaves_no_half_report(forks: Forks, run: Path, tmp_path: Path)
     assert left <= {"data", ".hydra", ".lock", "discover.log"}
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (["discover.efects=[inertia]"], r"did you mean discover\.effects"),
-        (["discover.page=perhaps"], "discover.page=perhaps is refused"),
-        (["model=line"], r"model=line is unknown.*did you mean lin"),
-        (["discover.max_effects=many"], "expected a whole number"),
-    ],
-)
-def test_a_wrong_option_is_refused_in_words(given: list[str], message: str) -> None:
-    register()
-    with pytest.raises(ConfigError, match=message):
-        check_overrides(given, ROOT / "conf", "discover")
-
-
 def test_effects_can_be_given_on_the_command_line() -> None:
-    register()
-    given = "model.effects=[{name: relative_speed, kappa: 0.3}]"
-    assert check_overrides([given], ROOT / "conf", "train") == []
+    effects = composed("train", "model.effects=[{name: relative_speed, kappa: 0.3}]").model.effects
+    assert effects == [{"name": "relative_speed", "kappa": 0.3}]
 
 
 def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:

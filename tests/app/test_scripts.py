@@ -215,23 +215,6 @@ def test_resume_refuses_another_problem(script: Script, traffic: Path, tmp_path:
     assert os.path.exists(last)
 
 
-@pytest.mark.parametrize(
-    ("name", "overrides", "key"),
-    [
-        ("evaluate", [], "checkpoint"),
-        ("plot_forces", [], "checkpoint"),
-        ("train", ["data=table", "data.domain=traffic"], "data.path"),
-        ("prepare_data", ["data=table", "data.path=x.csv"], "data.domain"),
-    ],
-)
-def test_a_forgotten_option_is_named(
-    script: Script, tmp_path: Path, name: str, overrides: list[str], key: str
-) -> None:
-    done = script(name, *overrides, f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {key} is not set")
-
-
 def test_resuming_and_evaluating_can_be_swept(
     script: Script, traffic: Path, tmp_path: Path
 ) -> None:

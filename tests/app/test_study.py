@@ -9,18 +9,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from nnode.app import study
-from nnode.app.cli.run import check_overrides
-from nnode.config import register
 from nnode.errors import ConfigError
 from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
-from tests.app.conftest import ROOT
+from tests.app.conftest import composed
 from tests.app.forked import Forks
-
-CONF = ROOT / "conf"
 
 #: The script with another study in the place of the traffic's.
 CODE = """
@@ -35,31 +30,11 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["study=trafic"], "study=trafic is unknown, expected one of crowd, following, traffic"),
-        (["study.qick=true"], r"did you mean study\.quick"),
-        (["study=traffic", "study.horizons=[1]"], r"option study\.horizons is unknown"),
-        (["study=crowd", "study.horizons=[one]"], "expected a number"),
-        (["study.quick=maybe"], "study.quick=maybe is refused"),
-        (["study.restarts=many"], "expected a whole number"),
-    ],
-)
-def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) -> None:
-    register()
-    with pytest.raises(ConfigError, match=message):
-        check_overrides(overrides, CONF, "study")
-
-
-@pytest.mark.parametrize(
     ("name", "kind"), [("traffic", TrafficStudyOptions), ("crowd", CrowdStudyOptions)]
 )
 def test_every_study_composes_in_a_folder_without_time(name: str, kind: type) -> None:
-    register()
-    check_overrides([f"study={name}", "study.quick=true", "study.workers=3"], CONF, "study")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("study", [f"study={name}"], return_hydra_config=True)
-        assert config.hydra.run.dir == f"runs/study/{name}"
+    config = composed("study", f"study={name}", "study.quick=true", "study.workers=3")
+    assert config.hydra.run.dir == f"runs/study/{name}"
     assert isinstance(OmegaConf.to_object(config.study), kind)
     assert name in study.STUDIES
 

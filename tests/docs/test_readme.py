@@ -11,10 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchmarks.config import register
-from nnode.app.cli.flags import read_command_line
-from nnode.app.cli.run import check_overrides
-from tests.app.conftest import examples
+from tests.app.conftest import composed, examples
 from tests.app.following import table
 from tests.discover.platoons import platoons
 from tests.docs.test_tutorials import ROOT, blocks
@@ -32,17 +29,13 @@ MADE = {"model=lin_with_speed_zone", "data=i80"}
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_every_command_has_options_that_exist(page: Path) -> None:
-    register()
     for language, text in blocks(page):
         for command in examples(text) if language == "sh" else []:
             words = shlex.split(command, comments=True)
             place = next(i for i, word in enumerate(words) if word.startswith("scripts/"))
             if "…" in words or MADE & set(words):
                 continue
-            line = read_command_line(words[place + 1 :])
-            check_overrides(
-                line.overrides, ROOT / "conf", Path(words[place]).stem, sweep=line.sweeps
-            )
+            composed(Path(words[place]).stem, *words[place + 1 :])
 
 
 def test_every_link_leads_somewhere() -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.cli.choices import own_groups
 from nnode.app.cli.saved import in_hydra, path_given
 from nnode.config import SCHEMAS
 from nnode.data.prepare import NOT_PREPARATION, made_by, refuse_others
@@ -15,20 +14,19 @@ from nnode.data.store import Store
 from nnode.errors import ConfigError
 
 
-def prepared_group(overrides: list[str], conf: Path, script: str) -> list[str]:
+def prepared_group(overrides: list[str], conf: Path) -> list[str]:
     """The override that chooses a prepared folder's data set, where the user chooses none.
 
     Args:
         overrides: as given by the user.
         conf: the folder of the configuration.
-        script: whose groups count.
 
     Raises:
         ConfigError, DataError: the folder holds no store, or does not say how it was made.
     """
     folder = path_given(overrides, "data.prepared")
     chosen = any(override.partition("=")[0] == "data" for override in overrides)
-    if folder is None or chosen or "data" not in own_groups(conf, script):
+    if folder is None or chosen:
         return []
     return [f"data={_group(_store(folder), conf)}"]
 

@@ -1,31 +1,33 @@
-"""From a command line to a job: composition, checked options, errors in the toolkit's words."""
+"""From a command line to a job, through Hydra; errors of the package in one line each."""
 
 from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
-from collections.abc import Callable
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from nnode.app.cli.flags import read_command_line
 from nnode.app.cli.help import help_text
-from nnode.app.cli.launchers import check_launcher, has_no_part, out_of_sight
-from nnode.app.cli.overrides import check_overrides
 from nnode.app.cli.prepared import prepared_group
-from nnode.app.cli.sweep import failures, record_failure
-from nnode.calibrate.distributed import World, join
+from nnode.app.cli.runs import RESULT, end, failures, say
+from nnode.calibrate.distributed import World, join, started_together
 from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
-from nnode.files import disk_words
+from nnode.files import disk_words, write_json
 from nnode.program import begin, configuration
 from nnode.version import VERSION
 
@@ -49,130 +51,91 @@ def run(
         parallel: whether the job is for all processes that were started together; otherwise
             the first one does it alone.
     """
-    if has_no_part(parallel):
+    if started_together() and not parallel and os.environ["RANK"] != "0":
         return
+    if "--version" in sys.argv[1:]:
+        print(f"nnode {VERSION}")
+        return
+    if {"-h", "--help"} & set(sys.argv) and hasattr(signal, "SIGPIPE"):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # a reader such as head has seen enough
     register()
     # on a full disk the log cannot be written either, which shall not bury the run's own words
     logging.raiseExceptions = False
     begin()
     folder = configuration()
+    OmegaConf.register_new_resolver("nnode_help", partial(help_text, name, folder), replace=True)
     try:
         if parallel:
             join()
         with World().together():
-            given = _arguments(name, folder, inject)
-        with out_of_sight(given):
-            hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(
-                _guarded(job)
-            )()
-            failed = failures()
+            given = [sys.argv[i] for i in _places()]
+            extra = prepared_group(given, folder)
+            _insert(extra + (inject([*given, *extra]) if inject else []), first=True)
     except NNodeError as error:
-        _end(error)
-    except Escape as escape:
-        _end(escape.error)
+        end(error)
+    GlobalHydra.instance().clear()  # of a job that has forked this process
+    with _out_of_sight():
+        hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_task(job))()
     World().part()
-    if failed:
+    if failures():
         sys.exit(1)
 
 
-def _arguments(
-    name: str, folder: Path, inject: Callable[[list[str]], list[str]] | None
-) -> list[str]:
-    """Check the command line and complete it in place; returns its overrides."""
-    if not folder.is_dir():
-        raise ConfigError(
-            f"no configuration folder {folder}; run scripts/{name}.py in place, or install nnode "
-            "again"
-        )
-    line = read_command_line(sys.argv[1:])
-    if "--version" in line.flags:
-        print(f"nnode {VERSION}")
-        sys.exit()
-    given = line.overrides
-    asked = "--help" in line.flags
-    if not asked:
-        extra = prepared_group(given, folder, name)
-        extra += inject([*given, *extra]) if inject is not None else []
-        first = sys.argv.index(given[0], 1) if given else len(sys.argv)
-        sys.argv[first:first] = extra
-        given = extra + given
-    check_launcher(given)
-    free = check_overrides(given, folder, name, sweep=line.sweeps or asked, extra=line.folder)
-    if asked:
-        _show(help_text(given, folder, name, line.folder))
-        sys.exit()
-    # what goes into a mapping that takes any name is added, not only replaced
-    sys.argv[1:] = [f"++{a}" if a in free else a for a in sys.argv[1:]]
-    return read_command_line(sys.argv[1:]).overrides
-
-
-def _show(text: str) -> None:
-    """Print a long text; a reader that has seen enough, such as head, is no error."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _end(error: NNodeError) -> NoReturn:
-    """Say what happened and leave with the exit status that belongs to it.
-
-    What all processes know is said by the first one, and they leave together.
-    """
-    stopped = isinstance(error, Interrupted)
-    world = World()
-    if world.first or not world.agreed:
-        _say(str(error) if stopped else f"error: {error}")
-    if world.agreed:
-        world.part()
-    if isinstance(error, Interrupted):
-        sys.exit(128 + error.signal)
-    sys.exit(2 if isinstance(error, ConfigError) else 1)
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-class Escape(BaseException):
-    """Carries the package's errors through Hydra, which would print its own words for them."""
-
-    def __init__(self, error: NNodeError) -> None:
-        self.error = error
-
-
-def _guarded(job: Job) -> Callable[[DictConfig], None]:
+def _task(job: Job) -> Callable[[DictConfig], None]:
     here = os.getpid()
 
     def task(config: DictConfig) -> None:
         settings = HydraConfig.get()
         folder = Path(settings.runtime.output_dir)
         try:
-            try:
-                with disk_words(folder):
-                    job(config, folder)
-            except OmegaConfBaseException as error:
-                raise ConfigError(_missing(error)) from None
+            with disk_words(folder):
+                job(config, folder)
+        except OmegaConfBaseException as error:
+            failed: NNodeError = ConfigError(str(error).splitlines()[0])
         except NNodeError as error:
-            # a launcher may run the job elsewhere, where only this job can be stopped
-            stopped = isinstance(error, Interrupted) and os.getpid() == here
-            alone = World().size > 1 and not World().agreed
-            if stopped or alone or settings.mode != RunMode.MULTIRUN:
-                if isinstance(error, Interrupted) and settings.mode == RunMode.MULTIRUN:
-                    text = f"{error}\nthe sweep ends here: its later runs were not started"
-                    error = Interrupted(text, error.signal)
-                raise Escape(error) from None
-            # the other jobs of a sweep go on
-            if World().first:
-                _say(f"error in {folder}: {error}")
-            record_failure(folder, str(error))
+            failed = error
+        else:
+            return
+        sweep, world = settings.mode == RunMode.MULTIRUN, World()
+        # a launcher may run the job elsewhere, where only this job can be stopped
+        stopped = isinstance(failed, Interrupted) and os.getpid() == here
+        if stopped or not sweep or (world.size > 1 and not world.agreed):
+            if stopped and sweep:
+                say("the sweep ends here: its later runs were not started")
+            end(failed)
+        # the other jobs of a sweep go on
+        if world.first:
+            say(f"error in {folder}: {failed}")
+        write_json(folder / RESULT, {"error": str(failed)})
 
     return task
 
 
-def _missing(error: OmegaConfBaseException) -> str:
-    """What is wrong with a composed configuration, in one line."""
-    if isinstance(error, MissingMandatoryValue):
-        key = error.full_key or str(error).rpartition(" ")[2]
-        return f"{key} is not set; give it a value with {key}=..."
-    return str(error).splitlines()[0]
+def _places() -> list[int]:
+    """Where the command line has overrides."""
+    return [i for i, a in enumerate(sys.argv) if i and "=" in a and not a.startswith("-")]
+
+
+def _insert(overrides: list[str], *, first: bool = False) -> None:
+    """Put overrides before or behind the user's; Hydra wants all of them side by side."""
+    places = _places() or [len(sys.argv)]
+    place = places[0] if first else places[-1] + 1
+    sys.argv[place:place] = overrides
+
+
+@contextmanager
+def _out_of_sight() -> Iterator[None]:
+    """Silence for all processes but the first, and a folder for Hydra that nobody looks for."""
+    if World().first:
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="nnode-") as folder:
+        places = [
+            f"hydra.run.dir={folder}",
+            f"hydra.sweep.dir={folder}",
+            "hydra.output_subdir=null",
+        ]
+        _insert(places)
+        logging.disable(logging.CRITICAL)
+        warnings.simplefilter("ignore")
+        yield

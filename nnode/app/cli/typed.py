@@ -9,15 +9,14 @@ from typing import Any, cast
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, make_absolute
 from nnode.program import configuration
 
-#: Texts of these characters need no quotes, unless they would be read as something else.
-_PLAIN = re.compile(r"[\w./:+-]*", re.ASCII)
-_NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
-_WORDS = ("null", "true", "false")
 #: What must be escaped in the name of a mapping's entry.
 _SPECIAL = re.compile(r"([\\()\[\]{}:=, \t])")
 
@@ -38,15 +37,11 @@ def literal(value: object) -> str:
     if isinstance(value, int | float):
         return str(value)
     text = str(value)
-    other = not text or text.lower() in _WORDS or _NUMBER.fullmatch(text)
-    if _PLAIN.fullmatch(text) and not other:
-        return text
-    # a quote is escaped, and so is a backslash that would escape one
-    return "'" + re.sub(r"(\\*)('|$)", _escaped, text) + "'"
-
-
-def _escaped(match: re.Match[str]) -> str:
-    return 2 * match[1] + ("\\'" if match[2] else "")
+    try:
+        read = OverridesParser.create().parse_override(f"key={text}").value()
+    except HydraException:
+        read = None
+    return text if read == text else QuotedString(text, Quote.single).with_quotes()
 
 
 def _name(key: object) -> str:

@@ -25,7 +25,6 @@ from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.paths import Path, Smoother
 from nnode.discover.residuals.engine import Rate, fill, row_of, runge_kutta
 from nnode.discover.residuals.fit import ROUGH, Fit, limits, refine
-from nnode.discover.residuals.traced import recorded
 from nnode.errors import SimulationError
 from nnode.models.system import Crowd, System
 
@@ -99,12 +98,11 @@ def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np
         push[: len(kick), b, : kick.shape[1]] = torch.from_numpy(kick)
     y = together.initial(batch)
     rest = torch.zeros(*y.shape[:-1], y.shape[-1] - 4, dtype=torch.float64)
-    graph = recorded(lambda t, y: together(t, y, scene), [torch.zeros((), dtype=torch.float64), y])
 
     def rate_from(k: int) -> Rate:
         def rate(t: Tensor, y: Tensor) -> Tensor:
             kick = torch.lerp(push[k], push[k + 1], t / batch.dt - k)
-            return graph(t, y) + torch.cat([torch.zeros_like(kick), kick, rest], -1)
+            return together(t, y, scene) + torch.cat([torch.zeros_like(kick), kick, rest], -1)
 
         return rate
 

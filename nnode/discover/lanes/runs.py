@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +13,6 @@ from nnode.data.sequence import Batch
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.motion import Leaders, Motion
 from nnode.discover.residuals.engine import runs_of
-from nnode.discover.residuals.traced import recorded
 from nnode.models.scene import Scene
 from nnode.models.system import System, initial_with
 
@@ -84,31 +82,26 @@ class _ByFormula:
 
 
 class _ByCode:
-    """States are ``(R, B, N, W)``; a step is recorded, so that it is arithmetic alone."""
+    """States are ``(R, B, N, W)``."""
 
     def __init__(self, system: System, rows: Tensor, scene: Scene) -> None:
         self._system, self._scene = system, scene
         self._parameters = runs_of(system, rows)
         self._rows = rows
-        self._graph: Callable[..., Tensor] | None = None
 
     def start(self, batch: Batch) -> Tensor:
         return _starts(self._system, self._rows, batch).clone()
 
+    @torch.no_grad()
     def rate(self, t: float, y: Tensor) -> Tensor:
-        time, values = torch.tensor(t, dtype=torch.float64), list(self._parameters.values())
-        if self._graph is None:
-            self._graph = recorded(self._every, [time, y, *values])
-        return self._graph(time, y, *values)
+        time = torch.tensor(t, dtype=torch.float64)
+
+        def one(parameters: dict[str, Tensor], y: Tensor) -> Tensor:
+            found: Tensor = functional_call(self._system, parameters, (time, y, self._scene))
+            return found
+
+        found: Tensor = torch.func.vmap(one)(self._parameters, y)
+        return found
 
     def states(self, found: list[Tensor]) -> Tensor:
         return torch.stack(found, 1)
-
-    def _every(self, t: Tensor, y: Tensor, *values: Tensor) -> Tensor:
-        own = dict(zip(self._parameters, values, strict=True))
-        found: Tensor = torch.func.vmap(self._one, in_dims=(0, None, 0))(own, t, y)
-        return found
-
-    def _one(self, parameters: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
-        found: Tensor = functional_call(self._system, parameters, (t, y, self._scene))
-        return found

@@ -13,15 +13,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from benchmarks.config import register
-from nnode.app.cli import launchers, sweep
-from nnode.app.cli.run import check_overrides
+from nnode.app.cli import runs
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.errors import ConfigError
-from tests.app.conftest import ROOT, environment
+from nnode.files import write_json
+from tests.app.conftest import ROOT, composed, environment
 from tests.app.forked import Forks
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
@@ -119,15 +116,15 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("override", "message"),
+    ("override", "message", "status"),
     [
-        ("model=n5", "error: model=n5 is unknown"),  # before the work starts
-        ("solver.dt=0.03", "error: solver.dt=0.03 s does not divide"),  # with the data
+        ("resume=none.pt", "error: no checkpoint none.pt", 1),  # before the work starts
+        ("solver.dt=0.03", "error: solver.dt=0.03 s does not divide", 2),  # with the data
     ],
 )
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
 def test_an_error_is_said_once(
-    forks: Forks, prepared: str, tmp_path: Path, override: str, message: str
+    forks: Forks, prepared: str, tmp_path: Path, override: str, message: str, status: int
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
@@ -136,7 +133,7 @@ def test_an_error_is_said_once(
     places = [{**place, "RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
     run = f"hydra.run.dir={tmp_path / 'run'}"
     first, second = forks.together("train", [*problem(override), prepared, run], places)
-    assert first.returncode == second.returncode == 2
+    assert first.returncode == second.returncode == status
     assert (first.stderr + second.stderr).count(message) == 1
 
 
@@ -166,51 +163,25 @@ def test_runs_of_a_sweep_in_other_processes(
 def test_failures_of_an_earlier_sweep_in_the_same_folder_do_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweep, "_sweep", {})  # commands that later tests fork inherit this process
+    monkeypatch.setattr(runs, "_sweep", {})  # commands that later tests fork inherit this process
     config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
+    failed = {"error": "of an earlier sweep"}
     for job in ("0", "1"):
-        sweep.record_failure(tmp_path / job, "of an earlier sweep")
-    sweep.SweepFailures().on_multirun_start(config)
-    assert sweep.failures() == []
-    sweep.write_json(tmp_path / "0" / "result.json", {"summary": {}})
-    assert sweep.failures() == []
-    sweep.record_failure(tmp_path / "1", "of this one")
-    sweep.record_failure(tmp_path / "a" / "b", "of this one")
-    assert sweep.failures() == [tmp_path / "1", tmp_path / "a" / "b"]
+        write_json(tmp_path / job / "result.json", failed)
+    callback = runs.Runs()
+    callback.on_multirun_start(config)
+    assert runs.failures() == []
+    write_json(tmp_path / "0" / "result.json", {"summary": {"model": "lin"}})
+    assert runs.failures() == []
+    for job in ("1", "a/b"):
+        write_json(tmp_path / job / "result.json", {"error": "of this one"})
+    assert runs.failures() == [tmp_path / "1", tmp_path / "a" / "b"]
+    callback.on_multirun_end(config)
+    assert pd.read_csv(tmp_path / "sweep.csv")["model"].tolist()[0] == "lin"
 
 
-@pytest.fixture
-def configurations() -> Path:
-    register()
-    return ROOT / "conf"
-
-
-def test_slurm_launcher_gives_submitit_what_it_knows(configurations: Path) -> None:
-    with initialize_config_dir(str(configurations), version_base="1.3"):
-        config = compose("train", ["hydra/launcher=slurm"], return_hydra_config=True)
-    settings = config.hydra.launcher
+def test_slurm_launcher_gives_submitit_what_it_knows() -> None:
+    settings = composed("train", "hydra/launcher=slurm").hydra.launcher
     assert settings._target_.endswith("submitit_launcher.SlurmLauncher")
     assert settings.cpus_per_task == 1
     assert settings.max_num_timeout == 0  # of the plugin's own
-
-
-@pytest.mark.parametrize("name", ["train", "evaluate", "plot_forces", "prepare_data", "benchmark"])
-def test_every_script_knows_its_failed_runs(configurations: Path, name: str) -> None:
-    with initialize_config_dir(str(configurations), version_base="1.3"):
-        config = compose(name, [], return_hydra_config=True)
-    targets = [callback._target_ for callback in config.hydra.callbacks.values()]
-    assert {"nnode.app.cli.sweep.SweepTable", "nnode.app.cli.sweep.SweepFailures"} & set(targets)
-
-
-def test_launchers_are_checked_like_every_group(configurations: Path) -> None:
-    check_overrides(["hydra/launcher=cores", "hydra.launcher.n_jobs=2"], configurations, "train")
-    with pytest.raises(ConfigError, match=r"hydra/launcher=core is unknown.*did you mean cores"):
-        check_overrides(["hydra/launcher=core"], configurations, "train")
-
-
-def test_a_launcher_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    launchers.check_launcher(["hydra/launcher=slurm"])
-    monkeypatch.setattr(launchers, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"hydra/launcher=slurm needs .* 'nnode\[cluster\]'"):
-        launchers.check_launcher(["hydra/launcher=slurm"])
-    launchers.check_launcher(["hydra/launcher=basic"])

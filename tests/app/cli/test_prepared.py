@@ -15,11 +15,10 @@ from nnode.app.cli.prepared import prepared_group
 from nnode.data.options import EsimasOptions, TableOptions, WalkwayOptions
 from nnode.data.prepare import prepare
 from nnode.errors import DataError
-from tests.app.conftest import ROOT
+from tests.app.conftest import CONF
 from tests.discover.recorded import lane
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
-CONF = ROOT / "conf"
 
 
 def numbered(path: Path) -> pd.DataFrame:
@@ -107,19 +106,18 @@ def test_the_group_is_the_folder_s(raw: Path, table: Path, tmp_path: Path) -> No
     given = [f"data.prepared={tmp_path}"]
     options = EsimasOptions(name="demo_traffic", recording="demo", source=str(raw))
     prepare(options, tmp_path)
-    assert prepared_group(given, CONF, "train") == ["data=demo_traffic"]
-    assert prepared_group([*given, "data=esimas"], CONF, "train") == []
-    assert prepared_group(given, CONF, "study") == []
-    assert prepared_group(["data.prepared=null"], CONF, "train") == []
+    assert prepared_group(given, CONF) == ["data=demo_traffic"]
+    assert prepared_group([*given, "data=esimas"], CONF) == []
+    assert prepared_group(["data.prepared=null"], CONF) == []
     options.name = "mine"  # a name of the user's own, or that of another reader's data
     prepare(options, tmp_path)
-    assert prepared_group(given, CONF, "train") == ["data=esimas"]
+    assert prepared_group(given, CONF) == ["data=esimas"]
     options.name = "table"
     prepare(options, tmp_path)
-    assert prepared_group(given, CONF, "train") == ["data=esimas"]
-    assert prepared_group([f"data.prepared={table}"], CONF, "discover") == ["data=table"]
+    assert prepared_group(given, CONF) == ["data=esimas"]
+    assert prepared_group([f"data.prepared={table}"], CONF) == ["data=table"]
     with pytest.raises(DataError, match="holds no prepared data"):
-        prepared_group([f"data.prepared={raw}"], CONF, "train")
+        prepared_group([f"data.prepared={raw}"], CONF)
 
 
 def test_every_reader_has_a_group_of_its_usual_name() -> None:

@@ -1,87 +1,139 @@
-"""Every option is checked before work starts, and errors name the nearest valid one."""
+"""Command lines compose, wrong ones are refused before work starts, and errors have a status."""
 
 from __future__ import annotations
 
+import os
+import re
 import shlex
 from pathlib import Path
 
 import pytest
-from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from nnode.app.cli.flags import read_command_line
-from nnode.app.cli.run import check_overrides
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver
 from nnode.calibrate.options import FusedOptions
-from nnode.config import register
 from nnode.errors import ConfigError
 from nnode.solvers import FusedSolver
-
-CONF = Path(__file__).resolve().parents[3] / "conf"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _schemas() -> None:
-    register()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["trainer.max_epoch=3"], "did you mean trainer.max_epochs"),
-        (["modle=lin"], "did you mean model"),
-        (["trainr.max_epochs=3"], r"did you mean trainer\.max_epochs"),
-        (["~trainer.patience"], "cannot be deleted"),
-        (["model=n5"], "expected one of a2, a4, a10, cfsm, esf, formula, fvdm"),
-        (["model=lin_schema"], "model=lin_schema is unknown"),
-        (["model.hidden=3"], "option model.hidden is unknown"),
-        (["model=n4", "model.hiden=3"], "did you mean model.hidden"),
-        (["trainer.max_epochs=three"], "expected a whole number"),
-        (["data.faults=kep"], "expected one of drop, keep, error; did you mean keep"),
-        (["data.split.heldout=abc"], "expected a number"),
-        (["+trainer.extra=1"], "option trainer.extra is unknown"),
-        (["solver=fused", "solver.gradient=adjoint"], "option solver.gradient is unknown"),
-        (["solver=fused", "solver.cutoff=far"], "expected a number"),
-        (["solver.gradient=exact"], "expected one of adjoint, discrete"),
-        (["model=lin,n5"], "model=n5 is unknown"),
-        (["seed=1,two"], "seed=two is refused"),
-        (["data.recording=[1-1_1"], r"a \[ or \] is missing"),
-    ],
-)
-def test_a_wrong_option_is_refused_in_words(overrides: list[str], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        check_overrides(overrides, CONF, "train")
+from tests.app.conftest import CONF, Script, composed
 
 
 @pytest.mark.parametrize(
     "overrides",
     [
-        [],
         ["model=n4", "model.hidden=7", "model.box=1.0", "model.leader=measured"],
-        ["data.recording=1-1_1"],
         ["data.recording=[1-1_1,1-1_2]", "hydra.run.dir=/tmp/x"],
-        ["model=lin,log,n2", "seed=1,2,3"],
-        ["model=sf", "data=hermes", "optimizer=adam", "optimizer.lr=0.1", "seed=range(3)"],
+        ["model=lin,log,n2", "seed=range(3)"],
+        ["model=sf", "data=hermes", "optimizer=adam", "optimizer.lr=0.1"],
         ["data=vehicles", "data.path='a, b.csv'", "data.columns={vehicle: id, x: pos}"],
         ["data=sumo", "data.path=fcd.xml.gz", "data.lane=e_0", "data.kinds={car: car}"],
         ["data=highd", "data.path=01_tracks.csv", "data.window=null"],
         ["model=sf", "data=jupedsim", "data.path=a.sqlite", "data.view=[1,9]"],
         ["model=sf", "data=pedpy", "data.path=a.txt", "data.geometry=a.wkt"],
         ["experiment=paper_traffic", "solver.dt=null"],
-        ["solver=fused", "solver.cutoff=2.5"],
-        ["solver=fused", "solver.cutoff=null", "solver.cutoff_error=1e-6"],
+        ["solver=fused", "solver.cutoff=2.5", "solver.cutoff_error=1e-6"],
+        ["hydra/launcher=cores", "hydra.launcher.n_jobs=2"],
+        ["hydra/launcher=slurm", "hydra.launcher.partition=all"],
     ],
 )
-def test_right_options_pass(overrides: list[str]) -> None:
-    check_overrides(overrides, CONF, "train")
+def test_right_options_compose(overrides: list[str]) -> None:
+    composed("train", *overrides)
+
+
+def test_a_mapping_takes_any_name() -> None:
+    overrides = ["data=vehicles", "data.path=a.csv", "data.columns.time=t"]
+    assert composed("train", *overrides).data.columns == {"time": "t"}
 
 
 @pytest.mark.parametrize("name", ["train", "prepare_data", "evaluate", "plot_forces", "export"])
-def test_every_group_of_every_script_composes(name: str) -> None:
-    for group in ("model", "data", "optimizer", "solver", "experiment"):
+def test_every_choice_of_every_command_composes(name: str) -> None:
+    for group in composed(name).hydra.runtime.choices:
         for file in sorted((CONF / group).glob("*.yaml")):
-            if name == "train" or group == "data":
-                check_overrides([f"{group}={file.stem}"], CONF, name)
+            composed(name, f"{group}={file.stem}")
+
+
+#: What is typed, what the answer has to contain, and the exit status.
+WRONG = [
+    # Hydra's own words
+    ("train modle=lin", r"Could not override 'modle'", 1),
+    ("train model=linn", r"Could not find 'model/linn'\s+Available options in 'model'", 1),
+    ("train trainer.max_epoch=3", "Key 'max_epoch' not in 'TrainerOptions'", 1),
+    ("train solver=fused solver.gradient=adjoint", "Key 'gradient' not in 'FusedOptions'", 1),
+    ("train trainer.max_epochs=three", "'three' .* could not be converted to Integer", 1),
+    ("train data.faults=kep", r"expected one of \[drop, keep, error\]", 1),
+    ("train model=lin,log", "To sweep over it, add --multirun", 1),
+    ("train --max_epochs=3", "unrecognized arguments: --max_epochs=3", 2),
+    ("train --config-dir /nowhere", "'/nowhere' not found", 1),
+    # the package's, each in one line
+    ("export", "error: Missing mandatory value: run\n$", 2),
+    ("train data=table", "error: Missing mandatory value: data.domain\n$", 2),
+    ("discover discover.alpha=2", "error: .*must lie between 0 and 1", 2),
+    ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?", 2),
+    ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz", 2),
+    ("benchmark_discovery 'benchmark_discovery.arms=[foo]'", "expected one of single, pair", 2),
+    ("train data=table data.domain=traffic data.path=none.csv", "error: .*csv is not there", 1),
+    ("train data=table data.domain=traffic data.path=$T/empty.csv", "is empty", 1),
+    ("train data=table data.domain=traffic data.path=$T/odd.csv", "Expected 2 fields in line 3", 1),
+    ("prepare_data data=sumo data.path=$T/junk.pt", "no whole XML document", 1),
+    ("train resume=$T", "error: no checkpoint .*; it is a folder", 1),
+    ("train resume=$T/junk.pt", "error: .*cannot be opened as a checkpoint", 1),
+    ("plot_forces checkpoint=[]", "give one or more paths", 2),
+    ("drive run=none sumo=a.sumocfg vehicles=car", "no checkpoint none/checkpoints/best.pt", 1),
+    ("train hydra.run.dir=$T/head.csv", "error: .*cannot be used as a folder", 1),
+    ("train -m seed=1,2 hydra.sweep.dir=$T/head.csv", "error: .*cannot be used as a folder", 1),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wrong")
+    (folder / "empty.csv").write_text("")
+    (folder / "head.csv").write_text("sequence,time,agent,x\n")
+    (folder / "odd.csv").write_text("sequence,time\n1,2\n3,4,5,6\n")
+    (folder / "junk.pt").write_bytes(b"junk")
+    return folder
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="starts many commands")
+@pytest.mark.parametrize(("line", "words", "status"), WRONG, ids=[line for line, *_ in WRONG])
+def test_a_wrong_command_is_answered_in_words(
+    script: Script, files: Path, tmp_path: Path, line: str, words: str, status: int
+) -> None:
+    name, *arguments = shlex.split(line.replace("$T", str(files)))
+    if "hydra." not in line:
+        arguments.append(f"hydra.run.dir={tmp_path}")
+    done = script(name, *arguments)
+    assert re.search(words, done.stderr)
+    assert done.returncode == status
+    assert "Traceback" not in done.stderr
+    if done.stderr.startswith("error: "):
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_file_that_may_not_be_read(script: Script, tmp_path: Path) -> None:
+    """The superuser may read all, so the system's refusal is staged."""
+    path = tmp_path / "shut.csv"
+    path.write_text("sequence,time,agent,x\n0,0,a,0\n")
+    code = f"""
+import sys
+from nnode.app.commands.train import main
+from nnode.program import running
+def shut(event, arguments):
+    if event == "open" and arguments[0] == {str(path)!r}:
+        raise PermissionError(13, "Permission denied", {str(path)!r})
+sys.addaudithook(shut)
+running("train")
+main()
+"""
+    options = ["data=table", "data.domain=traffic", f"data.path={path}"]
+    done = script(code, *options, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"error: {path} cannot be read")
+    assert "Permission denied" in done.stderr
+
+
+def test_what_is_shown_in_place_of_working(script: Script) -> None:
+    assert "hidden: 4" in script("train", "--cfg", "job", "model=n4", "-p", "model").stdout
+    assert re.fullmatch(r"nnode \d+\.\d+\.\d+\n", script("train", "--version").stdout)
 
 
 def test_the_fused_solver_gets_its_options() -> None:
@@ -95,16 +147,6 @@ def test_the_fused_solver_gets_its_options() -> None:
         build_solver(FusedOptions(cutoff_error=2))
 
 
-def test_flags_are_told_from_overrides() -> None:
-    line = read_command_line(["-m", "model=lin,log", "-c", "job", "seed=1", "--package=model"])
-    assert line.overrides == ["model=lin,log", "seed=1"]
-    assert line.flags == {"--multirun": "", "--cfg": "job", "--package": "model"}
-    assert line.sweeps
-
-
-@pytest.mark.parametrize("place", ["runs/a/last.pt", "/tmp/a folder/it's/last.pt", "a,b=[c]/x.pt"])
-def test_overrides_can_be_pasted_into_a_shell(place: str) -> None:
-    typed = shlex.split(shell_override("resume", place))
-    (override,) = OverridesParser.create().parse_overrides(typed)
-    value = override.value()
-    assert getattr(value, "text", value) == place
+def test_what_is_printed_can_be_pasted_into_a_shell() -> None:
+    for place in ("runs/a/last.pt", "/tmp/a folder/it's/last.pt", "a,b=[c]/x.pt"):
+        assert composed("train", *shlex.split(shell_override("resume", place))).resume == place

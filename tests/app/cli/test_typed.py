@@ -12,13 +12,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 
-from nnode.app.cli.run import check_overrides
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, literal, shell_override
 from nnode.app.discover import _commands
 from nnode.config import register
-
-CONF = Path(__file__).resolve().parents[3] / "conf"
+from tests.app.conftest import CONF, composed
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -55,9 +53,7 @@ def plain(value: Any) -> Any:
 
 
 def test_what_a_job_has_left_behind_is_not_taken() -> None:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = compose("train", ["model=n4", "data=table"], return_hydra_config=True)
-    HydraConfig.instance().set_config(composed)
+    HydraConfig.instance().set_config(composed("train", "model=n4", "data=table"))
     try:
         assert group_defaults("data", "table")["name"] == "table"
         assert "groups" not in plain_config(OmegaConf.create({"data": {}}))
@@ -83,10 +79,10 @@ def test_only_what_differs_is_told() -> None:
     ("model", "given"),
     [
         ("lin", ["data=sumo", "data.path='a folder/fcd.xml.gz'", "data.window=null",
-                 "data.lane=[e_0,e_1]", "++data.kinds={DEFAULT_VEHTYPE: car}"]),
+                 "data.lane=[e_0,e_1]", "data.kinds={DEFAULT_VEHTYPE: car}"]),
         ("lin", ["data=highd", "data.path=01_tracks.csv", "data.lane=2", "data.split.heldout=0.3"]),
         ("lin", ["data=vehicles", "data.path=cars.csv", "data.position_unit=ft",
-                 "++data.columns={vehicle: Vehicle_ID, time: t}"]),
+                 "data.columns={vehicle: Vehicle_ID, time: t}"]),
         ("sf", ["data=table", "data.path=walk.csv", "data.domain=crowd", "data.walls=w.csv"]),
         ("sf", ["data=jupedsim", "data.path=run.sqlite", "data.t_seq=2", "data.velocity=central"]),
         ("sf", ["data=pedpy", r"data.path='it\'s.txt'", "data.geometry=area.wkt", "data.unit=cm",
@@ -109,9 +105,7 @@ def test_the_printed_training_reads_the_data_of_the_diagnosis(
             HydraConfig.instance().cfg = None
     python, script, *overrides = shlex.split(command)
     assert [python, script] == ["python", "scripts/train.py"]
-    free = check_overrides(overrides, CONF, "train")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        read = compose("train", [f"++{o}" if o in free else o for o in overrides])
+    read = composed("train", *overrides)
     assert OmegaConf.to_container(read.data, resolve=True, enum_to_str=True) == told["data"]
 
 

@@ -8,13 +8,11 @@ from typing import Any
 
 import pytest
 
-from benchmarks.config import register
 from benchmarks.torture.fuzz import fuzz
 from benchmarks.torture.jobs import jobs
 from benchmarks.torture.report import Row, keep
 from benchmarks.torture.targets import Target
-from nnode.app.cli.overrides import check_overrides
-from tests.app.conftest import ROOT, Script
+from tests.app.conftest import Script, composed
 
 
 def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
@@ -83,9 +81,8 @@ def test_a_reader_that_misbehaves_is_a_loss(
 
 
 def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
-    register()
     for job in jobs(tmp_path / "raw"):
-        check_overrides(job.first, ROOT / "conf", job.name)
+        composed(job.name, *job.first)
 
 
 def test_only_a_training_with_a_checkpoint_is_gone_on_with(tmp_path: Path) -> None:

@@ -1,0 +1,123 @@
+"""The folders of runs and sweeps: taken before Hydra writes there, and gathered at the end.
+
+Runs of a sweep may be other processes, on other machines: only the files that they write tell.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pandas as pd
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from nnode.calibrate.distributed import World
+from nnode.calibrate.interrupt import Interrupted
+from nnode.errors import ConfigError, NNodeError
+from nnode.files import PARTIAL, disk_words
+from nnode.lock import give, take
+
+#: What a run came to, or why it failed; in its folder.
+RESULT = "result.json"
+
+#: Bytes that Hydra writes of a configuration, at most.
+ROOM = 1 << 15
+
+#: The sweep of this process: its folder, and the results that lay there before.
+_sweep: dict[Path, dict[Path, int]] = {}
+
+
+class Runs(Callback):
+    """Refuses a second run, or a second sweep, where one is at work; gathers a sweep's results."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        _take(Path(config.hydra.run.dir))
+
+    def on_run_end(self, config: DictConfig, **kwargs: Any) -> None:
+        give(Path(config.hydra.run.dir))
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        _take(folder)
+        _sweep[folder] = _results(folder)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        if World().first:
+            _table(folder)
+        give(folder)
+
+
+def end(error: NNodeError) -> NoReturn:
+    """Say what happened and leave with the exit status that belongs to it.
+
+    What all processes know is said by the first one, and they leave together.
+    """
+    world, stopped = World(), isinstance(error, Interrupted)
+    if world.first or not world.agreed:
+        say(str(error) if stopped else f"error: {error}")
+    if world.agreed:
+        world.part()
+    if isinstance(error, Interrupted):
+        sys.exit(128 + error.signal)
+    sys.exit(2 if isinstance(error, ConfigError) else 1)
+
+
+def say(text: str) -> None:
+    """Tell the user at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def failures() -> list[Path]:
+    """Folders of the runs of this process's sweep that failed, wherever they ran."""
+    return [
+        path.parent
+        for folder, before in _sweep.items()
+        for path, changed in sorted(_results(folder).items())
+        if before.get(path) != changed and "error" in json.loads(path.read_text())
+    ]
+
+
+def _take(folder: Path) -> None:
+    path = folder / f".room.{os.getpid()}{PARTIAL}"
+    try:
+        take(folder)
+        # fail here, where there are words for it, and not where Hydra writes its configuration
+        with disk_words(folder):
+            try:
+                path.write_bytes(bytes(ROOM))
+            finally:
+                path.unlink(missing_ok=True)
+    except NNodeError as error:
+        end(error)
+
+
+def _results(folder: Path) -> dict[Path, int]:
+    """Result files of the runs in a folder, with the time of their last change."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob(RESULT)}
+
+
+def _table(folder: Path) -> None:
+    """Write the results of trainings into ``sweep.csv`` and print them; nothing for other jobs."""
+    results = {
+        path.parent.name: json.loads(path.read_text())
+        for path in sorted(folder.glob(f"*/{RESULT}"), key=lambda p: (len(str(p)), p))
+    }
+    if not any("summary" in result for result in results.values()):
+        return
+    rows = [{"run": run, **result.pop("summary", result)} for run, result in results.items()]
+    table = pd.DataFrame(rows)
+    table.to_csv(folder / "sweep.csv", index=False)
+    shown = Table(title=f"{len(rows)} runs")
+    for column in table.columns:
+        shown.add_column(str(column))
+    for row in table.itertuples(index=False):
+        shown.add_row(*(f"{v:.5g}" if isinstance(v, float) else str(v) for v in row))
+    Console(width=None if os.isatty(1) else 160).print(shown)
+    print(f"table: {folder / 'sweep.csv'}")
