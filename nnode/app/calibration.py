@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from nnode.app.training import straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.options import Pooling
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import Source
@@ -26,6 +27,8 @@ from nnode.plots import force_figure
 
 if TYPE_CHECKING:
     from xarray import Dataset
+
+    from nnode.calibrate.pooling import Own
 
 _BOUND = {"low": "lower", "high": "upper"}
 
@@ -48,6 +51,10 @@ class Calibration:
         epoch: of the best evaluation.
         n_iter: epochs that were done.
         history: one row per evaluation: epoch, costs, parameters.
+        own: parameters of each training sequence's own, where ``trainer.pooling`` asks for them: a
+            row per sequence with ``cost_pool`` (with those of all) and ``cost``; None: there are
+            none. ``parameters`` and ``cost_heldout`` are the pool's, which another sequence gets.
+        pooling: how they came about, and costs of second halves, which they were not calibrated on.
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
@@ -65,6 +72,8 @@ class Calibration:
     epoch: int
     n_iter: int
     history: pd.DataFrame
+    own: pd.DataFrame | None
+    pooling: dict[str, Any]
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
@@ -81,6 +90,14 @@ class Calibration:
         if np.isfinite(self.cost_heldout):
             before, after = self.heldout_start, self.cost_heldout
             lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        if self.pooling:
+            lines.append(
+                f"with parameters of each sequence's own ({self.pooling['kind']}): "
+                f"{self.pooling['cost']:.4g} {unit} where they were calibrated; on second halves, "
+                "calibrated on the first: "
+                + ", ".join(f"{k} {v:.4g}" for k, v in self.pooling["second_half"].items())
+                + f" {unit}; another sequence gets the pool's parameters"
+            )
         short = short_names(map(str, self.parameters.index))
         rows = _rows(self.parameters).items()
         return "\n".join([*lines, *(f"{short[name]} = {_words(row)}" for name, row in rows)])
@@ -156,6 +173,8 @@ class Calibration:
                 for name, row in _rows(self.correlation).items()
             }
             found["clusters"] = self.clusters
+        if self.own is not None:
+            found["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
         found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
         rows_of = self.history.to_dict("records")
         # what was not measured at an evaluation is not there
@@ -191,7 +210,7 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
-    found = _intervals(trainer, model, store)
+    found, own = _by_tangents(trainer, model, store)
     known = found.get("parameters", {})
     # an epoch of an older checkpoint that was resumed may know its parameters by other names
     rows = {
@@ -214,28 +233,39 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         epoch=trainer.best_epoch,
         n_iter=trainer.epoch,
         history=pd.DataFrame(history),
+        own=None if own is None else own.table,
+        pooling=own.facts if own else {},
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
     )
 
 
-def _intervals(trainer: Trainer, model: System, store: Source) -> dict[str, Any]:
-    """Intervals of the best parameters, of models that have exact tangents; otherwise none."""
+def _by_tangents(
+    trainer: Trainer, model: System, store: Source
+) -> tuple[dict[str, Any], Own | None]:
+    """Intervals of the best parameters, and each sequence's own where they are asked for, of models
+    that have exact tangents; otherwise none."""
     if not isinstance(trainer.optimizer, GaussNewton):
-        return {}
+        return {}, None
     # compiled code takes a second to import
     from nnode.calibrate.gauss_newton import TangentCost
     from nnode.calibrate.intervals import intervals
+    from nnode.calibrate.pooling import own_parameters
     from nnode.solvers.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
+    options, solver = trainer.options, trainer.solver
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))
     double = copy.deepcopy(model).double()
-    cost = TangentCost(double, batch, trainer.solver, trainer.options.cost)
-    return intervals(cost, cost.row(double), clusters(store.index)[indices])
+    cost = TangentCost(double, batch, solver, options.cost)
+    found = intervals(cost, cost.row(double), clusters(store.index)[indices])
+    if options.pooling is Pooling.pooled:
+        return found, None
+    chosen, seed = [store[i] for i in indices], int(trainer.provenance.config["seed"])
+    return found, own_parameters(options.pooling, double, chosen, solver, options.cost, seed)
 
 
 def _row(value: float, unit: str, known: dict[str, Any] | None) -> tuple[Any, ...]:
