@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from nnode.app.training import straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.calibrate.optimizers.damped import GaussNewton
-from nnode.calibrate.options import Pooling
+from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import Source
@@ -55,6 +56,8 @@ class Calibration:
             row per sequence with ``cost_pool`` (with those of all) and ``cost``; None: there are
             none. ``parameters`` and ``cost_heldout`` are the pool's, which another sequence gets.
         pooling: how they came about, and costs of second halves, which they were not calibrated on.
+        start_speeds: ``kind``, measured, smoothed or fitted; of fitted ones ``sequences``, first
+            speeds (m/s) by vehicle, and their root mean square ``change`` from the data's.
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
@@ -74,6 +77,7 @@ class Calibration:
     history: pd.DataFrame
     own: pd.DataFrame | None
     pooling: dict[str, Any]
+    start_speeds: dict[str, Any]
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
@@ -90,6 +94,11 @@ class Calibration:
         if np.isfinite(self.cost_heldout):
             before, after = self.heldout_start, self.cost_heldout
             lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        if "change" in self.start_speeds:
+            lines.append(
+                f"first speeds of training sequences are fitted: {self.start_speeds['change']:.3g} "
+                "m/s (root mean square) from the data's, which held-out sequences start with"
+            )
         if self.pooling:
             lines.append(
                 f"with parameters of each sequence's own ({self.pooling['kind']}): "
@@ -175,6 +184,7 @@ class Calibration:
             found["clusters"] = self.clusters
         if self.own is not None:
             found["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
+        found["start_speeds"] = self.start_speeds
         found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
         rows_of = self.history.to_dict("records")
         # what was not measured at an evaluation is not there
@@ -210,7 +220,7 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
-    found, own = _by_tangents(trainer, model, store)
+    found, own, speeds = _by_tangents(trainer, model, store)
     known = found.get("parameters", {})
     # an epoch of an older checkpoint that was resumed may know its parameters by other names
     rows = {
@@ -235,6 +245,7 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         history=pd.DataFrame(history),
         own=None if own is None else own.table,
         pooling=own.facts if own else {},
+        start_speeds=speeds,
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
@@ -243,29 +254,38 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
 
 def _by_tangents(
     trainer: Trainer, model: System, store: Source
-) -> tuple[dict[str, Any], Own | None]:
-    """Intervals of the best parameters, and each sequence's own where they are asked for, of models
-    that have exact tangents; otherwise none."""
+) -> tuple[dict[str, Any], Own | None, dict[str, Any]]:
+    """Intervals of the best parameters, each sequence's own and first speeds where they are asked
+    for, of models that have exact tangents; otherwise none."""
+    config, options = trainer.provenance.config, trainer.options
+    speeds: dict[str, Any] = {"kind": config["data"].get("start_speeds", "measured")}
     if not isinstance(trainer.optimizer, GaussNewton):
-        return {}, None
+        return {}, None, speeds
     # compiled code takes a second to import
-    from nnode.calibrate.gauss_newton import TangentCost
     from nnode.calibrate.intervals import intervals
     from nnode.calibrate.pooling import own_parameters
+    from nnode.calibrate.start_speeds import COSTS
     from nnode.solvers.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
-    options, solver = trainer.options, trainer.solver
+    make = partial(COSTS[options.start_speeds], solver=trainer.solver, convention=options.cost)
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))
     double = copy.deepcopy(model).double()
-    cost = TangentCost(double, batch, solver, options.cost)
-    found = intervals(cost, cost.row(double), clusters(store.index)[indices])
-    if options.pooling is Pooling.pooled:
-        return found, None
-    chosen, seed = [store[i] for i in indices], int(trainer.provenance.config["seed"])
-    return found, own_parameters(options.pooling, double, chosen, solver, options.cost, seed)
+    cost = make(double, batch)
+    row = cost.row(double)
+    found, own = intervals(cost, row, clusters(store.index)[indices]), None
+    if options.start_speeds is StartSpeeds.fitted:
+        by_name = cost.starts(row)
+        first = {s.name: s.velocity()[0, :, 0] for s in (store[i] for i in indices)}
+        away = np.concatenate([(np.array(v) - first[n])[:-1] for n, v in by_name.items()])
+        change = float(np.sqrt(np.mean(away**2)))
+        speeds = {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
+    if options.pooling is not Pooling.pooled:
+        chosen = [store[i] for i in indices]
+        own = own_parameters(options.pooling, double, chosen, make, int(config["seed"]))
+    return found, own, speeds
 
 
 def _row(value: float, unit: str, known: dict[str, Any] | None) -> tuple[Any, ...]:

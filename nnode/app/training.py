@@ -20,6 +20,7 @@ from nnode.calibrate.options import (
     FusedOptions,
     Pooling,
     SolverOptions,
+    StartSpeeds,
     TorchdiffeqOptions,
     TrainerOptions,
 )
@@ -149,6 +150,11 @@ def trainer_of(
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)
+    if options.start_speeds is StartSpeeds.fitted and optimizer_options.name != "gauss_newton":
+        raise ConfigError(
+            "trainer.start_speeds=fitted needs optimizer=gauss_newton, found "
+            f"optimizer={optimizer_options.name}; data.start_speeds=smoothed takes any"
+        )
     seed = int(config.seed)
     _check_same_data(store, checkpoint)
     parts = _parts(store, data, checkpoint)

@@ -51,6 +51,13 @@ class Pooling(str, Enum):
     shrunk = "shrunk"
 
 
+class StartSpeeds(str, Enum):
+    """First speeds of training sequences: the data's, or fitted beside the parameters."""
+
+    given = "given"
+    fitted = "fitted"
+
+
 @dataclass
 class SolverOptions:
     """What all solvers share."""
@@ -95,6 +102,8 @@ class TrainerOptions:
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
     pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
+    # given | fitted: first speeds of training sequences, those of the data, or the best ones
+    start_speeds: StartSpeeds = StartSpeeds.given
     dtype: Precision = Precision.float64
     device: Device = Device.auto
     threads: int | None = None  # of torch; null: one for traffic, all cores for crowds

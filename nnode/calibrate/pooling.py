@@ -8,7 +8,7 @@ what lasts of a driver, and the unit in which shrinkage counts deviations from t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass
 from typing import Any
@@ -16,16 +16,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton import TangentCost, alone, pooled
 from nnode.calibrate.intervals import at_bounds
 from nnode.calibrate.options import Pooling
 from nnode.data.clusters import clusters, folds, index_of
-from nnode.data.sequence import Sequence, collate
+from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models.system import System
 from nnode.models.term import short_names
-from nnode.solvers.fused.engine import FusedSolver
 
 #: Factors on the penalty by which sequences are drawn towards the pool.
 STRENGTHS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
@@ -164,10 +162,13 @@ class Own:
 
 
 def own_parameters(
-    kind: Pooling, system: System, sequences: list[Sequence], solver: FusedSolver,
-    convention: Convention, seed: int,
+    kind: Pooling, system: System, sequences: list[Sequence],
+    cost: Callable[[System, Batch], TangentCost], seed: int,
 ) -> Own:  # fmt: skip
     """Parameters of every sequence's own, of a model with the pool's.
+
+    Args:
+        cost: what is minimised of some sequences.
 
     The strength of shrinkage is relative to the mean cost of the pool, and the one that predicts
     second halves best.
@@ -186,9 +187,7 @@ def own_parameters(
             "sequences (data.window), more of them, or trainer.pooling=pooled"
         )
     parts = [[s.part(low, low + 0.5) for s in sequences] for low in (0.0, 0.5)]
-    whole, first, second = (
-        TangentCost(system, collate(part), solver, convention) for part in (sequences, *parts)
-    )
+    whole, first, second = (cost(system, collate(part)) for part in (sequences, *parts))
     row = whole.start
     starts = scattered(whole, [row] * STARTS, seed)
     at_pool = whole.costs(row)

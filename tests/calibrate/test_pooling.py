@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +11,7 @@ import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
+from nnode.calibrate.gauss_newton import TangentCost
 from nnode.calibrate.options import Pooling
 from nnode.calibrate.pooling import Own, own_parameters
 from nnode.data.sequence import Sequence
@@ -26,7 +29,8 @@ def own(kind: Pooling, sequences: list[Sequence]) -> Own:
     with torch.no_grad():
         for name, value in HELLY.items():
             getattr(system.terms[0], name).fill_(value)
-    return own_parameters(kind, system, sequences, FusedSolver(), Convention.spacing, seed=0)
+    cost = partial(TangentCost, solver=FusedSolver(), convention=Convention.spacing)
+    return own_parameters(kind, system, sequences, cost, seed=0)
 
 
 def test_drivers_who_differ_are_told_apart() -> None:
