@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from nnode.app.training import straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import Source
@@ -26,6 +28,8 @@ from nnode.plots import force_figure
 
 if TYPE_CHECKING:
     from xarray import Dataset
+
+    from nnode.calibrate.pooling import Own
 
 _BOUND = {"low": "lower", "high": "upper"}
 
@@ -48,6 +52,12 @@ class Calibration:
         epoch: of the best evaluation.
         n_iter: epochs that were done.
         history: one row per evaluation: epoch, costs, parameters.
+        own: parameters of each training sequence's own, where ``trainer.pooling`` asks for them: a
+            row per sequence with ``cost_pool`` (with those of all) and ``cost``; None: there are
+            none. ``parameters`` and ``cost_heldout`` are the pool's, which another sequence gets.
+        pooling: how they came about, and costs of second halves, which they were not calibrated on.
+        start_speeds: ``kind``, measured, smoothed or fitted; of fitted ones ``sequences``, first
+            speeds (m/s) by vehicle, and their root mean square ``change`` from the data's.
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
@@ -65,6 +75,9 @@ class Calibration:
     epoch: int
     n_iter: int
     history: pd.DataFrame
+    own: pd.DataFrame | None
+    pooling: dict[str, Any]
+    start_speeds: dict[str, Any]
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
@@ -81,6 +94,19 @@ class Calibration:
         if np.isfinite(self.cost_heldout):
             before, after = self.heldout_start, self.cost_heldout
             lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        if "change" in self.start_speeds:
+            lines.append(
+                f"first speeds of training sequences are fitted: {self.start_speeds['change']:.3g} "
+                "m/s (root mean square) from the data's, which held-out sequences start with"
+            )
+        if self.pooling:
+            lines.append(
+                f"with parameters of each sequence's own ({self.pooling['kind']}): "
+                f"{self.pooling['cost']:.4g} {unit} where they were calibrated; on second halves, "
+                "calibrated on the first: "
+                + ", ".join(f"{k} {v:.4g}" for k, v in self.pooling["second_half"].items())
+                + f" {unit}; another sequence gets the pool's parameters"
+            )
         short = short_names(map(str, self.parameters.index))
         rows = _rows(self.parameters).items()
         return "\n".join([*lines, *(f"{short[name]} = {_words(row)}" for name, row in rows)])
@@ -156,6 +182,9 @@ class Calibration:
                 for name, row in _rows(self.correlation).items()
             }
             found["clusters"] = self.clusters
+        if self.own is not None:
+            found["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
+        found["start_speeds"] = self.start_speeds
         found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
         rows_of = self.history.to_dict("records")
         # what was not measured at an evaluation is not there
@@ -191,7 +220,7 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
-    found = _intervals(trainer, model, store)
+    found, own, speeds = _by_tangents(trainer, model, store)
     known = found.get("parameters", {})
     # an epoch of an older checkpoint that was resumed may know its parameters by other names
     rows = {
@@ -214,28 +243,49 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         epoch=trainer.best_epoch,
         n_iter=trainer.epoch,
         history=pd.DataFrame(history),
+        own=None if own is None else own.table,
+        pooling=own.facts if own else {},
+        start_speeds=speeds,
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
     )
 
 
-def _intervals(trainer: Trainer, model: System, store: Source) -> dict[str, Any]:
-    """Intervals of the best parameters, of models that have exact tangents; otherwise none."""
+def _by_tangents(
+    trainer: Trainer, model: System, store: Source
+) -> tuple[dict[str, Any], Own | None, dict[str, Any]]:
+    """Intervals of the best parameters, each sequence's own and first speeds where they are asked
+    for, of models that have exact tangents; otherwise none."""
+    config, options = trainer.provenance.config, trainer.options
+    speeds: dict[str, Any] = {"kind": config["data"].get("start_speeds", "measured")}
     if not isinstance(trainer.optimizer, GaussNewton):
-        return {}
+        return {}, None, speeds
     # compiled code takes a second to import
-    from nnode.calibrate.gauss_newton import TangentCost
     from nnode.calibrate.intervals import intervals
+    from nnode.calibrate.pooling import own_parameters
+    from nnode.calibrate.start_speeds import COSTS
     from nnode.solvers.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
+    make = partial(COSTS[options.start_speeds], solver=trainer.solver, convention=options.cost)
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))
     double = copy.deepcopy(model).double()
-    cost = TangentCost(double, batch, trainer.solver, trainer.options.cost)
-    return intervals(cost, cost.row(double), clusters(store.index)[indices])
+    cost = make(double, batch)
+    row = cost.row(double)
+    found, own = intervals(cost, row, clusters(store.index)[indices]), None
+    if options.start_speeds is StartSpeeds.fitted:
+        by_name = cost.starts(row)
+        first = {s.name: s.velocity()[0, :, 0] for s in (store[i] for i in indices)}
+        away = np.concatenate([(np.array(v) - first[n])[:-1] for n, v in by_name.items()])
+        change = float(np.sqrt(np.mean(away**2)))
+        speeds = {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
+    if options.pooling is not Pooling.pooled:
+        chosen = [store[i] for i in indices]
+        own = own_parameters(options.pooling, double, chosen, make, int(config["seed"]))
+    return found, own, speeds
 
 
 def _row(value: float, unit: str, known: dict[str, Any] | None) -> tuple[Any, ...]:

@@ -37,9 +37,12 @@ RESUMABLE = (
     "trainer.max_epochs",
     "trainer.patience",
     "trainer.min_delta",
+    "trainer.pooling",
     "trainer.save_every",
     "trainer.figure_every",
 )
+#: Table of each sequence's own parameters, of ``trainer.pooling``.
+OWN = "own_parameters.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
 
 
@@ -92,6 +95,9 @@ def train(config: DictConfig, folder: Path) -> None:
         "best checkpoint": trainer.best_path,
         "last checkpoint": trainer.last_path,
     }
+    if result.own is not None:
+        paths["own parameters"] = folder / OWN
+        result.own.to_csv(folder / OWN, index=False)
     write_json(folder / RESULT, result.plain({name: str(path) for name, path in paths.items()}))
     print(result.summary())
     for what, path in paths.items():

@@ -18,7 +18,9 @@ from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
 from nnode.calibrate.options import (
     FusedOptions,
+    Pooling,
     SolverOptions,
+    StartSpeeds,
     TorchdiffeqOptions,
     TrainerOptions,
 )
@@ -147,6 +149,12 @@ def trainer_of(
     optimizer_options: Any = OmegaConf.to_object(config.optimizer)
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
+    _check_pooling(options.pooling, model, optimizer_options.name)
+    if options.start_speeds is StartSpeeds.fitted and optimizer_options.name != "gauss_newton":
+        raise ConfigError(
+            "trainer.start_speeds=fitted needs optimizer=gauss_newton, found "
+            f"optimizer={optimizer_options.name}; data.start_speeds=smoothed takes any"
+        )
     seed = int(config.seed)
     _check_same_data(store, checkpoint)
     parts = _parts(store, data, checkpoint)
@@ -217,6 +225,30 @@ def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> S
         sorted(places[name] for name in known.get(part, [])) for part in PARTS
     )
     return Split(train=train, heldout=heldout, dropped=dropped, mode="checkpoint", note="as it was")
+
+
+def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
+    """Say where parameters of each sequence's own have no place.
+
+    Raises:
+        ConfigError: people, another optimiser, or a network.
+    """
+    if kind is Pooling.pooled:
+        return
+    asked = f"trainer.pooling={kind.value}"
+    if model.domain != "traffic":
+        raise ConfigError(
+            f"{asked} is one of laws of lanes, and {model.domain} models have parameters that all "
+            "share: everybody in a sequence meets everybody; take trainer.pooling=pooled"
+        )
+    if optimizer != "gauss_newton":
+        raise ConfigError(f"{asked} needs optimizer=gauss_newton, found optimizer={optimizer}")
+    physical = sum(value.numel() for value, _ in model.physical().values())
+    if sum(p.numel() for p in model.parameters() if p.requires_grad) > physical:
+        raise ConfigError(
+            f"{asked} has no place in a network: one sequence does not determine its weights; "
+            "take a law such as idm without model.network, or trainer.pooling=pooled"
+        )
 
 
 def _check_same_data(store: Source, checkpoint: Checkpoint | None) -> None:

@@ -102,6 +102,10 @@ class TangentCost:
             own[name].view(-1)[place] = float(value)
         return system
 
+    def starts(self, rows: np.ndarray) -> dict[str, list[float]]:
+        """First speeds (m/s) that were fitted, by sequence and vehicle; none here."""
+        return {}
+
     def physical(self, name: str) -> bool:
         """Whether a symbol is that of a parameter with a physical meaning, no weight."""
         return self._places[name][2] is None
@@ -125,6 +129,10 @@ class TangentCost:
 
     def __call__(self, rows: np.ndarray) -> Curved:
         """Costs and their derivatives, of parameters ``(P,)`` or ``(B, P)``."""
+        return self._curved(*self._slopes(rows))
+
+    def _slopes(self, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """Errors, which count, and their derivatives ``(P, ...)``."""
         x, v, dx, dv = self._simulated(rows, tuple(self.names))
         away, seen = self._errors(x, v)
         if self.convention not in FOLLOWING:
@@ -139,7 +147,9 @@ class TangentCost:
                 change = changed_gap(own, measured, self.convention)
                 (factor,) = torch.autograd.grad(change.sum(), own)
             slope = torch.where(seen, torch.diff(dx) * factor, 0.0)
-        away, slope = away.double(), slope.double()
+        return away.double(), seen, slope.double()
+
+    def _curved(self, away: Tensor, seen: Tensor, slope: Tensor) -> Curved:
         number = seen.sum((0, -1)).clamp(min=1).double()
         pull = torch.einsum("kbn,pkbn->bp", away, slope)
         bend = torch.einsum("pkbn,qkbn->bpq", slope, slope)

@@ -16,6 +16,12 @@ LEVEL = 0.95
 VAGUE = 0.5
 
 
+def at_bounds(cost: TangentCost, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(P,)`` twice: which parameters are at the lower and at the upper end of what is allowed."""
+    near = 1e-6 * (1 + np.abs(row))
+    return row <= cost.low + near, row >= cost.high - near
+
+
 def intervals(cost: TangentCost, row: np.ndarray, cluster: np.ndarray) -> dict[str, Any]:
     """What calibrated parameters of a lane are, and what the data say of them.
 
@@ -32,8 +38,7 @@ def intervals(cost: TangentCost, row: np.ndarray, cluster: np.ndarray) -> dict[s
         ``correlation``: address to address to correlation; ``clusters``: their number. Weights of
         networks are not listed.
     """
-    near = 1e-6 * (1 + np.abs(row))
-    low, high = row <= cost.low + near, row >= cost.high - near
+    low, high = at_bounds(cost, row)
     free = ~(low | high)
     weights = np.full(len(cost.batch), 1 / len(cost.batch))
     covariance = sandwich(cost(row), weights, cluster, free)

@@ -39,6 +39,25 @@ class Monitor(str, Enum):
     heldout = "heldout"
 
 
+class Pooling(str, Enum):
+    """Whether all sequences share their parameters, see :mod:`nnode.calibrate.pooling`.
+
+    ``pooled``: they do. ``alone``: each has its own. ``shrunk``: each has its own, drawn towards
+    those of all as far as this predicts better.
+    """
+
+    pooled = "pooled"
+    alone = "alone"
+    shrunk = "shrunk"
+
+
+class StartSpeeds(str, Enum):
+    """First speeds of training sequences: the data's, or fitted beside the parameters."""
+
+    given = "given"
+    fitted = "fitted"
+
+
 @dataclass
 class SolverOptions:
     """What all solvers share."""
@@ -82,6 +101,9 @@ class TrainerOptions:
     patience: int | None = None  # evaluations without progress before stopping; null never
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
+    pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
+    # given | fitted: first speeds of training sequences, those of the data, or the best ones
+    start_speeds: StartSpeeds = StartSpeeds.given
     dtype: Precision = Precision.float64
     device: Device = Device.auto
     threads: int | None = None  # of torch; null: one for traffic, all cores for crowds

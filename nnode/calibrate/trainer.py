@@ -236,7 +236,7 @@ class Trainer:
         if isinstance(self.optimizer, GaussNewton):
             if self.world.size > 1 or batch is None:
                 raise ConfigError("optimizer=gauss_newton works in one process only")
-            self.optimizer.attach(self.solver, batch, self.options.cost)
+            self.optimizer.attach(self.solver, batch, self.options.cost, self.options.start_speeds)
             self.sum += self.optimizer.step()
             self.model.project_()
             return
@@ -275,7 +275,8 @@ class Trainer:
             if self.world.size == 1 and self._guard.requested is not None:
                 raise _StopRequested
             if batch is not None:
-                yield batch.to(self.device, self.dtype)
+                moved, told = batch.to(self.device, self.dtype), self.optimizer
+                yield told.started(moved) if isinstance(told, GaussNewton) else moved
 
     def _evaluate(self, logbook: Logbook | None, minibatch: float | None = None) -> None:
         row: dict[str, float] = {"epoch": float(self.epoch), "step": float(self.step)}

@@ -73,6 +73,19 @@ def clusters(index: Index, gap: float = GAP, *, together: bool = False) -> np.nd
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
+def folds(label: np.ndarray, number: int, seed: int) -> np.ndarray:
+    """``(S,)`` the fold in which each sequence is held out; a cluster is in one fold.
+
+    Args:
+        label: ``(S,)`` clusters, counted from 0.
+    """
+    count = int(label.max()) + 1
+    order = np.random.default_rng(seed).permutation(count)
+    fold = np.empty(count, dtype=int)
+    fold[order] = np.arange(count) % number
+    return fold[label]
+
+
 def _near(
     index: Index, members: list[int], gap: float, touching: bool
 ) -> Iterable[tuple[int, int]]:

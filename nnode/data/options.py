@@ -56,6 +56,13 @@ class Velocity(str, Enum):
     backward = "backward"
 
 
+class Starts(str, Enum):
+    """Speeds with which simulations start: the data's own, or those of :mod:`nnode.data.smooth`."""
+
+    measured = "measured"
+    smoothed = "smoothed"
+
+
 @dataclass
 class SplitOptions:
     """Which sequences are held out from training."""
@@ -90,6 +97,9 @@ class DataOptions:
     faults: Faults = Faults.drop
     # whether one identifier in two sequences of a recording is one agent
     agents: Agents = Agents.auto
+    # measured | smoothed: speeds at the first sample, with which simulations start; smoothed: of
+    # parabolas through the first 2 s of positions
+    start_speeds: Starts = Starts.measured
     split: SplitOptions = field(default_factory=SplitOptions)
     loader: LoaderOptions = field(default_factory=LoaderOptions)
 

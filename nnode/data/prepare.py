@@ -28,6 +28,7 @@ from nnode.data.options import (
     NgsimOptions,
     OpenAccOptions,
     PairOptions,
+    Starts,
     SumoOptions,
     TableOptions,
     VehicleTableOptions,
@@ -48,6 +49,7 @@ from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
 from nnode.data.readers.vehicles import read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence
+from nnode.data.smooth import start_smoothed
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError, DataError
 from nnode.progress import Stages
@@ -185,6 +187,8 @@ def judge(
     agents, notes = identify(sequences, domain, options.agents)
     unique = {s.name: replace(s, agents=own) for s, own in zip(sequences, agents, strict=True)}
     kept = [unique[s.name] for s in kept]
+    if options.start_speeds is Starts.smoothed:
+        kept = [start_smoothed(s) for s in kept]
     if notes:
         more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
         log.info("%s%s; data.agents decides by hand", notes[0], more)

@@ -122,6 +122,17 @@ class Sequence:
         step = np.diff(self.x, axis=0) / self.dt
         return np.concatenate([step, step[-1:]])
 
+    def part(self, first: float, last: float) -> Sequence:
+        """The samples of a share of the sequence, from ``first`` to ``last``."""
+        low, high = (int(share * self.n_samples) for share in (first, last))
+        return replace(
+            self,
+            name=f"{self.name}/{low}-{high}",
+            time=self.time[low:high],
+            x=self.x[low:high],
+            v=None if self.v is None else self.v[low:high],
+        )
+
     def select(self, keep: np.ndarray) -> Sequence:
         """The same sequence with only the agents where ``keep`` (N booleans) holds."""
         index = np.flatnonzero(keep)

@@ -139,6 +139,8 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
         model = {
             "strength_neighbor_repulsion": own["a"],
             "range_neighbor_repulsion": own["D"],
+            "strength_geometry_repulsion": fixed["a_w"],
+            "range_geometry_repulsion": fixed["D_w"],
         }
         content = _content("CollisionFreeSpeedModel", model, agent)
         found.notes.append("radius: l/2")
@@ -151,16 +153,17 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
             "strength_neighbor_repulsion": own["eta"],
             "max_neighbor_interaction_distance": fixed["r_c"],
             "max_neighbor_repulsion_force": fixed["f_max"],
+            "strength_geometry_repulsion": fixed["eta_w"],
+            "max_geometry_interaction_distance": fixed["r_c"],
+            "max_geometry_repulsion_force": fixed["f_w"],
         }
         content = _content("GeneralizedCentrifugalForceModel", model, agent)
         found.missing.append(
             "the distance of bodies: JuPedSim takes points of the ellipses that are not on the "
-            "line between the centres, and interpolates the force where they are near or far"
+            "line between the centres, and interpolates the force where they are near or far, "
+            "from walls as well"
         )
     found.notes.append(_PACE)
-    found.missing.append(
-        "walls: the law has none, and those of JuPedSim push as they do by default"
-    )
     found.missing += effects_without(system, 1, set())
     return found, content
 

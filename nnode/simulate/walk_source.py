@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from types import ModuleType
 
-from nnode.laws.crowd import OTHERS, POINTS, CrowdLaw
+from nnode.laws.crowd import OTHERS, POINTS, SEEN, WALLS, CrowdLaw
 from nnode.laws.expression import Expr, below, symbols
 from nnode.laws.text import plain
 from nnode.simulate import _math, _polynomials
@@ -42,7 +42,7 @@ OPTIONS = dict(error_model="numpy", fastmath={{"contract", "nsz", "reassoc"}})
 _DRIVE = '''
 
 @njit(**OPTIONS)
-def acceleration(x, y, vx, vy, seen, meets, wall, points, have, q):
+def acceleration(x, y, vx, vy, seen, meets, wall, points, edge, edges, have, q):
 {zeros}    for j in range(seen.shape[1]):
         dx, dy, dvx, dvy = x - seen[0, j], y - seen[1, j], vx - seen[2, j], vy - seen[3, j]
         {people} = of_others(dx, dy, dvx, dvy, vx, vy, have, q)
@@ -50,24 +50,32 @@ def acceleration(x, y, vx, vy, seen, meets, wall, points, have, q):
         {places} = of_points(
             x - wall[0, j], y - wall[1, j], wall[2, j], wall[3, j], vx, vy, have, q
         )
-{touched}    return rate({state}{sums}have, q)
+{touched}    for j in range(edges):
+        {sides} = of_walls(
+            x - edge[0, j], y - edge[1, j], edge[2, j], edge[3, j], vx, vy, have, q
+        )
+{sided}    return rate({state}{sums}have, q)
 
 
 @njit(nogil=True, cache=True, **OPTIONS)
-def accelerations(state, person, moment, row, others, window, meets, wall, points, have, q):
+def accelerations(
+    state, person, moment, row, others, window, meets, wall, points, edge, edges, have, q
+):
     """``(S, 2)`` m/s² of states ``(S, 4)`` of some people at some moments with some rows."""
     out = np.empty((state.shape[0], 2))
     for s in range(state.shape[0]):
         p = person[s]
         out[s, 0], out[s, 1] = acceleration(
             state[s, 0], state[s, 1], state[s, 2], state[s, 3], others[moment[s], window[p]],
-            meets[p], wall[p], points[p], have[p], q[row[s]],
+            meets[p], wall[p], points[p], edge[p], edges[p], have[p], q[row[s]],
         )
     return out
 
 
 @njit(nogil=True, cache=True, **OPTIONS)
-def advance(now, before, after, out, n, h, others, window, meets, wall, points, have, q):
+def advance(
+    now, before, after, out, n, h, others, window, meets, wall, points, edge, edges, have, q
+):
     """Step ``n`` of ``h`` s by the classical Runge-Kutta method, from states ``now`` to ``out``.
 
     Both are ``(R, P, 4)``. Accelerations ``before`` and ``after`` ``(R, P, 2)`` are added, linear
@@ -84,7 +92,7 @@ def advance(now, before, after, out, n, h, others, window, meets, wall, points, 
                 k[stage, 0], k[stage, 1] = y[2], y[3]
                 ax, ay = acceleration(
                     y[0], y[1], y[2], y[3], others[moment, window[p]], meets[p], wall[p],
-                    points[p], have[p], q[r],
+                    points[p], edge[p], edges[p], have[p], q[r],
                 )
                 k[stage, 2] = ax + (1 - share) * before[r, p, 0] + share * after[r, p, 0]
                 k[stage, 3] = ay + (1 - share) * before[r, p, 1] + share * after[r, p, 1]
@@ -93,6 +101,7 @@ def advance(now, before, after, out, n, h, others, window, meets, wall, points, 
                 out[r, p, c] = now[r, p, c] + h / 6 * slope
 '''
 _STATE = ("x", "y", "vx", "vy")
+_SUMS = (OTHERS, POINTS, WALLS)
 
 
 @dataclass(frozen=True)
@@ -100,7 +109,7 @@ class WalkSource:
     """Source of a model.
 
     Attributes:
-        law: flat, with sums over others and over wall points at most.
+        law: flat, with sums over others, wall points and walls.
     """
 
     law: CrowdLaw
@@ -121,22 +130,23 @@ class WalkSource:
         law = self.law
         label: dict[str, str] = {}
         formula = [f"dvx/dt = {plain(law.rate[0])}", f"dvy/dt = {plain(law.rate[1])}"]
-        for over in (OTHERS, POINTS):
+        for over in _SUMS:
             label |= {name: f"{over}_{i}" for i, name in enumerate(law.sums[over])}
             formula += [f"{n} = sum over {over} of {plain(s)}" for n, s in law.sums[over].items()]
         text = _HEAD.format(formula="\n".join(formula))
-        seen = {OTHERS: ("dx", "dy", "dvx", "dvy"), POINTS: ("dx", "dy", "normal_x", "normal_y")}
-        for over, names in seen.items():
+        for over in _SUMS:
             found = list(law.sums[over].values())
-            text += self._function(f"of_{over}", (*names, "vx", "vy"), found)
+            text += self._function(f"of_{over}", (*SEEN[over], "vx", "vy"), found)
         text += self._function("rate", (*_STATE, *label), list(law.rate))
-        people, places = ([label[name] for name in law.sums[over]] for over in (OTHERS, POINTS))
+        people, places, sides = ([label[name] for name in law.sums[over]] for over in _SUMS)
         return text + _DRIVE.format(
             zeros="".join(f"    {name} = 0.0\n" for name in label.values()),
             people=_tuple([f"now_{name}" for name in people]),
             places=_tuple([f"now_{name}" for name in places]),
+            sides=_tuple([f"now_{name}" for name in sides]),
             met="".join(f"        {name} += meets[j] * now_{name}\n" for name in people),
             touched="".join(f"        {name} += now_{name}\n" for name in places),
+            sided="".join(f"        {name} += now_{name}\n" for name in sides),
             state="".join(f"{name}, " for name in _STATE),
             sums="".join(f"{name}, " for name in label.values()),
         )

@@ -191,11 +191,15 @@ def test_laws_of_people_that_jupedsim_has() -> None:
     scenes = Scenes(people=8.0, points=0.0, spacing=0.25, speed=1.1, pace=1.4)
     content = json.loads(jupedsim_parameters(field("cfsm"), scenes).text)
     assert content["classes"]["model"] == "CollisionFreeSpeedModel"
-    assert content["model"] == {"strength_neighbor_repulsion": 5.0, "range_neighbor_repulsion": 0.1}
+    assert content["model"] == {
+        "strength_neighbor_repulsion": 5.0, "range_neighbor_repulsion": 0.1,
+        "strength_geometry_repulsion": 5.0, "range_geometry_repulsion": 0.02,
+    }  # fmt: skip
     assert content["agent"] == {"desired_speed": 1.4, "time_gap": 1.0, "radius": 0.15}
     content = json.loads(jupedsim_parameters(field("gcfm"), scenes).text)
     assert content["classes"]["agent"] == "GeneralizedCentrifugalForceModelAgentParameters"
     assert content["model"]["strength_neighbor_repulsion"] == pytest.approx(0.2)
+    assert content["model"]["strength_geometry_repulsion"] == pytest.approx(0.2)
     assert content["agent"]["a_v"] == pytest.approx(0.53)
     assert any("distance of bodies" in line for line in content["no_counterpart"])
     for name in ("ttc", "esf"):

@@ -180,3 +180,61 @@ def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
     ours = rate[:, 2].numpy() * np.sign(way[:, 0])
     assert (ours < 1.3 / 0.5 - speed / 0.5 - 0.05).all()  # each pushes the other
     np.testing.assert_allclose(theirs, ours, rtol=1e-3)
+
+
+def in_a_room(
+    jupedsim: ModuleType, name: str, place: list[float], speed: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(2,) velocities after a short step to the right, of one person in a room: JuPedSim's, and
+    those of the law that was exported to it."""
+    import shapely
+
+    dt, goal = 1e-4, (4.99, place[1])
+    room = np.array([[-5.0, -2, 5, -2], [5, -2, 5, 2], [5, 2, -5, 2], [-5, 2, -5, -2]])
+    x, v = np.array([place]), np.array([[speed, 0.0]])
+    s = Sequence(
+        name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), v=np.stack([v, v]),
+        destination=np.array([goal]), preferred=np.array([[1.3, 0.0]]), walls=room,
+    )  # fmt: skip
+    system = Crowd([law_from(name, PEOPLE[name])], desired="exit")
+    written = exported(system, [s])
+    simulation = jupedsim.Simulation(
+        model=getattr(jupedsim, written["classes"]["model"])(**written["model"]),
+        geometry=shapely.box(-5, -2, 5, 2), dt=dt,
+    )  # fmt: skip
+    stage = simulation.add_direct_steering_stage()
+    moving = {"speed": speed, "orientation": (1.0, 0.0), "desired_direction": (1.0, 0.0)}
+    person = getattr(jupedsim, written["classes"]["agent"])(
+        position=tuple(place), stage_id=stage, **written["agent"],
+        journey_id=simulation.add_journey(jupedsim.JourneyDescription([stage])),
+        **(moving if name == "gcfm" else {}),
+    )  # fmt: skip
+    own = simulation.add_agent(person)
+    simulation.agent(own).target = goal
+    simulation.iterate()
+    theirs = (np.array(simulation.agent(own).position) - x[0]) / dt
+    batch = collate([s])
+    rate = system(torch.tensor(0.0), system.initial(batch), system.scene(batch)).detach()[0, 0]
+    rate = rate[-2:].numpy()
+    return theirs, rate if system.order == 1 else v[0] + dt * rate
+
+
+@pytest.mark.parametrize("place", [[0.0, -1.82], [1.0, 1.84], [-4.83, -1.81], [0.0, 0.0]])
+def test_jupedsim_s_collision_free_people_near_walls(
+    jupedsim: ModuleType, place: list[float]
+) -> None:
+    theirs, ours = in_a_room(jupedsim, "cfsm", place, 0.0)
+    np.testing.assert_allclose(theirs, ours, atol=1e-6)
+    assert (abs(theirs[1]) > 0.1) == (place != [0.0, 0.0])
+
+
+@pytest.mark.parametrize(("apart", "speed"), [(1.4, 0.5), (1.2, 0.4), (1.1, 0.2), (3.0, 0.8)])
+def test_jupedsim_s_centrifugal_people_who_walk_at_a_wall(
+    jupedsim: ModuleType, apart: float, speed: float
+) -> None:
+    """Where bodies are so far from it that JuPedSim neither interpolates nor pushes with its
+    greatest force (within 0.4 m and a radius), and centres nearer than the law fades."""
+    theirs, ours = in_a_room(jupedsim, "gcfm", [5.0 - apart, 0.3], speed)
+    free = speed + 1e-4 * (1.3 - speed) / 0.5
+    assert (ours[0] < free - 1e-6) == (apart < 2)
+    np.testing.assert_allclose(theirs[0] - speed, ours[0] - speed, rtol=1e-3)

@@ -14,7 +14,7 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.models import Crowd, build_model
-from nnode.models.field_crowd import PEOPLE
+from nnode.models.field_crowd import PEOPLE, without_walls
 
 R = 0.25
 
@@ -202,6 +202,76 @@ def test_without_velocities_it_is_circular() -> None:
         np.testing.assert_allclose(found[i], wanted, rtol=1e-5)
     still = force(model("esf", lam=1.0, A=0.7, B=0.5, stride=0.0), crowd(5, 8, 3.0))
     np.testing.assert_allclose(still, found, rtol=1e-9, atol=1e-9)
+
+
+# -- walls ---------------------------------------------------------------------------------------
+
+#: A corner, and a wall across it; x1, y1, x2, y2 in m.
+WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [0.0, 3.0, 0.0, 0.0], [3.5, 0.5, 1.0, 2.9]])
+
+
+def nearest(x: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The point of a wall that is nearest, and whether it is one of its ends."""
+    share = (x - wall[:2]) @ (wall[2:] - wall[:2]) / ((wall[2:] - wall[:2]) @ (wall[2:] - wall[:2]))
+    inside = min(max(share, 0.0), 1.0)
+    return wall[:2] + inside * (wall[2:] - wall[:2]), inside != share
+
+
+def by_walls(name: str, item: Sequence, **parameters: Any) -> np.ndarray:
+    """(N, 2): what walls add to the rates."""
+    law = {**model_options({"term": "formula", "name": name, "law": PEOPLE[name]}, "measured"),
+           "desired": "direction"}  # fmt: skip
+    found = rates(build_model(law), replace(item, walls=WALLS))
+    bare = build_model({**law, "law": without_walls(PEOPLE[name])})
+    np.testing.assert_array_equal(
+        rates(bare, replace(item, walls=WALLS)), rates(build_model(law), item)
+    )
+    return found - rates(bare, item)
+
+
+def near_walls() -> Sequence:
+    x = np.array([[0.4, 0.25], [2.2, 0.2], [3.8, 0.4], [1.0, 1.6], [2.4, 1.9], [-0.3, -0.4]])
+    draw = np.random.default_rng(2)
+    return scene(x, draw.normal(0, 0.8, x.shape))
+
+
+def test_elliptical_walls_are_exponential() -> None:
+    item = near_walls()
+    wanted = np.zeros((6, 2))
+    for i, x in enumerate(item.x[0]):
+        for wall in WALLS:
+            away = x - nearest(x, wall)[0]
+            d = np.linalg.norm(away)
+            wanted[i] += 5.0 * math.exp((R - d) / 0.1) * away / d
+    assert np.abs(wanted).max() > 1
+    np.testing.assert_allclose(by_walls("esf", item), wanted, rtol=1e-6, atol=1e-9)
+
+
+def test_centrifugal_walls_push_those_who_come_along_their_normal() -> None:
+    item = near_walls()
+    x, v = item.x[0], item.v[0]  # type: ignore[index]
+    wanted = np.zeros((6, 2))
+    for i in range(6):
+        for wall in WALLS:
+            point, end = nearest(x[i], wall)
+            d = math.dist(x[i], point)
+            e = (point - x[i]) / d
+            if end:
+                continue
+            sees = max(v[i] @ e, 0) / np.linalg.norm(v[i])
+            room = max(d - ellipse(v[i], e, 1.3), 0.1)
+            near = min(max((2.0 - d) / 0.5, 0), 1)
+            wanted[i] -= near * min(sees * (0.2 * 1.3 + max(v[i] @ e, 0)) ** 2 / room, 3.0) * e
+    assert np.abs(wanted).max() > 0.5
+    assert (wanted[5] == 0).all()  # beyond the corner
+    np.testing.assert_allclose(by_walls("gcfm", item), wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_collision_free_people_turn_from_walls() -> None:
+    lone = scene([[2.2, 0.17]], [[1.0, 0.0]])
+    found = rates(model("cfsm"), replace(lone, walls=WALLS))[0]
+    way = np.array([1.0, 5.0 * math.exp((0.15 - 0.17) / 0.02)])
+    np.testing.assert_allclose(found, 1.3 * way / np.linalg.norm(way), rtol=1e-5)
 
 
 # -- what people want ----------------------------------------------------------------------------

@@ -16,6 +16,8 @@ from nnode.models.field_crowd import PEOPLE
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 
 DT = 0.02
+#: Two sides of the room, and a wall in it; x1, y1, x2, y2 in m.
+WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
 
 
 def people(n: int, seed: int, samples: int = 6) -> Sequence:
@@ -25,7 +27,7 @@ def people(n: int, seed: int, samples: int = 6) -> Sequence:
     wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
     return Sequence(
         name=f"{n}-{seed}", recording="r", time=time, x=x + time[:, None, None] * v,
-        v=np.broadcast_to(v, (samples, n, 2)), preferred=wish,
+        v=np.broadcast_to(v, (samples, n, 2)), preferred=wish, walls=WALLS[: seed % 4],
     )  # fmt: skip
 
 

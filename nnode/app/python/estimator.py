@@ -49,6 +49,10 @@ class Calibrator:
         effects: beside it, names or ``{"name": ..., parameter: value}``.
         leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
+        pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
+            pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
+        start_speeds: ``given``, or ``fitted`` beside the parameters to each training sequence; see
+            :mod:`nnode.calibrate.start_speeds`.
         optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the
             command does, Gauss and Newton's method for the field's laws, else L-BFGS (where the
             command has the paper's stochastic descent).
@@ -72,6 +76,8 @@ class Calibrator:
     effects: ListLike[str | Mapping[str, Any]] = ()
     leader: str | None = None
     cost: str = "integral"
+    pooling: str = "pooled"
+    start_speeds: str = "given"
     optimizer: str | Mapping[str, Any] | None = None
     solver: str | None = None
     method: str | None = None
@@ -197,6 +203,7 @@ class Calibrator:
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
         trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
+        trainer |= {"pooling": self.pooling, "start_speeds": self.start_speeds}
         trainer["device"] = Device.cpu.value
         data = OmegaConf.structured(data_of(given))
         data.split.heldout = self.heldout

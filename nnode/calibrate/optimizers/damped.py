@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch.optim import Optimizer
 
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.least_squares import damped_step
+from nnode.calibrate.options import StartSpeeds
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.models.system import System
@@ -40,30 +42,49 @@ class GaussNewton(Optimizer):
         if not tolerance >= 0:
             raise ValueError(f"tolerance={tolerance} must not be negative")
         trained = [p for p in system.parameters() if p.requires_grad]
-        super().__init__(trained, {"damping": damping, "converged": False})
+        super().__init__(trained, {"damping": damping, "converged": False, "starts": {}})
         self.system, self.tolerance = system, tolerance
         self._cost: Any = None
+        self._batch: Batch | None = None
 
     @property
     def converged(self) -> bool:
         return bool(self.param_groups[0]["converged"])
 
-    def attach(self, solver: Solver, batch: Batch, convention: Convention) -> None:
+    def attach(
+        self,
+        solver: Solver,
+        batch: Batch,
+        convention: Convention,
+        starts: StartSpeeds = StartSpeeds.given,
+    ) -> None:
         """Say what the next step lowers.
 
         Raises:
             ConfigError: another solver than the compiled one, or a model that is no formula of a
                 lane.
         """
-        if self._cost is not None and self._cost.batch is batch:
+        if self._batch is batch:
             return
+        self._batch = batch
         # compiled code takes a second to import
-        from nnode.calibrate.gauss_newton import TangentCost
+        from nnode.calibrate.start_speeds import COSTS
         from nnode.solvers.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
-        self._cost = TangentCost(self.system, batch, solver, convention)
+        self._cost = COSTS[starts](self.system, self.started(batch), solver, convention)
+
+    def started(self, batch: Batch) -> Batch:
+        """A batch with the first speeds that were fitted to its sequences, if any were."""
+        known = self.param_groups[0]["starts"]
+        if not known:
+            return batch
+        v = batch.v.clone()
+        for b, name in enumerate(batch.names):
+            own = known.get(name, [])
+            v[0, b, : len(own), 0] = v.new_tensor(own)
+        return replace(batch, v=v)
 
     def step(self, closure: Callable[[], Any] | None = None) -> float:  # type: ignore[override]
         """Take a step; returns the mean cost before it.
@@ -85,5 +106,6 @@ class GaussNewton(Optimizer):
         if value < now:
             cost.fill_(self.system, end)
             group["damping"] = damping
+        group["starts"] = cost.starts(end)
         group["converged"] = not now - value > self.tolerance * now
         return now

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import takewhile
 from typing import cast
 
@@ -14,7 +14,7 @@ from torch.func import functional_call, vmap
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
 from nnode.discover.residuals.engine import trained
 from nnode.models.crowd import NetworkForce
-from nnode.models.crowd_formula import CrowdBase, crowd_of, settings_of
+from nnode.models.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
 from nnode.models.formula import own_values, values_of
 from nnode.models.system import Crowd, System
 from nnode.models.term import State, Term
@@ -49,6 +49,8 @@ class Tables:
     meets: np.ndarray
     wall: np.ndarray
     points: np.ndarray
+    edge: np.ndarray
+    edges: np.ndarray
     have: np.ndarray
 
     @classmethod
@@ -67,6 +69,9 @@ class Tables:
         # real points come first
         order = np.argsort(~there, axis=1, kind="stable")
         wall = np.take_along_axis(wall, order[..., None], 1).transpose(0, 2, 1)
+        edge, solid = (part.numpy()[which] for part in walls_of(scene))
+        first = np.argsort(~solid, axis=1, kind="stable")
+        edge = np.take_along_axis(edge, first[..., None], 1).transpose(0, 2, 1)
         goal = scene.destination.numpy()[which, who]
         has = {
             "goal_x": goal[:, 0],
@@ -76,11 +81,12 @@ class Tables:
             "points": scene.wall_count.numpy()[which, 0, 0],
         }
         have = np.stack([has[name] for name in source.fields] or [np.zeros(len(who))], 1)
-        return cls(others, which, meets, np.ascontiguousarray(wall), there.sum(1), have)
+        around = (np.ascontiguousarray(wall), there.sum(1), np.ascontiguousarray(edge))
+        return cls(others, which, meets, *around, solid.sum(1), have)
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """In the order of the compiled functions."""
-        return (self.others, self.window, self.meets, self.wall, self.points, self.have)
+        return tuple(getattr(self, field.name) for field in fields(self))
 
 
 class Walk:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.gauss_newton import TangentCost
+from nnode.calibrate.pooling import scattered
 from nnode.models.build import build_model
 from nnode.models.field import FIELD, NEURONS
 from nnode.models.system import System
 
-#: Starts of parameters with limits: the usual value times a factor that is drawn from here.
-FACTORS = (0.5, 2.0)
 #: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.
 DECAY = 1e-3
 
@@ -111,16 +109,7 @@ def starts(candidate: Candidate, cost: TangentCost, number: int, seed: int) -> n
     Weights of networks are drawn as models draw them, those beside a law start at 0 in their
     last layer.
     """
-    rng = np.random.default_rng(seed)
-    rows = []
-    for i in range(number):
-        row = cost.row(candidate.system(seed + i))
-        if i:
-            limited = np.isfinite(cost.low) & np.isfinite(cost.high)
-            factor = np.exp(rng.uniform(math.log(FACTORS[0]), math.log(FACTORS[1]), len(row)))
-            row = np.where(limited, row * factor, row)
-        rows.append(np.clip(row, cost.low, cost.high))
-    return np.stack(rows)
+    return scattered(cost, (cost.row(candidate.system(seed + i)) for i in range(number)), seed)
 
 
 def decay(cost: TangentCost) -> tuple[np.ndarray, np.ndarray] | None:

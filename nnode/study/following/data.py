@@ -82,19 +82,6 @@ def labels(found: Iterable[Sequence]) -> np.ndarray:
     return clusters(index_of(found))
 
 
-def folds(label: np.ndarray, number: int, seed: int) -> np.ndarray:
-    """``(B,)`` the fold in which each sequence is held out; a cluster is in one fold.
-
-    Args:
-        label: ``(B,)`` clusters, counted from 0.
-    """
-    count = int(label.max()) + 1
-    order = np.random.default_rng(seed).permutation(count)
-    fold = np.empty(count, dtype=int)
-    fold[order] = np.arange(count) % number
-    return fold[label]
-
-
 def behind(platoon: Sequence) -> list[Sequence]:
     """Every follower of a platoon with the vehicle ahead of it, foremost pair first.
 
@@ -112,18 +99,6 @@ def behind(platoon: Sequence) -> list[Sequence]:
         x = np.stack([lead - (pair.x[:, 1] - pair.x[:, 0]), lead], 1)
         found.append(replace(pair, name=f"{platoon.name}/{pair.agents[0]}", x=x))
     return found
-
-
-def part(sequence: Sequence, first: float, last: float) -> Sequence:
-    """The samples of a share of a sequence, from ``first`` to ``last``."""
-    low, high = (int(share * sequence.n_samples) for share in (first, last))
-    return replace(
-        sequence,
-        name=f"{sequence.name}/{low}-{high}",
-        time=sequence.time[low:high],
-        x=sequence.x[low:high],
-        v=None if sequence.v is None else sequence.v[low:high],
-    )
 
 
 def gap_of(pair: Sequence) -> np.ndarray:

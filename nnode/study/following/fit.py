@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import Fit, TangentCost, alone, pooled
+from nnode.calibrate.gauss_newton import Fit, TangentCost, pooled
+from nnode.calibrate.pooling import best_alone
+from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
 from nnode.models.build import build_model
 from nnode.models.field import FIELD
@@ -69,7 +71,7 @@ def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int)
     begin = time.perf_counter()
     candidate, batch = EVERY[name], data.batch(folder)
     label = data.labels(data.pairs(folder))
-    fold = data.folds(label, folds, seed)
+    fold = by_cluster(label, folds, seed)
     cost = costs_of(candidate, batch)
     others = {one: costs_of(candidate, batch, one) for one in OBJECTIVES}
     whole, found = calibrated(candidate, cost, restarts, seed)
@@ -96,13 +98,11 @@ def floor(folder: str, name: str, restarts: int, seed: int) -> Result:
     candidate, batch = EVERY[name], data.batch(folder)
     cost = costs_of(candidate, batch)
     centre = calibrated(candidate, cost, 1, seed)[0].row
-    fits = [alone(cost, row) for row in (centre, *starts(candidate, cost, restarts, seed))]
-    best = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
-    rows = np.stack([fits[k].row[b] for b, k in enumerate(best)])
+    rows, costs = best_alone(cost, (centre, *starts(candidate, cost, restarts, seed)))
     return {
         "names": list(named(cost, centre)),
         "rows": rows.tolist(),
-        "costs": np.min(np.array([fit.cost for fit in fits]), axis=0).tolist(),
+        "costs": costs.tolist(),
         "limits": [at_limits(cost, row) for row in rows],
     }
 

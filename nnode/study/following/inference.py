@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate.gauss_newton import TangentCost, alone, pooled, sandwich
+from nnode.calibrate import pooling
+from nnode.calibrate.gauss_newton import TangentCost, pooled, sandwich
+from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import collate
 from nnode.study.following import data
 from nnode.study.following.candidates import EVERY, starts
@@ -17,10 +19,6 @@ Result = dict[str, Any]
 
 #: Factors on a parameter, at which all others are calibrated again.
 PROFILE = tuple(float(f) for f in np.geomspace(0.25, 4, 17))
-#: Factors on the penalty by which pairs are drawn towards the pool.
-STRENGTHS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-#: A parameter's spread between pairs is at least this share of the pooled value.
-LEAST_SPREAD = 0.02
 
 
 def precision(folder: str, name: str, row: list[float]) -> Result:
@@ -79,58 +77,25 @@ def halves(
     """Pooled, alone and in between: calibrated on the first half of every pair, judged on the
     second.
 
-    What lasts of a driver is the covariance of its numbers in both halves (method of moments).
-    Drawn towards the pool, squares of deviations, in units of that spread, add to a pair's
-    cost; how much is chosen for each fold from the pairs outside it.
+    How much pairs are drawn towards the pool is chosen for each fold from the pairs outside it.
     """
     both = data.pairs(folder)
     first, second = (
-        costs_of(EVERY[name], collate([data.part(s, low, low + 0.5) for s in both]))
-        for low in (0.0, 0.5)
+        costs_of(EVERY[name], collate([s.part(low, low + 0.5) for s in both])) for low in (0.0, 0.5)
     )
-    centre = pooled(first, np.array(row)).row
-    begin = [centre, *starts(EVERY[name], first, restarts, seed)]
-
-    def best(cost: TangentCost, pool: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-        fits = [alone(cost, one, pool=pool) for one in (begin if pool is None else begin[:1])]
-        which = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
-        return np.stack([fits[k].row[b] for b, k in enumerate(which)])
-
-    own = [best(cost, None) for cost in (first, second)]
-    lasting = _lasting(*own)
-    spread = np.maximum(np.sqrt(lasting), LEAST_SPREAD * np.abs(centre))
-    rows = {s: best(first, (centre, s / spread**2)) if s else own[0] for s in STRENGTHS}
-    costs = np.stack([second.costs(one) for one in rows.values()])
-    usual = second.costs(np.array(centre))
     label = data.labels(both)
-    fold = data.folds(label, folds, seed)
-    shrunk, chosen = np.zeros(len(both)), []
-    for k in range(folds):
-        i = int(np.argmin(costs[:, fold != k].mean(1)))
-        shrunk[fold == k] = costs[i, fold == k]
-        chosen.append(STRENGTHS[i])
+    fold = by_cluster(label, folds, seed)
+    others = starts(EVERY[name], first, restarts, seed)
+    found = pooling.halves(first, second, np.array(row), others, fold)
     return {
-        "names": list(named(first, centre)),
-        "centre": centre.tolist(),
-        "spread": np.sqrt(lasting).tolist(),
-        "between": np.std(own[0], axis=0).tolist(),
-        "pooled": usual.tolist(),
-        "alone": costs[0].tolist(),
-        "shrunk": shrunk.tolist(),
-        "strengths": chosen,
-        "by_strength": costs.mean(1).tolist(),
+        "names": list(named(first, found.centre)),
+        "centre": found.centre.tolist(),
+        "spread": found.spread.tolist(),
+        "between": found.between.tolist(),
+        "pooled": found.pooled.tolist(),
+        "alone": found.alone.tolist(),
+        "shrunk": found.shrunk.tolist(),
+        "strengths": found.strengths,
+        "by_strength": found.by_strength.tolist(),
         "clusters": label.tolist(),
     }
-
-
-def _lasting(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """``(P,)`` variance of what both halves of a pair have in common; at least 0.
-
-    The middle 90 % of each half's numbers set the limits that others are moved to: a number that
-    a half does not determine may lie anywhere.
-    """
-    found = []
-    for one, other in zip(first.T, second.T, strict=True):
-        tame = [np.clip(x, *np.quantile(x, [0.05, 0.95])) for x in (one, other)]
-        found.append(max(float(np.cov(*tame)[0, 1]), 0.0))
-    return np.array(found)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import TangentCost, alone
+from nnode.calibrate.gauss_newton import TangentCost
+from nnode.calibrate.pooling import best_alone
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.models.build import build_model
 from nnode.models.field import FIELD
@@ -47,17 +48,13 @@ def followers(folder: str, run: str | None = None) -> list[Sequence]:
     ]
 
 
-def best_alone(
+def own_rows(
     candidate: Candidate, batch: Batch, restarts: int, seed: int
 ) -> tuple[TangentCost, np.ndarray, np.ndarray]:
     """Every pair by itself: the cost, ``(B, P)`` best rows of several starts, ``(B,)`` costs."""
     cost = costs_of(candidate, batch)
-    fits = [
-        alone(cost, row, steps=STEPS, tolerance=1e-7, pool=decay(cost))
-        for row in starts(candidate, cost, restarts, seed)
-    ]
-    which = np.argmin(np.array([fit.cost for fit in fits]), axis=0)
-    rows = np.stack([fits[k].row[b] for b, k in enumerate(which)])
+    begin = starts(candidate, cost, restarts, seed)
+    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=1e-7, pool=decay(cost))
     return cost, rows, cost.costs(rows)
 
 
@@ -72,7 +69,7 @@ def reproduced(folder: str) -> Result:
         system = build_model(
             {"term": "formula", "name": "ovm", "leader": "measured", "law": described}
         )
-        rest = data.part(pair, printed.FIRST, 1.0)
+        rest = pair.part(printed.FIRST, 1.0)
         cost = TangentCost(system, collate([rest]), FusedSolver(), Convention.spacing)
         found["law"][make] = float(cost.costs(cost.start)[0])
         found["stopped"][make] = collided(rest, values)
@@ -115,11 +112,11 @@ def compare(folder: str, name: str, restarts: int, seed: int) -> Result:
     first = printed.FIRST
 
     def share(low: float, high: float) -> Batch:
-        return collate([data.part(pair, low, high) for pair in pairs])
+        return collate([pair.part(low, high) for pair in pairs])
 
-    _, rows, _ = best_alone(candidate, share(0.0, first**2), restarts, seed)
+    _, rows, _ = own_rows(candidate, share(0.0, first**2), restarts, seed)
     chosen = costs_of(candidate, share(first**2, first)).costs(rows)
-    cost, rows, train = best_alone(candidate, share(0.0, first), restarts, seed)
+    cost, rows, train = own_rows(candidate, share(0.0, first), restarts, seed)
     heldout = costs_of(candidate, share(first, 1.0)).costs(rows)
     return {
         "makes": [pair.agents[0] for pair in pairs],
@@ -135,7 +132,7 @@ def every_run(folder: str, name: str, restarts: int, seed: int) -> Result:
     """One law on every follower of every run, each by itself."""
     candidate = CANDIDATES[name]
     pairs = followers(folder)
-    cost, rows, costs = best_alone(candidate, collate(pairs), restarts, seed)
+    cost, rows, costs = own_rows(candidate, collate(pairs), restarts, seed)
     return {
         "runs": [pair.recording for pair in pairs],
         "makes": [pair.agents[0] for pair in pairs],

@@ -1,4 +1,4 @@
-"""What is compared: laws of people, and predictions that need no calibration."""
+"""What is compared: laws of people, without walls, and predictions that need no calibration."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import torch
 
 from nnode.models.build import build_model
-from nnode.models.field_crowd import PEOPLE
+from nnode.models.field_crowd import PEOPLE, without_walls
 from nnode.models.system import System
 
-_FORCE = PEOPLE["esf"]
+_FORCE = without_walls(PEOPLE["esf"])
 _CIRCLE = {"stride": "0 s", "lam": "1"}
 
 #: Name to the law; the first is without any interaction.
@@ -25,7 +25,7 @@ LAWS: dict[str, dict[str, Any]] = {
         "parameters": {k: v for k, v in _FORCE["parameters"].items() if k not in _CIRCLE},
         "constants": {**_FORCE["constants"], **_CIRCLE},
     },
-    **{name: PEOPLE[name] for name in ("esf", "ttc", "gcfm", "cfsm")},
+    **{name: without_walls(PEOPLE[name]) for name in ("esf", "ttc", "gcfm", "cfsm")},
 }
 #: Values of parameters from all combinations of which a calibration chooses its starts: forces that
 #: jump where people just touch leave many valleys.

@@ -52,6 +52,7 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
     ("given", "options"),
     [
         ({"model": "idm"}, ["model=idm"]),
+        ({"model": "helly", "pooling": "shrunk"}, ["model=helly", "trainer.pooling=shrunk"]),
         (
             {"model": "lin", "optimizer": "adadelta", "solver": "torchdiffeq", "epochs": 2,
              "dt": 0.05, "effects": ["relative_speed"]},
@@ -63,7 +64,7 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
             ["model=ovm", "optimizer=lbfgs", "trainer.cost=gap", "trainer.max_epochs=3"],
         ),
     ],
-    ids=["idm", "lin", "ovm"],
+    ids=["idm", "shrunk", "lin", "ovm"],
 )  # fmt: skip
 def test_the_command_finds_the_same_to_the_last_digits(
     script: Script, tmp_path: Path, tidy: pd.DataFrame, given: dict[str, Any], options: list[str]
@@ -83,6 +84,10 @@ def test_the_command_finds_the_same_to_the_last_digits(
     assert found.cost_ == pytest.approx(written["summary"]["cost_train"], rel=1e-12)
     assert found.n_iter_ == written["history"][-1]["epoch"]
     assert found.result_.summary() in done.stdout
+    own, path = found.result_.own, tmp_path / "own_parameters.csv"
+    assert (own is not None) == path.exists() == ("pooling" in given)
+    if own is not None:
+        pd.testing.assert_frame_equal(own, pd.read_csv(path, keep_default_na=False))
 
 
 def _numbers(value: Any, name: str = "") -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,14 @@ from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.models import Crowd, Relaxation, SocialForce
+from nnode.models.crowd_formula import CrowdBase
 from nnode.models.effects import CATALOGUE, Effect
 from nnode.models.effects.crowd_motion import Drift
 from nnode.models.effects.crowd_pairs import Alignment, PairRepulsion
 from nnode.models.extend import extended
+from nnode.models.field_crowd import PEOPLE, without_walls
+from nnode.models.own_law import FormulaForce
+from nnode.models.term import State
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
@@ -32,6 +37,20 @@ class Same(SocialForce):
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
         return super().pair_force(dx, dv)
+
+
+class Coded(CrowdBase):
+    """A formula that is evaluated as code."""
+
+    name = "coded"
+
+    def __init__(self, name: str, **law: Any) -> None:
+        super().__init__()
+        self.own = FormulaForce(name, **law)
+
+    def forward(self, state: State) -> Tensor:
+        found: Tensor = self.own(state)
+        return found
 
 
 def model(force: type[SocialForce] = SocialForce, **options: float | bool) -> Crowd:
@@ -70,6 +89,19 @@ def test_compiled_paths_are_those_of_the_model(
     torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=2e-6)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=2e-5)
     assert float((found[0][0][:, 0] - found[0][0][:, 1]).abs().max()) > 0.05
+
+
+def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
+    windows = Windows(plain)
+    found = []
+    for law in (PEOPLE["esf"], without_walls(PEOPLE["esf"])):
+        for kind in (FormulaForce, Coded):
+            system = Crowd([kind("esf", **law)], desired="direction").double()
+            walk = Walk(windows, windows.scene(system), system)
+            assert walk.compiled is (kind is FormulaForce)
+            found.append(walk.paths(torch.stack([row_of(system)]))[0])
+    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-5)
+    assert float((found[0] - found[2]).abs().max()) > 0.01
 
 
 @pytest.mark.parametrize("effect", [PairRepulsion(A_2=0.4, B_2=0.8), Alignment(c=0.5)])

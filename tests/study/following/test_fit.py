@@ -8,6 +8,7 @@ from scipy import stats
 
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton import TangentCost
+from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
 from nnode.solvers.fused.engine import FusedSolver
 from nnode.study.following import data, fit, inference, leaders
@@ -53,7 +54,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
 def test_clusters_stay_in_one_fold() -> None:
     label = data.labels(driven())
     assert label.tolist() == [0, 0, 1, 1, 2, 2]
-    fold = data.folds(label, 2, seed=3)
+    fold = folds(label, 2, seed=3)
     assert fold[::2].tolist() == fold[1::2].tolist()
     assert set(fold) == {0, 1}
 
@@ -65,7 +66,7 @@ def test_followers_of_a_platoon_keep_their_leaders() -> None:
     )
     pairs = data.behind(platoon)
     assert [pair.agents for pair in pairs] == [("b", "a"), ("c", "b"), ("d", "c")]
-    last = data.part(pairs[0], 0.7, 1.0)
+    last = pairs[0].part(0.7, 1.0)
     assert (last.n_samples, last.time[0]) == (15, pytest.approx(3.5))
     assert np.diff(last.x[0, :, 0]) == pytest.approx(40)
 

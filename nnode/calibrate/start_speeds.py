@@ -1,0 +1,135 @@
+"""First speeds of noisy data as a nuisance: fitted with the parameters, sequence by sequence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.gauss_newton import Curved, TangentCost
+from nnode.calibrate.options import StartSpeeds
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError
+from nnode.models.system import System
+from nnode.solvers.fused.engine import FusedSolver
+
+#: First speeds: steps at most, the share of the cost below which a fall ends them, and the
+#: difference by which their derivatives are taken, m/s.
+_TURNS, _SETTLED, _DIFFERENCE = 10, 1e-12, 1e-5
+
+
+class StartSpeedCost(TangentCost):
+    """A cost whose first speeds are fitted, to each sequence for any parameters (profiled out).
+
+    They are those of all vehicles that the model drives, at least 0. Derivatives by them are
+    differences; gradient and curvature are those of the least cost over them: of Gauss and Newton's
+    curvature the Schur complement.
+
+    Attributes:
+        fitted: ``(B, N)`` True where a first speed is fitted.
+
+    Raises:
+        ConfigError: as of the base class; or a law of first order, which has no speeds to start
+            with.
+
+    Source:
+        Golub & Pereyra 2003, variable projection; Murphy & van der Vaart 2000, profile likelihood.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        batch: Batch,
+        solver: FusedSolver,
+        convention: Convention = Convention.integral,
+    ) -> None:
+        super().__init__(system, replace(batch, v=batch.v.clone()), solver, convention)
+        if self.lane.order < 2:
+            raise ConfigError(
+                "trainer.start_speeds=fitted needs a law of second order: one of first order has "
+                "no speed to start with; take trainer.start_speeds=given"
+            )
+        lead = torch.arange(batch.agent.shape[1]) == (batch.agent.sum(1) - 1)[:, None]
+        self.fitted = batch.agent & ~lead if self.system.leader == "measured" else batch.agent
+
+    def costs(self, rows: np.ndarray) -> np.ndarray:
+        """As of the base class, at the best first speeds."""
+        before = self.batch.v[0].clone()
+        found, _ = self._settled(rows)
+        self.batch.v[0] = before
+        return found
+
+    def starts(self, rows: np.ndarray) -> dict[str, list[float]]:
+        """First speeds (m/s) that are best for parameters, by sequence and vehicle."""
+        self._settled(rows)
+        agents = self.batch.agent.sum(1).tolist()
+        found = self.batch.v[0, ..., 0].tolist()
+        names = self.batch.names
+        return {name: v[:n] for name, v, n in zip(names, found, agents, strict=True)}
+
+    def __call__(self, rows: np.ndarray) -> Curved:
+        _, by_start = self._settled(rows)
+        away, seen, slope = self._slopes(rows)
+        number = slope.shape[0]
+        both = self._curved(away, seen, torch.cat([slope, by_start]))
+        bend, pull = both.hessian, both.gradient
+        own = self._inverse(bend[:, number:, number:])
+        across = np.einsum("bpj,bjk->bpk", bend[:, :number, number:], own)
+        return Curved(
+            both.cost,
+            pull[:, :number] - np.einsum("bpk,bk->bp", across, pull[:, number:]),
+            bend[:, :number, :number]
+            - np.einsum("bpk,bkq->bpq", across, bend[:, number:, :number]),
+        )
+
+    def _settled(self, rows: np.ndarray) -> tuple[np.ndarray, Tensor]:
+        """Move first speeds to the best ones; costs ``(B,)``, and derivatives of errors by them."""
+        start = self.batch.v[0]  # changed in place
+        x, v, _, _ = self._simulated(rows, ())
+        away, seen = self._errors(x, v)
+        now = self._cost(away, seen)
+        going = torch.ones(len(now), dtype=torch.bool)
+        for turn in range(_TURNS + 1):
+            by_start = self._by_start(rows, away)
+            if turn == _TURNS or not going.any():
+                break
+            found = self._curved(away.double(), seen, by_start)
+            step = -np.einsum("bjk,bk->bj", self._inverse(found.hessian), found.gradient)
+            before = start.clone()
+            moved = torch.from_numpy(step)[..., None].to(start) * self.fitted[..., None]
+            start += torch.where(going[:, None, None], moved, 0.0)
+            start.clamp_(min=0.0).copy_(torch.where(self.fitted[..., None], start, before))
+            x, v, _, _ = self._simulated(rows, ())
+            new, _ = self._errors(x, v)
+            value = self._cost(new, seen)
+            worse = ~(value < now)
+            start.copy_(torch.where(worse[:, None, None], before, start))
+            away = torch.where(worse[:, None], away, new)
+            going &= ~worse & (now - value > _SETTLED * now)
+            now = torch.where(worse, now, value)
+        return now.numpy(), by_start
+
+    def _by_start(self, rows: np.ndarray, away: Tensor) -> Tensor:
+        """``(N, K, B, ...)`` slopes of errors by the first speed of every vehicle."""
+        start, found = self.batch.v[0], []
+        for i in range(start.shape[1]):
+            before = start[:, i].clone()
+            start[:, i] += _DIFFERENCE * self.fitted[:, i, None]
+            x, v, _, _ = self._simulated(rows, ())
+            start[:, i] = before
+            found.append((self._errors(x, v)[0] - away).double() / _DIFFERENCE)
+        return torch.nan_to_num(torch.stack(found))
+
+    def _inverse(self, bend: np.ndarray) -> np.ndarray:
+        """Of the curvature by first speeds; 0 for those that nothing depends on."""
+        return np.linalg.pinv(bend, rcond=1e-10, hermitian=True)
+
+
+#: The cost by ``trainer.start_speeds``.
+COSTS: dict[StartSpeeds, type[TangentCost]] = {
+    StartSpeeds.given: TangentCost,
+    StartSpeeds.fitted: StartSpeedCost,
+}
