@@ -22,7 +22,5 @@ def test_files_stay_short() -> None:
 
 
 def test_folders_stay_small() -> None:
-    # a private file is a part of its neighbours that was put aside, not one more thing to know
-    shown = [file for file in FILES if not file.name.startswith("_")]
-    number = Counter(str(file.parent.relative_to(ROOT)) for file in shown)
+    number = Counter(str(file.parent.relative_to(ROOT)) for file in FILES)
     assert {folder: files for folder, files in number.items() if files > MOST_FILES} == {}

@@ -17,7 +17,6 @@ from nnode.data.sequence import Batch
 from nnode.models.system import System
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, substeps
 from nnode.solvers.base import check_finite
-from nnode.solvers.fused import fallback
 
 #: One simulation with cost and gradient: ``(K, B, N, D)`` positions and the flat gradient, in
 #: the order of ``System.named_parameters``.
@@ -102,22 +101,6 @@ def _traffic_in_jax(problem: Problem) -> bool:
     return law and find_spec("jax") is not None
 
 
-def _with_effects(problem: Problem) -> bool:
-    return "+" in problem.model
-
-
-class _Batched:
-    """What a model with a term that is code goes through, in batched PyTorch calls."""
-
-    def __init__(self, dt: float) -> None:
-        self.dt = dt
-
-    def __call__(self, system: System, batch: Batch) -> Trajectory:
-        steps = substeps(batch.dt, self.dt, system)
-        y = fallback.simulate(system, batch, steps, list(system.parameters()))
-        return Trajectory(*system.observe(y, batch))
-
-
 def _traffic_in_diffrax(problem: Problem) -> bool:
     return _traffic_in_jax(problem) and find_spec("diffrax") is not None
 
@@ -138,7 +121,6 @@ ENGINES: dict[str, Engine] = {
     "scan_batch_last": Engine(_jax("scan_batch_last"), _traffic_in_jax),
     "diffrax": Engine(_jax("diffrax"), _traffic_in_diffrax),
     "diffrax_batch_last": Engine(_jax("diffrax_batch_last"), _traffic_in_diffrax),
-    "batched": Engine(_solver(_Batched), _with_effects),
     # Steps of crowds are added without compensation: in float32 each may be off by 6e-8 of the
     # coordinate, 25 of them by 1.5e-6 (1.5e-4 m at 100 m), before forces amplify it. Found were
     # 2e-7 to 1.2e-6 for 50 to 10,000 people; an error of 1 m/s^2 in one step is 1.6e-5 at 100 m.

@@ -21,7 +21,6 @@ LOOKS: dict[str, tuple[str, int, bool]] = {
     "diffrax_batch_last": ("diffrax, batch innermost", 2, True),
     "scan": ("JAX lax.scan", 1, False),
     "scan_batch_last": ("JAX lax.scan, batch innermost", 1, True),
-    "batched": ("batched PyTorch calls", 5, False),
     "fused_1": ("fused, 1 thread", 0, False),
     "fused_2": ("fused, 2 threads", 0, True),
 }

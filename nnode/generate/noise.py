@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torchdiffeq import odeint
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
@@ -21,6 +22,7 @@ from nnode.models.own_law import law_from
 from nnode.models.system import System
 from nnode.models.term import State, Term
 from nnode.solvers.base import Trajectory, check_finite, substeps
+from nnode.solvers.ode import whole_steps
 from nnode.solvers.rates import Rates
 
 
@@ -173,13 +175,16 @@ def sample(
 
     y[..., -1] = noise.sigma * normal()
     kick = noise.sigma * math.sqrt(1 - kept**2)
-    states = [y]
-    for k in range(n * (batch.n_samples - 1)):
-        y = y + rates(torch.tensor(float(k), dtype=y.dtype), y)
-        y[..., -1] += kick * normal()
-        if not (k + 1) % n:
-            states.append(y)
-    x, v = noisy.observe(torch.stack(states), many)
+
+    def change(step: Tensor, y: Tensor) -> Tensor:
+        found: Tensor = rates(step, y)
+        found[..., -1] += kick * normal()
+        return found
+
+    times = n * torch.arange(batch.n_samples, dtype=y.dtype)
+    grid = {"grid_constructor": whole_steps}
+    states = odeint(change, y, times, method="euler", options=grid)
+    x, v = noisy.observe(states, many)
     return check_finite(Trajectory(x, v), many)
 
 

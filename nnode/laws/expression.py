@@ -13,7 +13,8 @@ tanh, sin, cos     of a
 softplus           log(1 + e^a), a beyond 20       softplus_slope, as PyTorch's
 softplus_slope     logistic(a), 1 beyond 20
 logistic           1 / (1 + e^-a)
-max, min           the larger, the smaller         that of a where both are equal
+max, min           the larger, the smaller, none   that of a where both are equal
+                   where either is no number
 choose             b where a > 0, c elsewhere      none by a
 call               of code by its name; PyTorch's alone
 =================  ==============================  ==============================================
@@ -198,9 +199,9 @@ def apply(name: str, *args: Expr) -> Expr:
     if name in UNARY:
         return _folded(name, UNARY[name], *args)
     if name == "max":
-        return _folded(name, lambda p, q: p if p >= q else q, *args)
+        return _folded(name, lambda p, q: q if q > p or q != q else p, *args)
     if name == "min":
-        return _folded(name, lambda p, q: p if p <= q else q, *args)
+        return _folded(name, lambda p, q: q if q < p or q != q else p, *args)
     if name == "choose":
         a, b, c = args
         if a.op == "const":

@@ -102,6 +102,7 @@ class Lane:
         starts: added state to its value at the start.
         leads: rates of a leader's other states, where they are not 0.
         chained: state to the symbol of its rate of the vehicle ahead, where formulas name it.
+        linear: states that formulas do no more with than to add multiples of them: tangents.
     """
 
     order: int
@@ -115,6 +116,7 @@ class Lane:
     starts: dict[str, Expr] = field(default_factory=dict)
     leads: dict[str, Expr] = field(default_factory=dict)
     chained: dict[str, str] = field(default_factory=dict)
+    linear: frozenset[str] = frozenset()
 
     @property
     def top(self) -> str:

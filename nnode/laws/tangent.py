@@ -42,7 +42,8 @@ def with_tangents(lane: Lane, parameters: tuple[str, ...]) -> Lane:
             if state in starts:
                 begun[own] = _along(starts[state], {p: const(1)})
         leads[f"x__d{i}"] = _along(lead, moved)
-    return replace(lane, rates=rates, starts=begun, leads=leads, chained=chained)
+    linear = frozenset(rates) - frozenset(lane.rates)
+    return replace(lane, rates=rates, starts=begun, leads=leads, chained=chained, linear=linear)
 
 
 def _slopes(formula: Expr) -> dict[str, Expr]:

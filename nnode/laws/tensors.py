@@ -30,8 +30,8 @@ OPERATIONS: dict[str, Code] = {
     "softplus": softplus,
     "softplus_slope": lambda a: torch.where(a > 20, 1.0, torch.sigmoid(a)),
     "logistic": torch.sigmoid,
-    "max": lambda a, b: torch.where(b > a, b, a),
-    "min": lambda a, b: torch.where(b < a, b, a),
+    "max": lambda a, b: torch.where((b > a) | (b != b), b, a),
+    "min": lambda a, b: torch.where((b < a) | (b != b), b, a),
     "choose": lambda a, b, c: torch.where(a > 0, b, c),
 }
 

@@ -15,8 +15,8 @@ def source(model: System) -> str:
     Raises:
         ValueError: the model has a term that is no formula.
     """
-    from nnode.simulate.crowd_source import CrowdSource
-    from nnode.simulate.lane_source import LaneSource
+    from nnode.simulate.crowds.source import CrowdSource
+    from nnode.simulate.lanes.source import LaneSource
 
     if isinstance(model, Traffic):
         lane = model.lane

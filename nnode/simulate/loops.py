@@ -29,8 +29,9 @@ OPERATIONS = {
     "softplus": "torch_softplus({0})[0]",
     "softplus_slope": "torch_softplus({0})[1]",
     "logistic": "logistic({0})",
-    "max": "({1} if {1} > {0} else {0})",
-    "min": "({1} if {1} < {0} else {0})",
+    # what is no number stays none, whichever of both it is
+    "max": "({1} if ({1} > {0}) | ({1} != {1}) else {0})",
+    "min": "({1} if ({1} < {0}) | ({1} != {1}) else {0})",
     "choose": "({1} if {0} > zero else {2})",
 }
 _PAIR = ("softplus", "softplus_slope")
@@ -141,6 +142,13 @@ class Loop:
         still = {*self.fixed, *self.scalars}
         ends = {n: b for n, b in bar.items() if not varies[n] and not set(symbols([n])) <= still}
         return stored, ends
+
+    def of_numbers(self, formulas: Mapping[str, Expr]) -> list[str]:
+        """Lines that compute formulas of numbers by their names."""
+        parts = below(formulas.values())
+        names = self.names(parts)
+        lines, _ = self.lines(parts, dict.fromkeys(parts, False), names)
+        return lines + [f"{name} = {names[node]}" for name, node in formulas.items()]
 
     def names(self, outputs: Sequence[Expr], prefix: str = "n") -> dict[Expr, str]:
         found = {}

@@ -23,7 +23,7 @@ FIXED_STEP = tuple(
 GRADIENTS = ("adjoint", "discrete")
 
 
-def _whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
+def whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
     """Time grid of one step per unit between the first and the last time, either direction."""
     n = round(float((t[-1] - t[0]).abs()))
     return (
@@ -88,13 +88,22 @@ class TorchdiffeqSolver:
         self.rtol, self.atol = rtol, atol
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
+        """Simulate from the first measured state, at the batch's sampling times.
+
+        Raises:
+            SimulationError: a simulated state is not a finite number.
+        """
+        return check_finite(self.solve(system, batch), batch)
+
+    def solve(self, system: System, batch: Batch) -> Trajectory:
+        """The same, states that are no finite numbers among them."""
         n = substeps(batch.dt, self.dt, system)
         method = self.method or system.step
         rates = Rates(system, batch, n, method if method in METHODS else "euler")
         y0 = system.initial(batch, batch.dt / n)
         t = n * torch.arange(batch.n_samples, dtype=y0.dtype, device=y0.device)
         method = STAGES.get(method, method)
-        options = {"grid_constructor": _whole_steps} if method in FIXED_STEP else {}
+        options = {"grid_constructor": whole_steps} if method in FIXED_STEP else {}
         kwargs: dict[str, Any] = {
             "method": method,
             "rtol": self.rtol,
@@ -106,5 +115,4 @@ class TorchdiffeqSolver:
             y = odeint_adjoint(rates, y0, t, adjoint_params=trained, **kwargs)
         else:
             y = odeint(rates, y0, t, **kwargs)
-        x, v = system.observe(y, batch)
-        return check_finite(Trajectory(x, v), batch)
+        return Trajectory(*system.observe(y, batch))

@@ -12,7 +12,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from nnode.data.sequence import collate
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.laws.steps import METHODS, STAGES, stepped
 from nnode.models import Linear, Traffic, build_model
 from nnode.solvers import FusedSolver, TorchdiffeqSolver, Trajectory
@@ -72,6 +72,21 @@ def test_the_ballistic_way_to_a_stop_is_exact() -> None:
         off = sign * (alone(model(BRAKE), SPEEDS, 5.0, method)[0][-1] - SPEEDS**2 / 6)
         assert off.min() > -1e-12
         assert (off <= SPEEDS * DT + 1e-12).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_acceleration_that_is_no_number_shows(method: str) -> None:
+    """The larger of it and of what would stop the car is no number either."""
+    broken = model({"parameters": {"a": "1 m/s²", "L": "5 m"}, "rate": {"v": "a*sqrt(1 - gap/L)"}})
+    time = DT * np.arange(8)
+    near = np.stack([8 * time, 4 + 8 * time], 1)
+    far = np.stack([8 * time, 4 + 16 * time], 1)
+    speeds = np.stack([0 * time + 8, 0 * time + 8], 1)
+    fine, bad = (collate([driven(time, x, speeds)]) for x in (near, far))
+    for solver in (TorchdiffeqSolver(method, "discrete", DT), FusedSolver(DT, method=method)):
+        assert solver(broken, fine).x.isfinite().all()
+        with pytest.raises(SimulationError, match="is not a finite number"):
+            solver(broken, bad)
 
 
 def test_no_speed_is_ever_negative() -> None:

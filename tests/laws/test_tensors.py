@@ -7,10 +7,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from numba import njit
 
+from nnode.laws.arrays import straight
 from nnode.laws.differentiate import derivatives
+from nnode.laws.expression import apply, const
 from nnode.laws.parse import parse
 from nnode.laws.tensors import computed
+from nnode.simulate import loops
 
 FORMULAS = [
     "a*(1 - (b/c)**4) - exp(-a)*log(b)",
@@ -46,6 +50,22 @@ def test_values_and_derivatives(text: str) -> None:
             continue
         slope = computed([own_slopes[name]], values)[0].expand(50)
         torch.testing.assert_close(slope, wanted, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("op", ["max", "min"])
+def test_the_larger_of_a_number_and_none_is_none(op: str) -> None:
+    nan = math.nan
+    values = {"a": np.array([nan, 1.0, nan, 1.0]), "b": np.array([1.0, nan, nan, 2.0])}
+    node = parse(f"{op}(a, b)")
+    wanted = [nan, nan, nan, 2.0 if op == "max" else 1.0]
+    tensors = {name: torch.from_numpy(value) for name, value in values.items()}
+    np.testing.assert_array_equal(computed([node], tensors)[0].numpy(), wanted)
+    np.testing.assert_array_equal(straight((node,))(values, ())[0], wanted)
+    code = njit(error_model="numpy")(eval("lambda a, b: " + loops.OPERATIONS[op].format("a", "b")))
+    pairs = zip(values["a"], values["b"], strict=True)
+    np.testing.assert_array_equal([code(a, b) for a, b in pairs], wanted)
+    folded = [apply(op, const(a), const(b)).value for a, b in zip(*values.values(), strict=True)]
+    np.testing.assert_array_equal(folded, wanted)
 
 
 @pytest.mark.parametrize(

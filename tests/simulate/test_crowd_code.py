@@ -13,8 +13,10 @@ import pytest
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Relaxation, SocialForce
 from nnode.models.crowd_formula import crowd_of
-from nnode.simulate import crowd_templates, crowds, source
-from nnode.simulate.crowd_source import CrowdSource
+from nnode.simulate import source
+from nnode.simulate.crowds import runs as crowds
+from nnode.simulate.crowds import templates as crowd_templates
+from nnode.simulate.crowds.source import CrowdSource
 
 SCRIPT = """
 import json
@@ -26,8 +28,8 @@ batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x
 model = Crowd([Relaxation(), SocialForce(1.0, 1.0, 1.0)])
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulate.crowds import compiled, supports
-from nnode.simulate.crowd_source import CrowdSource
+from nnode.simulate.crowds.runs import compiled, supports
+from nnode.simulate.crowds.source import CrowdSource
 module = compiled(CrowdSource(supports(model)))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
 print(json.dumps({"hits": hits}))

@@ -18,9 +18,10 @@ import torch
 from nnode.errors import ConfigError
 from nnode.models import Linear, Logarithmic, NetworkSpeed, Traffic
 from nnode.models.effects.following import RelativeSpeed
-from nnode.simulate import _math, lanes, source
-from nnode.simulate._cache import digest
-from nnode.simulate.lane_source import LaneSource
+from nnode.simulate import functions, source
+from nnode.simulate.cache import digest
+from nnode.simulate.lanes import runs as lanes
+from nnode.simulate.lanes.source import LaneSource
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from tests.simulate import saturation
 from tests.solvers.fused.compare import difference, gradient, single
@@ -35,7 +36,7 @@ PACKED = {
 #: Calls into the mathematical library, which stay scalar.
 LIBRARY = r"\b(call\w*|movabsq|bl|adrp)\s[^\n]*\b(exp2?|expm1|log1p|log2?|pow)f?\b"
 #: Calls of our own functions that were not inlined.
-CALLED = r"\b(call\w*|movabsq|bl)\s[^\n]*\b_ZN5nnode8simulate\w*_(math|polynomials)"
+CALLED = r"\b(call\w*|movabsq|bl)\s[^\n]*\b_ZN5nnode8simulate\w*(functions|polynomials)"
 
 
 def is_vector_code(text: str, loops: int = 1) -> bool:
@@ -96,7 +97,7 @@ def test_the_guard_sees_scalar_code(body: str) -> None:
     def far(x: float) -> float:
         return np.exp(-x)  # type: ignore[no-any-return]
 
-    names = {"np": np, "far": far, "exp": _math.exp}
+    names = {"np": np, "far": far, "exp": functions.exp}
     text = f"""
 def run(x, out):
     for i in range(len(x)):
@@ -105,7 +106,7 @@ def run(x, out):
         out[i] = x[i] / (3 + out[i])
 """
     exec(text, names)
-    run = numba.njit(error_model="numpy", fastmath=_math.FLAGS)(names["run"])
+    run = numba.njit(error_model="numpy", fastmath=functions.FLAGS)(names["run"])
     run(np.ones(4), np.ones(4))
     assert is_vector_code(run.inspect_asm(run.signatures[0])) == (body == "exp(-x[i])")
 
@@ -169,8 +170,8 @@ batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
 model = Traffic([NetworkSpeed(4)])
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulate import lanes
-from nnode.simulate.lane_source import LaneSource
+from nnode.simulate.lanes import runs as lanes
+from nnode.simulate.lanes.source import LaneSource
 module = lanes.compiled(LaneSource(model.lane))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
 print(json.dumps({"hits": hits}))

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from nnode.discover.crowds.walk import Walk
-from nnode.discover.residuals.engine import trained
+from nnode.discover.residuals.engine import runge_kutta, trained
 from nnode.models.effects.base import Effect
 from nnode.models.term import State
 
@@ -187,13 +187,9 @@ def propagate(jacobian: Tensor, step: float) -> tuple[Tensor, Tensor]:
         for k in range(2):
             out[..., 2 + k, 4 + k] += 1 - share
             out[..., 2 + k, 6 + k] += share
-        return out
+        return step * out
 
-    k1 = rate(0.0, y)
-    k2 = rate(0.5, y + step / 2 * k1)
-    k3 = rate(0.5, y + step / 2 * k2)
-    k4 = rate(1.0, y + step * k3)
-    y = y + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    y = runge_kutta(rate, 0.0, y, 1.0, rate(0.0, y))
     start = torch.zeros(p, f, 2, 4, dtype=jacobian.dtype)
     forced = torch.zeros(p, f, 2, f, 2, dtype=jacobian.dtype)
     state = torch.zeros(p, 4, 4 + 2 * f, dtype=jacobian.dtype)

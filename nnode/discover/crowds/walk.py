@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import takewhile
 from typing import cast
 
@@ -12,13 +13,13 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
-from nnode.discover.residuals.engine import trained
+from nnode.discover.residuals.engine import runge_kutta, trained
 from nnode.models.crowd import NetworkForce
 from nnode.models.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
 from nnode.models.formula import own_values, values_of
 from nnode.models.system import Crowd, System
 from nnode.models.term import State, Term
-from nnode.simulate.walk_source import WalkSource, compiled
+from nnode.simulate.crowds.alone import WalkSource, compiled
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -42,7 +43,7 @@ class Beyond(nn.Module):
 
 @dataclass
 class Tables:
-    """What the compiled code knows of the surroundings, see :mod:`nnode.simulate.walk_source`."""
+    """What the compiled code knows of the surroundings, see :mod:`nnode.simulate.crowds.alone`."""
 
     others: np.ndarray
     window: np.ndarray
@@ -170,14 +171,11 @@ class Walk:
         parameters = self.parameters(rows)
         if self.compiled:
             return self._compiled(parameters, rows, first[which, who])
-        y, h = first.expand(len(rows), *first.shape).clone(), windows.step
+        y = first.expand(len(rows), *first.shape)
         out = [y[:, which, who]]
-        for k in range(windows.steps):
-            k1 = self._rate(parameters, 2 * k, y)
-            k2 = self._rate(parameters, 2 * k + 1, y + h / 2 * k1)
-            k3 = self._rate(parameters, 2 * k + 1, y + h / 2 * k2)
-            k4 = self._rate(parameters, 2 * k + 2, y + h * k3)
-            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        for n in range(windows.steps):
+            rate = partial(self._change, parameters, 2 * n)
+            y = runge_kutta(rate, 0.0, y, 1.0, rate(0.0, y))
             out.append(y[:, which, who])
         return torch.stack(out)
 
@@ -191,11 +189,11 @@ class Walk:
         windows, h, q = self.windows, self.windows.step, self.of_law(rows)
         out = np.empty((windows.steps + 1, len(rows), *start.shape))
         out[0] = start.numpy()
-        fixed = (*self.tables.arguments(), q)
         before = self._extra(parameters, q, 0, out[0])
         after = before
         for n in range(windows.steps):
-            self.kernel.advance(out[n], before, after, out[n + 1], n, h, *fixed)
+            rate = partial(self._change_by_law, q, 2 * n, before, after)
+            out[n + 1] = runge_kutta(rate, 0.0, out[n], 1.0, rate(0.0, out[n]))
             if self.beyond.added:
                 found = self._extra(parameters, q, 2 * n + 2, out[n + 1])
                 bend = found - after if n else 0.0
@@ -203,6 +201,24 @@ class Walk:
                 out[n + 1, ..., 2:] += h / 2 * (found - after) - h / 12 * bend
                 before, after = found, 2 * found - before
         return torch.from_numpy(out)
+
+    def _change_by_law(
+        self, q: np.ndarray, moment: int, before: np.ndarray, after: np.ndarray, share: float,
+        states: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
+        """``(R, P, 4)``: change of states in a step from a moment on, at a share of it."""
+        own = self._of_law(q, moment + round(2 * share), states)
+        own += (1 - share) * before + share * after
+        return self.windows.step * np.concatenate([states[..., 2:], own], -1)
+
+    def _of_law(self, q: np.ndarray, moment: int, states: np.ndarray) -> np.ndarray:
+        """``(R, P, 2)`` m/s² of the compiled law, of states ``(R, P, 4)`` at one half step."""
+        r, p = states.shape[:2]
+        found: np.ndarray = self.kernel.accelerations(
+            states.reshape(r * p, 4), np.tile(np.arange(p), r), np.full(r * p, moment),
+            np.repeat(np.arange(r), p), *self.tables.arguments(), q,
+        )  # fmt: skip
+        return found.reshape(r, p, 2)
 
     def _extra(
         self, parameters: dict[str, Tensor], q: np.ndarray, moment: int, states: np.ndarray
@@ -215,22 +231,18 @@ class Walk:
         v = self.windows.batch.v[moment].expand_as(x).clone()
         state = torch.from_numpy(states)
         x[:, which, who], v[:, which, who] = state[..., :2], state[..., 2:]
-        rate, p = torch.zeros_like(x), len(which)
-        found = self.kernel.accelerations(
-            states.reshape(r * p, 4),
-            np.tile(np.arange(p), r),
-            np.full(r * p, moment),
-            np.repeat(np.arange(r), p),
-            *self.tables.arguments(),
-            q,
-        )
-        rate[:, which, who] = torch.from_numpy(found).reshape(r, p, 2)
+        rate = torch.zeros_like(x)
+        rate[:, which, who] = torch.from_numpy(self._of_law(q, moment, states))
         return self._beyond(parameters, moment, x, v, rate)[:, which, who].numpy()
 
-    def _rate(self, parameters: dict[str, Tensor], moment: int, y: Tensor) -> Tensor:
-        """``(R, W, N, 4)``: time derivative of states at one half step."""
+    def _change(
+        self, parameters: dict[str, Tensor], moment: int, share: float, y: Tensor
+    ) -> Tensor:
+        """``(R, W, N, 4)``: change of states in a step from a moment on, at a share of it."""
         x, v = y[..., :2], y[..., 2:]
-        return torch.cat([v, self._beyond(parameters, moment, x, v, torch.zeros_like(x))], -1)
+        now = moment + round(2 * share)
+        rate = self._beyond(parameters, now, x, v, torch.zeros_like(x))
+        return self.windows.step * torch.cat([v, rate], -1)
 
     def _beyond(
         self, own: dict[str, Tensor], moment: int, x: Tensor, v: Tensor, rate: Tensor

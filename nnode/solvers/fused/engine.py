@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -12,10 +13,14 @@ from torch import Tensor, nn
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.laws.steps import METHODS
+from nnode.models.formula import rule_of
 from nnode.models.system import System
-from nnode.simulate import crowds, lanes, neighbours
+from nnode.models.term import Term
+from nnode.simulate import lanes
+from nnode.simulate.crowds import cells
+from nnode.simulate.crowds import runs as crowds
 from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.fused import fallback
+from nnode.solvers.ode import TorchdiffeqSolver
 
 log = logging.getLogger(__name__)
 
@@ -29,9 +34,8 @@ class FusedSolver:
     from which it differs by O(dt).
 
     Models whose law and effects are formulas (see :mod:`nnode.laws`) run compiled. Any other
-    model, with a term that is code of its own, goes through
-    :mod:`nnode.solvers.fused.fallback`: the same gradient, at the speed of PyTorch. The solver
-    warns of it once.
+    model, with a term that is code of its own, goes through torchdiffeq: the same gradient, at the
+    speed and with the memory of PyTorch. The solver warns of it once.
 
     The first call for a law compiles (seconds) and keeps the result in the user's cache
     folder, or in NNODE_CACHE where this environment variable is set.
@@ -47,7 +51,7 @@ class FusedSolver:
         cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
             left out, in units of A. The acceleration of one person is then off by less than
             ``cutoff_error`` A / m through people, and as much through walls; see
-            :func:`nnode.simulate.neighbours.cutoff_distance`. 0 lets everybody meet
+            :func:`nnode.simulate.crowds.cells.cutoff_distance`. 0 lets everybody meet
             everybody.
         method: of lanes, one of :data:`nnode.laws.steps.METHODS`; None takes ``ballistic`` for
             accelerations and ``euler`` for speeds.
@@ -75,7 +79,7 @@ class FusedSolver:
                 f"solver.method={method} is unknown to solver=fused, expected one of "
                 f"{', '.join(METHODS)}, or null for the law's own"
             )
-        neighbours.check_cutoff(cutoff, cutoff_error)
+        cells.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads
         self.cutoff, self.cutoff_error = cutoff, cutoff_error
         self.method, self.uncompiled = method, ""
@@ -95,7 +99,7 @@ class FusedSolver:
             y = lanes.simulate(system, lane, batch, n, self.threads, method=self.method)[:, 0]
             found = Trajectory(*system.observe(y, batch))
         else:
-            found = self._other(system, batch, n, list(system.parameters()))
+            found = self._other(system, batch, n)
         return check_finite(found, batch)
 
     def ensemble(
@@ -127,7 +131,7 @@ class FusedSolver:
         found = []
         for r in range(len(next(iter(stacked.values())))):
             own = {name: value[r] for name, value in stacked.items()}
-            found.append(self._other(_replaced(system, own), batch, n, list(own.values())))
+            found.append(self._other(_replaced(system, own), batch, n))
         x = torch.stack([run.x for run in found], 1)
         speeds = [run.v for run in found if run.v is not None]
         return Trajectory(x, torch.stack(speeds, 1) if speeds else None)
@@ -143,7 +147,7 @@ class FusedSolver:
             )
         return substeps(batch.dt, self.dt, system)
 
-    def _other(self, system: System, batch: Batch, n: int, parameters: list[Tensor]) -> Trajectory:
+    def _other(self, system: System, batch: Batch, n: int) -> Trajectory:
         law = crowds.supports(system, batch)
         if law is not None:
             found = crowds.simulate(
@@ -152,14 +156,23 @@ class FusedSolver:
             return Trajectory(*found)
         # the relaxation alone is a baseline, and cheap
         if not self.uncompiled and not crowds.without_partners(system):
-            self.uncompiled = fallback.reason(system)
+            self.uncompiled = _reason(system)
             log.warning(
-                "solver=fused works in batched PyTorch and not in compiled code: %s; the gradient "
-                "is the same, but costs up to hundreds of times as much, see docs/performance.md",
+                "solver=fused works in PyTorch and not in compiled code: %s; the gradient is the "
+                "same, but costs up to hundreds of times as much, see docs/performance.md",
                 self.uncompiled,
             )
-        y = fallback.simulate(system, batch, n, parameters)
-        return Trajectory(*system.observe(y, batch))
+        return TorchdiffeqSolver(self.method, "discrete", self.dt).solve(system, batch)
+
+
+def _reason(system: System) -> str:
+    """Why compiled code is not used, in words: terms that it does not cover, by their names."""
+    terms = cast(list[Term], list(system.terms))
+    names = ", ".join(t.name for t in terms if rule_of(t) is None or (t.memory and t.rule is None))
+    if names:
+        return f"it does not cover {names}"
+    alone = "models that begin with a law of the gap, without people who meet themselves and others"
+    return f"it covers {alone} on the CPU, without a gradient by what was measured"
 
 
 def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:

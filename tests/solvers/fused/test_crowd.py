@@ -16,11 +16,11 @@ from nnode.errors import ConfigError, SimulationError
 from nnode.models import Crowd, Linear, NetworkForce, Relaxation, SocialForce, System, Traffic
 from nnode.models.effects import CATALOGUE
 from nnode.models.network import FeedForward
-from nnode.simulate import crowds as compiled
-from nnode.simulate.crowd_rows import SIZE
-from nnode.simulate.crowd_source import CrowdSource
+from nnode.simulate.crowds import runs as compiled
+from nnode.simulate.crowds.rows import SIZE
+from nnode.simulate.crowds.source import CrowdSource
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
-from nnode.solvers.fused import fallback
+from nnode.solvers.fused import engine
 from tests.solvers.fused.compare import difference, single
 from tests.solvers.fused.test_fallback import Sway
 
@@ -56,7 +56,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     def refuse(*args: object) -> None:
         raise AssertionError("the fallback was called")
 
-    monkeypatch.setattr(fallback, "simulate", refuse)
+    monkeypatch.setattr(engine, "TorchdiffeqSolver", refuse)
 
 
 @pytest.fixture
@@ -291,8 +291,14 @@ def test_loops_are_vector_code(name: str) -> None:
     module = compiled.compiled(source)
     for kind in (np.float64, np.float32):
         room, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
-        for function in (module.law_others_pull, module.law_points_pull):  # they divide
-            function(room, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
+        loops = ("law_others_pull", "law_points_pull", "slopes_others", "slopes_points")
+        divide = [getattr(module, one) for one in loops if hasattr(module, one)]
+        assert len(divide) == 2
+        for function in divide:
+            if function.__name__.startswith("law"):
+                function(room, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
+            else:
+                function(room, *(np.ones(32, kind) for _ in range(3)), 32, kind(1))
             text = function.inspect_asm(function.signatures[-1])
             assert re.findall(PACKED[platform.machine()], text), function.__name__
 

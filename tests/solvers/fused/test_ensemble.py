@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Linear, Logarithmic, NetworkSpeed, Relaxation, SocialForce, Traffic
-from nnode.simulate import lanes
+from nnode.simulate.lanes import runs as lanes
 from nnode.solvers import FusedSolver
 from tests.solvers.fused.compare import difference, single
 from tests.solvers.fused.test_fallback import Sway

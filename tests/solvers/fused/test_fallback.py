@@ -11,7 +11,6 @@ from torch import Tensor
 from nnode.models import Crowd, Linear, NetworkSpeed, Relaxation, SocialForce, System, Traffic
 from nnode.models.term import State, Term
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
-from nnode.solvers.fused import fallback
 from tests.solvers.fused.compare import difference, gradient, single
 
 DT = 0.02
@@ -47,11 +46,8 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("worth", [0, fallback._WORTH], ids=["by_step", "batched"])
 @pytest.mark.parametrize("name", MODELS)
-def test_states_and_gradient(name, worth, ragged, crowd, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr(fallback, "_WORTH", worth)
-    monkeypatch.setattr(fallback, "_ROOM", 7000)  # several batched calls, the last one short
+def test_states_and_gradient(name, ragged, crowd) -> None:  # type: ignore[no-untyped-def]
     people = [crowd(3, samples=4, name="a"), crowd(2, samples=3, name="b")]
     batch = single(people if name == "crowd" else ragged)
     model = MODELS[name]()
@@ -65,17 +61,6 @@ def test_states_and_gradient(name, worth, ragged, crowd, monkeypatch) -> None:  
     found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
     wide, same = TorchdiffeqSolver("euler", "discrete", DT), batch.to(dtype=torch.float32)
     assert difference(own, gradient(model, wide, same)[1]) < 1e-4
-
-
-def test_batched_calls_are_batched(ragged, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    calls = []
-    rates = fallback._Problem.rates
-    monkeypatch.setattr(
-        fallback._Problem, "rates", lambda self, s, y: calls.append(len(s)) or rates(self, s, y)
-    )
-    batch, model = single(ragged), Traffic([Linear(18.0, 4.0), Sway()])
-    gradient(model, FusedSolver(DT), batch)
-    assert calls == [60]
 
 
 def test_frozen_parameters(ragged) -> None:  # type: ignore[no-untyped-def]
@@ -124,7 +109,7 @@ def test_it_is_said_once_in_a_run_and_why(name, ragged, crowd, caplog) -> None: 
             solver(system, batch)
     (record,) = caplog.records
     assert record.levelname == "WARNING"
-    for words in ("batched PyTorch", SAID[name], "docs/performance.md"):
+    for words in ("in PyTorch", SAID[name], "docs/performance.md"):
         assert words in record.getMessage()
     assert solver.uncompiled in record.getMessage()
 

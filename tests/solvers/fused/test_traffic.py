@@ -12,7 +12,7 @@ from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.models import Linear, Logarithmic, NetworkSpeed, Traffic
 from nnode.simulate import lanes
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
-from nnode.solvers.fused import fallback
+from nnode.solvers.fused import engine
 from tests.solvers.fused.compare import difference, gradient, single
 
 DT = 0.01
@@ -36,7 +36,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     def refuse(*args: object) -> None:
         raise AssertionError("the fallback was called")
 
-    monkeypatch.setattr(fallback, "simulate", refuse)
+    monkeypatch.setattr(engine, "TorchdiffeqSolver", refuse)
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])

@@ -21,18 +21,20 @@ from nnode.models.formula import own_values, values_of
 from nnode.models.scene import Scene
 from nnode.models.system import Crowd, System
 from nnode.models.term import Term
-from nnode.simulate import _math, _polynomials, crowd_rows, lane_rows, least, neighbours
-from nnode.simulate._cache import digest, keep
-from nnode.simulate.crowd_rows import LANES, SIZE
-from nnode.simulate.crowd_source import CrowdSource
-from nnode.simulate.neighbours import check_cutoff, cutoff_distance
+from nnode.simulate import functions, polynomials
+from nnode.simulate.cache import digest, keep
+from nnode.simulate.crowds import cells, least
+from nnode.simulate.crowds import rows as crowd_rows
+from nnode.simulate.crowds.cells import check_cutoff, cutoff_distance
+from nnode.simulate.crowds.rows import LANES, SIZE
+from nnode.simulate.crowds.source import CrowdSource
 from nnode.simulate.threads import run_all
 
 #: From so many people on, social forces use cell lists. They are faster for 50 already; smaller
 #: crowds, and so most recordings, are exact to rounding instead.
 LISTS_FROM = 200
 #: Compiled into every module besides its own text.
-_COMPILED_IN = (crowd_rows, lane_rows, least, neighbours, _math, _polynomials)
+_COMPILED_IN = (crowd_rows, least, cells, functions, polynomials)
 
 
 @cache
@@ -200,7 +202,7 @@ def simulate(
     scheme. Simulations of fewer than LISTS_FROM people, and all models without a cutoff in which
     more than a social force acts between people, let everybody meet everybody. Others use cell
     lists: social forces that are smaller than ``cutoff_error`` times A are left out. See
-    :func:`nnode.simulate.neighbours.cutoff_distance` for the bound of the sum.
+    :func:`nnode.simulate.crowds.cells.cutoff_distance` for the bound of the sum.
 
     Args:
         substeps: Euler steps in a sampling interval.

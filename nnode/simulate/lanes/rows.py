@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-from nnode.simulate._math import INLINE, real
+from nnode.simulate.functions import INLINE, real
 
 #: Rows are computed in multiples of this: four of the widest vectors of float32.
 CHUNK = 64
 
-_SUM: Any = {**INLINE, "fastmath": {"contract", "nsz", "reassoc"}}
 _SCALAR: Any = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 
@@ -24,12 +25,6 @@ _SCALAR: Any = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
 def padded(number: int) -> int:
     """The next multiple of CHUNK."""
     return (number + CHUNK - 1) // CHUNK * CHUNK
-
-
-@njit(**_SUM)
-def add(total: Any, value: Any) -> Any:
-    """A sum whose order the compiler may choose; nothing else in a loop may be reordered."""
-    return total + value
 
 
 @njit(**_SCALAR)
@@ -65,10 +60,23 @@ def collect(row: Any, values: Any, low: int, width: int, w: int, vehicles: int) 
             row[i * w + b] = 0
 
 
-@njit(**INLINE)
-def copy(target: Any, source: Any, number: int) -> None:
-    for k in range(number):
-        target[k] = source[k]
+_memmove: Any = cgutils.raw_memmove
+
+
+@intrinsic
+def copy(typing_context: Any, target: Any, source: Any, number: Any) -> Any:
+    """The first numbers of a row to another one, which may be the same array further on: a loop
+    that cannot know how far would take them one by one."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        rows = [
+            context.make_array(kind)(context, builder, value).data
+            for kind, value in zip(signature.args[:2], args[:2], strict=True)
+        ]
+        _memmove(builder, *rows, args[2], context.get_abi_sizeof(rows[0].type.pointee))
+        return context.get_dummy_value()
+
+    return types.none(target, source, types.intp), emit
 
 
 @njit(**_SCALAR)

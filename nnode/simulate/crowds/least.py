@@ -11,7 +11,7 @@ from typing import Any
 
 from numba import njit
 
-from nnode.simulate.crowd_rows import LOOP
+from nnode.simulate.crowds.rows import LOOP
 
 #: Everybody's smallest values; they are computed behind the sums, which they may depend on.
 LEAST = """
@@ -54,9 +54,9 @@ def least_{over}_pull(
             weigh_one(room, WEIGHTS_{over}, which, weighed, low, who)
             clear_end(room, WEIGHTS_{over}, n, filled(n))
             law_{over}_pull(room, 0, filled(n), q, t, dt, 0, total)
-            increase(to_own, TO_BOTH_{over}, low, room, n)
-            increase(to_own, TO_OWN_{over}, low, room, n)
-            increase(weighed, TO_FROM_{over}, low, room, n)
+            increase(to_own, TO_BOTH_{over}, low, None, low, room, n)
+            increase(to_own, TO_OWN_{over}, low, None, low, room, n)
+            increase(weighed, TO_FROM_{over}, low, None, low, room, n)
             decrease_those(to_other, TO_BOTH_{over}, room, who)
 """
 

@@ -5,7 +5,7 @@ weighted sums of differences between a receiver and a source, then
 
 * the weights of the former leave the sum: what is summed are the functions alone;
 * the latter are differences of one number of the receiver and one of the source, so that per pair
-  only a difference and a function are left.
+  only a difference and a function are left; nothing but their sum is written.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def split(law: CrowdLaw, uniform: Sequence[str]) -> tuple[CrowdLaw, dict[str, di
         found = law.sums[over]
         outer = {name: _weights(summand, same) for name, summand in found.items()}
         inner = list(dict.fromkeys(g for _, weights in outer.values() for g in weights))
-        if not inner or not all(g.op in UNARY for g in inner):
+        if not inner or inner[0].op not in UNARY or len({g.op for g in inner}) > 1:
             continue
         numbers = [_weights(g.args[0], same) for g in inner]
         if not all(s.op == "symbol" and s.value in parts for _, w in numbers for s in w):

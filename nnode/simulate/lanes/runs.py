@@ -20,9 +20,10 @@ from nnode.laws.tangent import with_tangents
 from nnode.models.formula import inputs_of, starts_of
 from nnode.models.system import System, Traffic, initial_with
 from nnode.models.term import Term
-from nnode.simulate import _math, _polynomials, lane_rows
-from nnode.simulate._cache import digest, keep
-from nnode.simulate.lane_source import LaneSource
+from nnode.simulate import functions, polynomials
+from nnode.simulate.cache import digest, keep
+from nnode.simulate.lanes import rows as lane_rows
+from nnode.simulate.lanes.source import LaneSource
 from nnode.simulate.threads import run_all
 
 #: Bytes of one row: a handful of rows are to stay in the first-level cache.
@@ -36,7 +37,7 @@ _BEHIND = 2 * lane_rows.CHUNK
 #: Distances of rows; not powers of two: rows would compete for the same lines of the cache.
 _STRIDES = (1424, 5200, 20800, 83200)
 #: Compiled into every module besides its own text.
-_COMPILED_IN = (lane_rows, _math, _polynomials)
+_COMPILED_IN = (lane_rows, functions, polynomials)
 
 
 @cache

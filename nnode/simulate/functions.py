@@ -10,9 +10,8 @@ function                  value                                  at the ends
 ========================  =====================================  =============================
 ``exp(x)``                e^x                                    0 below, inf above the range
 ``log(x)``                natural logarithm                      -inf at 0, NaN below
-``softplus(x)``           log(1 + e^x)                           0; x
-``logistic(x)``           1 / (1 + e^-x), softplus' derivative   0; 1
-``softplus_logistic(x)``  both, for little more than one         see above
+``logistic(x)``           1 / (1 + e^-x)                         0; 1
+``softplus_logistic(x)``  log(1 + e^x), and its derivative       0; x and 0; 1
 ``torch_softplus(x)``     both, as PyTorch computes them         0; x and 1 for x > 20
 ``real(value, like)``     ``value`` in the type of ``like``
 ========================  =====================================  =============================
@@ -35,9 +34,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numba.extending import overload
 
-from nnode.simulate._polynomials import (
+from nnode.simulate.polynomials import (
     LOG2,
     LOG2E,
     MANTISSA,
@@ -57,6 +57,12 @@ FLAGS = {"contract", "nsz"}
 INLINE: Any = {"forceinline": True, "fastmath": FLAGS, "error_model": "numpy"}
 
 
+@njit(**{**INLINE, "fastmath": {*FLAGS, "reassoc"}})
+def add(total: Any, value: Any) -> Any:
+    """A sum whose order the compiler may choose; nothing else in a loop may be reordered."""
+    return total + value
+
+
 def real(value: float, like: Any) -> Any:
     """``value`` in the type of ``like``; inside compiled functions only."""
     raise TypeError("this function works only inside functions compiled by Numba")
@@ -69,11 +75,6 @@ def exp(x: Any) -> Any:
 
 def log(x: Any) -> Any:
     """Natural logarithm; inside compiled functions only."""
-    raise TypeError("this function works only inside functions compiled by Numba")
-
-
-def softplus(x: Any) -> Any:
-    """log(1 + e^x); inside compiled functions only."""
     raise TypeError("this function works only inside functions compiled by Numba")
 
 
@@ -183,19 +184,6 @@ def _log(x: Any) -> Callable[..., Any] | None:
         y = y if x < infinity else x
         y = -infinity if x == zero else y
         return nan if x < zero else y
-
-    return body
-
-
-@overload(softplus, jit_options=INLINE)
-def _softplus(x: Any) -> Callable[..., Any] | None:
-    if not is_float(x):
-        return None
-    zero = np.float32(0) if x.bitwidth == 32 else np.float64(0)
-
-    def body(x: Any) -> Any:
-        u = _exp_negative(x)
-        return (x if x > zero else zero) + u * log1p_polynomial(u)
 
     return body
 

@@ -13,13 +13,24 @@ from functools import cached_property
 import torch
 
 from nnode.laws.crowd import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdLaw
-from nnode.laws.expression import Expr, below, symbol, symbols
+from nnode.laws.differentiate import derivatives
+from nnode.laws.expression import Expr, apply, below, symbol, symbols
 from nnode.laws.tensors import computed
 from nnode.laws.text import plain
-from nnode.simulate.affine import Feature, split
-from nnode.simulate.crowd_rows import SIZE
-from nnode.simulate.crowd_templates import DENSE, HEAD, KNOW, MEET, OWN, SPARSE, SPARSE_MEET
-from nnode.simulate.least import LEAST
+from nnode.simulate.crowds.least import LEAST
+from nnode.simulate.crowds.neurons import Feature, split
+from nnode.simulate.crowds.rows import SIZE
+from nnode.simulate.crowds.templates import (
+    ARRANGE,
+    DRIVE,
+    HEAD,
+    KNOW,
+    MEET,
+    NEURONS,
+    OWN,
+    PAIRS,
+    SCENE,
+)
 from nnode.simulate.loops import Loop
 
 _STATE = ("x", "y", "vx", "vy")
@@ -29,6 +40,19 @@ _FIELDS = ("goal_x", "goal_y", "pace", "people", "points", "start")
 _APART = ("dx", "dy", "dvx", "dvy")
 _RELATIVE = {OTHERS: _APART, POINTS: ("dx", "dy"), WALLS: ("dx", "dy"), SMALLEST: _APART}
 _COUNT = {POINTS: "points", WALLS: "walls"}
+#: Who meets whom, in a driver: everybody everything, or pairs.
+_PARTNERS = {
+    False: {
+        OTHERS: "length, here, y, here, width, first, shifts",
+        POINTS: "length, here, rows_points, real_points, width, 0, points",
+        WALLS: "length, here, rows_walls, real_walls, width, 0, walls",
+    },
+    True: {
+        OTHERS: "own, pairs, meetings",
+        POINTS: "barriers, touched, touches",
+        WALLS: "solid, every, every.shape[1]",
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -124,7 +148,6 @@ class CrowdSource:
         seen = [name for over in self.over for name in SEEN[over]]
         state = [*self.own, *dict.fromkeys(seen), *(f"{n}_j" for n in self.law.inputs)]
         weights = [f"W_{name}" for name in (*self.sums, "O_x", "O_y")]
-        seen += [z for found in self.features.values() for z in found]
         state += [z for found in self.features.values() for z in found]
         weights += [f"W_{z}" for found in self.features.values() for z in found]
         slopes = [f"D_{name}" for name in (*_STATE, *dict.fromkeys(seen), *self.sums)]
@@ -147,35 +170,26 @@ class CrowdSource:
         places += f"KEPT = np.array({kept}, np.int64).reshape(-1, 2)\n"
         text = HEAD.format(formula="\n".join(lines), rows=len(self.rows), places=places)
         for over, found in self.over.items():
+            if over in self.features:
+                text += self._known(over)
+                continue
             text += self._tables(over)
             text += self.loop.function(f"law_{over}", found)
             text += self.loop.pulled(f"law_{over}_pull", _seeds(found), self._slopes(over), [])
-            if over in self.features:
-                text += self._known(over)
             if over == SMALLEST:
                 text += LEAST.format(over=over, nobody=NOBODY)
                 continue
-            opposite, moving = self.mutual and over == OTHERS, over == OTHERS
-            template = SPARSE_MEET if self.near else MEET
-            moving = moving or over in self.features
-            text += template.format(over=over, mutual=opposite, moving=moving)
+            mutual = self.mutual and over == OTHERS
+            text += PAIRS.format(over=over, mutual=mutual, moving=over == OTHERS)
+            for name, rest in (("", "sums, reaction"), ("_pull", "weight, to_own, to_other")):
+                text += MEET[self.near].format(name=f"{over}{name}", rest=rest, mutual=mutual)
         text += self._own_tables() + self.loop.function("law_own", self._rate)
         text += self.loop.pulled("law_own_pull", _seeds(self._rate), self._slopes_own, [])
-        turned = [("own, sums, rate",), ("own, sums, weight", "to_own, to_sums")]
-        text += OWN.format(
-            **{
-                # rows are columns where everybody meets his neighbours
-                name: "".join(f"    {a} = {a.replace(',', '.T,')}.T\n" for a in arrays)
-                if self.near
-                else ""
-                for name, arrays in zip(("turned", "turned_back"), turned, strict=True)
-            }
-        )
-        return text + (SPARSE if self.near else DENSE).format(**self._pieces())
+        return text + OWN + DRIVE.format(**self._pieces())
 
     def _known(self, over: str) -> str:
         """Features of receivers and of sources, and their gradients."""
-        text, found = "", self.features[over]
+        text, found = "\n\n", self.features[over]
         for whose in ("own", "other"):
             formulas = {z: getattr(feature, whose) for z, feature in found.items()}
             columns = _STATE if over == OTHERS or whose == "own" else _POINT
@@ -191,13 +205,20 @@ class CrowdSource:
             slopes = {row: row[2:] for row in gives}
             text += self.loop.pulled(f"know_{name}_pull", _seeds(formulas), slopes, [])
             text += KNOW.format(name=name, over=over)
+        first, z = self.sums.index(f"{over}_one"), symbol("z")
+        value = apply(self.over[over][f"{over}_s0"].op, z)
+        lines = {
+            "value": self.loop.of_numbers({"value": value}),
+            "slope": self.loop.of_numbers({"slope": derivatives(value, ["z"])["z"]}),
+        }
+        text += NEURONS.format(
+            over=over, first=first, **{k: _lines(2, v).rstrip("\n") for k, v in lines.items()}
+        )
         numbers = {z: i for i, z in enumerate(found)}
         text += self._table(f"KNOWN_{over}", numbers)
         return text + self._table(f"WEIGHED_{over}", {f"W_{z}": i for z, i in numbers.items()})
 
     def _slopes(self, over: str) -> dict[str, str]:
-        if over in self.features:
-            return {f"D_{z}": z for z in self.features[over]}
         used = set(symbols(self.over[over].values()))
         names = [n for n in (*_RELATIVE[over], *_STATE) if n in used]
         names += [n for n in self.sums if n in used]
@@ -212,7 +233,6 @@ class CrowdSource:
         """What a sum takes from receivers and sources, and what it gives back."""
         used, relative, seen = symbols(self.over[over].values()), _RELATIVE[over], [*SEEN[over]]
         apart = {n: relative.index(n) for n in used if n in relative}
-        apart |= {z: i for i, z in enumerate(self.features.get(over, ()))}
         own = {n: self.own.index(n) for n in used if n in self.own}
         other = {n: seen.index(n) for n in used if n in seen and n not in relative}
         other |= {n: self.own.index(n[:-2]) for n in used if n.endswith("_j")}
@@ -247,103 +267,99 @@ class CrowdSource:
     # -- drivers ---------------------------------------------------------------------------------
 
     def _pieces(self) -> dict[str, object]:
-        meets: list[str] = []
-        pulls: list[str] = []
+        near, sums, width = self.near, len(self.rows_of_sums), len(self.own)
         barriers: list[str] = []
+        meets: list[str] = []
+        pulls = [] if near else [f"repeat(weighed, {sums}, length)"]
         for over in self.over:
             if over == SMALLEST:
                 continue
-            calls, pull = f"meet_{over}(room, ", f"meet_{over}_pull(room, "
-            rest, back = "q, time, dt, total, sums", "q, time, dt, total, weighed, to_own"
-            if self.near:
-                source = {OTHERS: "own, pairs, meetings", POINTS: "barrier, touched, touches",
-                          WALLS: "solid, every, every.shape[1]"}[over]  # fmt: skip
-                near = (
-                    "touched, touches = points_near(own[:, 0], own[:, 1], barrier[:, 0], "
-                    "barrier[:, 1], cells, start, cutoff_wall, touched)"
+            if near and over == POINTS:
+                near_them = (
+                    "touched, touches = points_near(own[0], own[1], barriers[0], barriers[1], "
+                    "cells, start, cutoff_wall, touched)"
                 )
-                for found, call, end in ((meets, calls, rest), (pulls, pull, back)):
-                    found += [near] if over == POINTS else []
-                    found.append(f"{call}own, {source}, {end})")
+                meets.append(near_them)
+                pulls.append(near_them)
+            elif not near and over != OTHERS:
+                found = f"barrier(members, people, {_COUNT[over]}, table_{over})"
+                barriers.append(f"rows_{over}, real_{over} = {found}")
+            if over in self.features:
+                self._of_neurons(over, barriers, meets, pulls)
                 continue
-            count = _COUNT.get(over, "")
-            source = f"y, length, exists, rows_{over}, real_{over}, width, 0, {count}"
-            if over == OTHERS:
-                source = "y, length, exists, y, exists, width, first, shifts"
-            else:
-                table = f"barrier(members, people, {count}, table_{over})"
-                barriers.append(f"rows_{over}, real_{over} = {table}")
-            if over in self.features:
-                barriers += self._spaces(over)
-                meets += self._knowing(over)
-                pulls += self._knowing(over)
-                source = source.replace("y, length", f"own_{over}, length").replace(
-                    "exists, y," if over == OTHERS else f"rows_{over},",
-                    f"exists, other_{over}," if over == OTHERS else f"other_{over},",
-                )
-                back = back.replace("to_own", f"to_own_{over}")
-                pulls += [f"clear(to_own_{over})", f"clear(to_other_{over})"]
-            meets.append(f"{calls}{source}, {rest}, reaction)")
-            to_other = f"to_other_{over}" if over in self.features else "to_other"
-            pulls.append(f"{pull}{source}, {back}, {to_other})")
-            if over in self.features:
-                pulls += self._given_back(over)
+            call = f"room, own, {_PARTNERS[near][over]}, q, time, dt, total"
+            meets.append(f"meet_{over}({call}, sums, reaction)")
+            pulls.append(f"meet_{over}_pull({call}, weighed, to_own, to_other)")
+        if not near:
+            meets += ["fold(sums, reaction, length)"] if self.mutual else []
+            pulls.append("fold(to_own, to_other, length)")
+        inner = {"width": width, "mutual": self.mutual}
+        arrays = {
+            "blank": ("blank", "scattered"),
+            "reaction": (f"blank({sums}, 2 * length, y0)", "sums"),
+            "weighed": (f"blank({sums}, 2 * length, grad_y0)",
+                        f"scattered({sums}, length, grad_y0)"),
+            "to_other": ("blank(4, 2 * length, grad_y0)", "to_own"),
+        }  # fmt: skip
         return {
             **self._moving(),
-            "width": len(self.own), "sums": len(self.rows_of_sums), "mutual": self.mutual,
-            "kept_width": 4 + len(self.kept), "meets": _lines(3, meets),
+            **{name: both[near] for name, both in arrays.items()},
+            "scene": SCENE[near].format(**inner).strip("\n"),
+            "arrange": ARRANGE[near].format(**inner).strip("\n"),
+            "sums": sums, "kept_width": 4 + len(self.kept), "meets": _lines(3, meets),
             "pulls": _lines(3, pulls), "barriers": _lines(2, barriers),
         }  # fmt: skip
 
     def _moving(self) -> dict[str, str]:
         """How states move, and how their adjoints go back; smallest values."""
         second, least = self.law.order == 2, SMALLEST in self.over
-        place = ("y[c, t] += move[t] * y[2 + c, t]", "y[i, c] += dt * y[i, 2 + c]")
-        placed = ("adjoint[2 + c, t] += move[t] * adjoint[c, t]",
-                  "adjoint[i, 2 + c] += dt * adjoint[i, c]")  # fmt: skip
-        names = ("place", "place_near", "placed", "placed_near")
-        found = dict(zip(names, (*place, *placed) if second else ("pass",) * 4, strict=True))
-        call = f"least_{SMALLEST}(room, y, length, exists, width, q, time, dt, total, sums)"
+        call = f"least_{SMALLEST}(room, y, length, here, width, q, time, dt, total, sums)"
         back = (
             f"least_{SMALLEST}_pull(room, y, length, width, q, time, dt, total, sums, weighed, "
             "to_own, to_other)"
         )
-        found |= {"leasts": _lines(3, [call] if least else [])}
-        found |= {"least_pulls": _lines(3, [back] if least else [])}
-        return found | {"moved": "2 + c" if second else "c"}
+        return {
+            "leasts": _lines(3, [call] if least else []),
+            "least_pulls": _lines(3, [back] if least else []),
+            "moved": "2 + c" if second else "c",
+            "place": "y[c, t] += move[t] * y[2 + c, t]" if second else "pass",
+            "placed": "adjoint[2 + c, t] += move[t] * adjoint[c, t]" if second else "pass",
+        }
 
-    def _spaces(self, over: str) -> list[str]:
-        """Places for features, and for their gradients."""
-        number = len(self.features[over])
-        size = "2 * length" if over == OTHERS else f"rows_{over}.shape[1]"
-        return [
-            f"own_{over}, other_{over} = blank({number}, length, y), blank({number}, {size}, y)",
+    def _of_neurons(self, over: str, before: list[str], meets: list[str], pulls: list[str]) -> None:
+        """Features of everybody, from somebody's place on, for large numbers cost digits; sums of
+        functions of their differences; and the gradients."""
+        others = over == OTHERS
+        number, rest = len(self.features[over]), "q, time, dt, total"
+        size, rows = ("2 * length", "y") if others else (f"rows_{over}.shape[1]", f"rows_{over}")
+        there, first, last = ("here", "first", "shifts") if others else (
+            f"real_{over}", "0", _COUNT[over])  # fmt: skip
+        before += [
+            f"own_{over}, other_{over} = blank({number}, length, y), "
+            f"blank({number}, {size} + LANES, y)",
             f"to_own_{over}, to_other_{over} = 0 * own_{over}, 0 * other_{over}",
         ]
-
-    def _knowing(self, over: str) -> list[str]:
-        """Features of everybody; from somebody's place on, for large numbers cost digits."""
-        source = "y" if over == OTHERS else f"rows_{over}"
-        number = "2 * length" if over == OTHERS else f"rows_{over}.shape[1]"
-        rest = "q, time, dt, total"
-        return [
+        knowing = [
             f"all_own_{over}(room, y, y, length, {rest}, own_{over})",
-            f"all_other_{over}(room, {source}, y, {number}, {rest}, other_{over})",
+            f"all_other_{over}(room, {rows}, y, {size}, {rest}, other_{over})",
         ]
-
-    def _given_back(self, over: str) -> list[str]:
-        rest = "q, time, dt, total"
-        found = [f"all_own_{over}_pull(room, y, y, length, {rest}, to_own_{over}, to_own)"]
-        if over == OTHERS:
-            return [
-                *found,
-                f"clear(to_own_{over})",
-                f"fold(to_own_{over}, to_other_{over}, length)",
-                f"all_other_{over}_pull(room, y, y, length, {rest}, to_own_{over}, to_own)",
-            ]
-        number = f"rows_{over}.shape[1]"
-        call = f"all_other_{over}_pull(room, rows_{over}, y, {number}, {rest}, to_other_{over}"
-        return [*found, f"{call}, to_own)"]
+        call = f"room, own_{over}, length, other_{over}, {there}, width, {first}, {last}, dt"
+        meets += [*knowing, f"meet_{over}({call}, sums)"]
+        pulls += [
+            *knowing,
+            f"clear(to_own_{over})",
+            f"clear(to_other_{over})",
+            f"meet_{over}_pull({call}, weighed, to_own_{over}, to_other_{over})",
+            f"all_own_{over}_pull(room, y, y, length, {rest}, to_own_{over}, to_own)",
+        ]
+        to_other = f"to_other_{over}"
+        if others:
+            to_other, size = f"to_own_{over}", "length"
+            pulls += [
+                f"clear(to_own_{over})", f"fold(to_own_{over}, to_other_{over}, length)",
+            ]  # fmt: skip
+        back = f"all_other_{over}_pull(room, {rows}, y, {size}, {rest}, {to_other}, to_own)"
+        pulls.append(back)
 
 
 def _seeds(formulas: dict[str, Expr]) -> dict[Expr, Expr]:

@@ -10,10 +10,10 @@ from math import cos, sin, sqrt
 import numpy as np
 from numba import njit
 
-from nnode.simulate.lane_rows import (
-    add, collect, copy, lead_places, masks, padded, place, spread, take,
+from nnode.simulate.lanes.rows import (
+    collect, copy, lead_places, masks, padded, place, spread, take,
 )
-from nnode.simulate._math import INLINE, exp, log, logistic, real, torch_softplus
+from nnode.simulate.functions import INLINE, add, exp, log, logistic, real, torch_softplus
 
 SCALAR = dict(error_model="numpy", fastmath={{"contract", "nsz"}})
 S = np.uint64({stride})
@@ -39,22 +39,20 @@ SIMULATE = '''
 
 @njit(**INLINE)
 def advance(room, n):
+    """Add increments to states; in single precision steps hand their rounding error to the next
+    one (Kahan's summation)."""
     for c in range(STATES):
         y, i = row(room, X, c), row(room, I, c)
-        for k in range(n):
-            y[k] = y[k] + i[k]
-
-
-@njit(**INLINE)
-def advance_compensated(room, n):
-    """Steps that hand their rounding error to the next one (Kahan's summation)."""
-    for c in range(STATES):
-        y, i, e = row(room, X, c), row(room, I, c), row(room, E, c)
-        for k in range(n):
-            step = i[k] - e[k]
-            moved = y[k] + step
-            e[k] = (moved - y[k]) - step
-            y[k] = moved
+        if room.itemsize < 8:
+            e = row(room, E, c)
+            for k in range(n):
+                step = i[k] - e[k]
+                moved = y[k] + step
+                e[k] = (moved - y[k]) - step
+                y[k] = moved
+        else:
+            for k in range(n):
+                y[k] = y[k] + i[k]
 
 
 @njit(**INLINE)
@@ -135,10 +133,7 @@ def forward(jobs, per, dt, drives, y0, fields, number, end, path, every_q, state
             stages(
                 room, path, number, q, step, per, dt, drives, low, width, w, agents, total, False
             )
-            if y0.itemsize < 8:
-                advance_compensated(room, n)
-            else:
-                advance(room, n)
+            advance(room, n)
         leaders(room, path, number, drives, steps - 1, per, 1.0, low, width, w)
         for c in range(STATES):
             take(row(room, X, c), out[c, steps // per], low, width, w)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from nnode.errors import ConfigError
-from nnode.simulate.crowd_rows import LOOP
+from nnode.simulate.crowds.rows import LOOP, scattered
 
 #: Cells are a hair wider than the cutoff, so that no rounding puts partners two cells apart.
 _WIDER = 1.0001
@@ -212,3 +212,61 @@ def with_oneself(pairs: Any, number: int, people: int) -> tuple[Any, int]:
     for i in range(people):
         pairs[0, number + i] = pairs[1, number + i] = i
     return pairs, number + people
+
+
+@njit(**LOOP)
+def who(exists: Any) -> Any:
+    """Indices of what exists."""
+    found, number = np.empty(len(exists), np.int64), 0
+    for i in range(len(exists)):
+        found[number] = i
+        number += 1 if exists[i] > 0 else 0
+    return found[:number]
+
+
+@njit(**LOOP)
+def take(rows: Any, values: Any, chosen: Any) -> None:
+    """Chosen columns of values into rows."""
+    for k in range(len(chosen)):
+        for c in range(rows.shape[0]):
+            rows[c, k] = values[c, chosen[k]]
+
+
+@njit(**LOOP)
+def scene(
+    exists: Any, table_points: Any, table_walls: Any, points: int, walls: int, cutoff: Any
+) -> Any:
+    """What does not move in a simulation: who exists; wall points by cell (4, P), their cells and
+    where every cell begins; walls (4, W); everybody with every wall (2, N W)."""
+    there = who(exists)
+    solid = who(table_points[:points, 4])
+    barriers = scattered(4, len(solid), table_points)
+    take(barriers, table_points.T, solid)
+    cells = grid(barriers[0], barriers[1], cutoff)
+    order, _, start = sort(barriers[0], barriers[1], cells)
+    take(barriers, table_points.T, solid[order])
+    stand = who(table_walls[:walls, 4])
+    long = scattered(4, len(stand), table_walls)
+    take(long, table_walls.T, stand)
+    every = np.empty((2, len(there) * len(stand)), np.int32)
+    for k in range(every.shape[1]):
+        every[0, k], every[1, k] = k // len(stand), k % len(stand)
+    return there, barriers, cells, start, long, every
+
+
+@njit(**LOOP)
+def arranged(y: Any, own: Any, cutoff: Any, first: int, mutual: bool, pairs: Any) -> Any:
+    """Sort people by cell into ``own``.
+
+    Returns:
+        their order, pairs of places in it, the number of those that count.
+    """
+    cells = grid(y[0], y[1], cutoff)
+    order, cell, start = sort(y[0], y[1], cells)
+    take(own, y, order)
+    pairs, number = people_near(own[0], own[1], cells, cell, start, cutoff, pairs)
+    if not mutual:
+        pairs, number = both_ways(pairs, number)
+    if first == 0:
+        pairs, number = with_oneself(pairs, number, own.shape[1])
+    return order, pairs, number

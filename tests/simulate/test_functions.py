@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 from numba import njit
 
-from nnode.simulate import _math
-from nnode.simulate._math import FLAGS
+from nnode.simulate import functions
+from nnode.simulate.functions import FLAGS
 
 KINDS = [np.float32, np.float64]
 
 
 def loop(name: str) -> Callable[[Any, Any], None]:
-    function = getattr(_math, name)
+    function = functions.softplus_logistic if name == "softplus" else getattr(functions, name)
+    first = name == "softplus"
 
     @njit(error_model="numpy", fastmath=FLAGS)
     def run(x: Any, out: Any) -> None:
         for i in range(len(x)):
-            out[i] = function(x[i])
+            out[i] = function(x[i])[0] if first else function(x[i])
 
     return run  # type: ignore[no-any-return]
 
@@ -104,8 +105,8 @@ def test_pairs_agree_with_their_parts(kind: Any) -> None:
     @njit(error_model="numpy")
     def pairs(x: Any, out: Any) -> None:
         for i in range(len(x)):
-            out[0, i], out[1, i] = _math.softplus_logistic(x[i])
-            out[2, i], out[3, i] = _math.torch_softplus(x[i])
+            out[0, i], out[1, i] = functions.softplus_logistic(x[i])
+            out[2, i], out[3, i] = functions.torch_softplus(x[i])
 
     x = np.linspace(-50, 50, 301).astype(kind)
     out, value, slope = np.empty((4, len(x)), kind), np.empty_like(x), np.empty_like(x)
@@ -121,8 +122,8 @@ def test_pairs_agree_with_their_parts(kind: Any) -> None:
 
 
 def test_functions_are_for_compiled_code() -> None:
-    for name in [*EXACT, "softplus_logistic", "torch_softplus"]:
+    for name in ["exp", "log", "logistic", "softplus_logistic", "torch_softplus"]:
         with pytest.raises(TypeError, match="Numba"):
-            getattr(_math, name)(1.0)
+            getattr(functions, name)(1.0)
     with pytest.raises(TypeError, match="Numba"):
-        _math.real(1.0, 2.0)
+        functions.real(1.0, 2.0)

@@ -18,7 +18,7 @@ from nnode.laws.expression import Expr, apply, const, symbol, symbols
 from nnode.laws.lane import Lane
 from nnode.laws.tensors import SAFE
 from nnode.laws.text import plain
-from nnode.simulate.lane_templates import HEAD, SIMULATE
+from nnode.simulate.lanes.templates import HEAD, SIMULATE
 from nnode.simulate.loops import Loop
 
 #: Weights and times of the stages of a method.
@@ -183,12 +183,17 @@ class LaneSource:
         for s, j in self.lane.ahead:
             own, mask = (s, "behind") if j == 1 else (f"{s}_1", "second")
             text += f"    there = room[_{s} + np.uint64(lo + {j} * w):]\n"
+            text += f"    found = room[_{s}_{j} + np.uint64(lo):]\n"
+            if s in self.lane.linear:
+                # nothing is chosen by them, and what they are where nobody is goes nowhere
+                text += "    copy(found, there, n)\n"
+                continue
+            away = "here[k] + safe" if s == "x" else "here[k]"
             text += (
                 f"    here, mask = room[_{own} + np.uint64(lo):], room[_{mask} + np.uint64(lo):]\n"
+                "    for k in range(n):\n"
+                f"        found[k] = there[k] if mask[k] > zero else {away}\n"
             )
-            text += f"    found = room[_{s}_{j} + np.uint64(lo):]\n    for k in range(n):\n"
-            away = "here[k] + safe" if s == "x" else "here[k]"
-            text += f"        found[k] = there[k] if mask[k] > zero else {away}\n"
         if self.recursive:
             for s, ahead in self.lane.chained.items():
                 text += (

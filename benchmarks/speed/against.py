@@ -1,0 +1,125 @@
+"""This checkout's compiled code and another one's: ``python -m benchmarks.speed.against``.
+
+Each has a process of its own that waits for its turn, so that a busy moment hits both; what is
+compared is CPU time on one thread, and the numbers must be the same up to rounding.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+HERE = Path(__file__).parents[2]
+#: What can be timed: shape and model, and what of it; a gradient, or tangents beside states alone.
+CASES = {
+    "sf": ("crowd", "sf", "gradient"),
+    "nn": ("crowd", "nn", "gradient"),
+    "hall": ("scale", "sf", "gradient"),
+    "n4": ("stress", "n4", "gradient"),
+    "sf+1": ("crowd_effects", "sf+1", "gradient"),
+    "lin_places": ("tangents", "lin_places", "tangents"),
+    "idm_zone": ("tangents", "idm_zone", "tangents"),
+    "lin_ahead": ("tangents", "lin_ahead", "tangents"),
+}
+#: Answers each line with CPU seconds and two numbers that must agree between checkouts.
+_SCRIPT = """
+import sys, time
+import torch
+from benchmarks.speed.engines import torch_call
+from benchmarks.speed.problems import SHAPES, pose
+from nnode.solvers import FusedSolver
+torch.set_num_threads(1)
+name, model, what = sys.argv[1:]
+shape = next(one for one in SHAPES[name] if model in one.models)
+problem = pose(shape, model, torch.float32)
+if what == "gradient":
+    calls = {what: torch_call(problem, FusedSolver(shape.step))}
+else:
+    from benchmarks.speed.tangents import calls as tangent_calls
+    calls = tangent_calls(problem)
+found = {key: call() for key, call in calls.items()}
+last = found[what]
+pair = last if isinstance(last, tuple) else (found["forward"].numpy(), last.numpy())
+print(*(abs(one.astype(float)).sum() for one in pair), flush=True)
+for line in sys.stdin:
+    begin = time.process_time()
+    for _ in range(int(line.split()[1])):
+        calls[line.split()[0]]()
+    print(time.process_time() - begin, flush=True)
+"""
+
+
+class Worker:
+    """A process of one checkout."""
+
+    def __init__(self, checkout: Path, case: str) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _SCRIPT, *CASES[case]], cwd=checkout, env=environment,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.found = [float(number) for number in self._read().split()]
+
+    def _read(self) -> str:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError("a checkout cannot pose this problem, see the error above")
+        return line
+
+    def seconds(self, what: str, times: int) -> float:
+        """CPU time of a call."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{what} {times}\n")
+        self._process.stdin.flush()
+        return float(self._read()) / times
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def compared(case: str, other: Path, rounds: int) -> dict[str, Any]:
+    """One problem by both checkouts, in turns."""
+    workers = {"here": Worker(HERE, case), "other": Worker(other, case)}
+    what = ["forward", "tangents"] if CASES[case][2] == "tangents" else ["gradient"]
+    taken: dict[str, list[float]] = {f"{w} {key}": [] for w in workers for key in what}
+    for key in what:
+        times = max(1, round(0.2 / max(1e-4, workers["here"].seconds(key, 1))))
+        for _ in range(rounds):
+            for name, worker in workers.items():
+                taken[f"{name} {key}"].append(worker.seconds(key, times))
+    for worker in workers.values():
+        worker.close()
+    here, there = workers["here"].found, workers["other"].found
+    found: dict[str, Any] = {"case": case, **{k: median(v) for k, v in taken.items()}}
+    found["difference"] = max(abs(a - b) / abs(b) for a, b in zip(here, there, strict=True))
+    for key in what:
+        pairs = zip(taken[f"here {key}"], taken[f"other {key}"], strict=True)
+        found[f"{key} here / other"] = median(a / b for a, b in pairs)
+    if len(what) > 1:
+        for name in workers:
+            pairs = zip(taken[f"{name} tangents"], taken[f"{name} forward"], strict=True)
+            found[f"{name}: tangents / forward"] = median(a / b for a, b in pairs)
+    return found
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--against", type=Path, required=True, help="another checkout")
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--rounds", type=int, default=15)
+    given = parser.parse_args(arguments)
+    for case in given.cases:
+        print(json.dumps(compared(case, given.against.resolve(), given.rounds)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""People in the plane, in compiled code."""
