@@ -1,0 +1,72 @@
+"""Where the calibration of an effect begins, when another law has shown that it is missing."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from nnode.discover.name import candidate
+from nnode.discover.name.search import _hinted
+from nnode.errors import SimulationError
+from nnode.models import System, build_model
+from nnode.models.effects import CATALOGUE
+from nnode.models.extend import effects_of
+
+ZONE = {"name": "speed_zone", "alpha": 0.5, "a": 10.0, "b": 90.0}
+LATE = {"name": "reaction_delay", "T": 0.7}
+
+
+def lin(*effects: dict[str, Any]) -> System:
+    return build_model({"name": "lin", "term": "lin", "effects": list(effects)}, 0)
+
+
+def names(system: System | None) -> set[str] | None:
+    return None if system is None else {effect.name for effect in effects_of(system)}
+
+
+def test_a_hint_has_the_model_s_effects_and_one_more() -> None:
+    hint = lin(ZONE, LATE)
+    assert names(_hinted(hint, lin(), "speed_zone")) == {"speed_zone"}
+    assert names(_hinted(hint, lin(LATE), "speed_zone")) == {"speed_zone", "reaction_delay"}
+    assert _hinted(hint, lin(), "inertia") is None
+    assert _hinted(hint, lin({"name": "inertia", "tau_v": 0.5}), "speed_zone") is None
+    assert _hinted(None, lin(), "speed_zone") is None
+    assert names(hint) == {"speed_zone", "reaction_delay"}
+
+
+def score() -> Any:
+    return SimpleNamespace(effect=CATALOGUE.effects["reaction_delay"], options={})
+
+
+@pytest.mark.parametrize(
+    ("own", "hinted", "best"),
+    [(9.0, 4.0, 4.0), (3.0, 4.0, 3.0), (None, 4.0, 4.0), (3.0, None, 3.0)],
+)
+def test_the_better_of_two_starts_counts(
+    monkeypatch: pytest.MonkeyPatch, own: float | None, hinted: float | None, best: float
+) -> None:
+    hint = lin(LATE)
+
+    def refine(engine: Any, system: System, **how: Any) -> Any:
+        cost = hinted if system is hint else own
+        if cost is None:
+            raise SimulationError("it blows up")
+        return SimpleNamespace(cost=cost)
+
+    monkeypatch.setattr(candidate, "refine", refine)
+    engine: Any = None
+    before: Any = SimpleNamespace(system=lin())
+    assert candidate.calibrated(engine, before, score(), 0.0, hint).cost == best
+
+
+def test_two_starts_that_blow_up_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refine(*given: Any, **how: Any) -> Any:
+        raise SimulationError("it blows up")
+
+    monkeypatch.setattr(candidate, "refine", refine)
+    engine: Any = None
+    before: Any = SimpleNamespace(system=lin())
+    with pytest.raises(SimulationError, match="reaction_delay blows up on these data"):
+        candidate.calibrated(engine, before, score(), 0.0)
