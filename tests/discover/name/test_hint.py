@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from nnode.app.python.inputs import model_options
 from nnode.discover.name import candidate
 from nnode.discover.name.search import _hinted
 from nnode.errors import SimulationError
@@ -19,7 +20,7 @@ LATE = {"name": "reaction_delay", "T": 0.7}
 
 
 def lin(*effects: dict[str, Any]) -> System:
-    return build_model({"name": "lin", "term": "lin", "effects": list(effects)}, 0)
+    return build_model({**model_options("lin", "measured"), "effects": list(effects)}, 0)
 
 
 def names(system: System | None) -> set[str] | None:
