@@ -242,12 +242,14 @@ def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
 
 
 def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> list[Candidate]:
-    """Candidates in their order, those near the best calibrated to the end: kin differ by less
-    than a rough calibration leaves."""
+    """Candidates in their order, those near the best and its kin calibrated to the end: kin differ
+    by less than a rough calibration leaves."""
     assert found.screen is not None
     ended = []
     for one in candidates:
-        if one.gain.gain >= CLOSE * candidates[0].gain.gain > 0:
+        best = candidates[0]
+        near = one.gain.gain >= CLOSE * best.gain.gain or apart_at(best, one) < APART
+        if best.gain.gain > 0 and near:
             fit = refine(engine, one.fit.system, tolerance=FINE)
             one = _candidate(one.score, fit, found.fit, found.screen, one.removed)
         ended.append(one)
