@@ -16,6 +16,7 @@ from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Provenance, write_page
 from nnode.study.options import StudyOptions
+from nnode.study.runner import KEPT
 
 log = logging.getLogger(__name__)
 
@@ -68,12 +69,12 @@ def study(config: DictConfig, folder: Path) -> None:
     if options.workers < 1:
         raise ConfigError(f"study.workers={options.workers} must be at least 1")
     folder = folder / QUICK if options.quick else folder
-    start = time.monotonic()
+    start, before = time.monotonic(), len(list((folder / KEPT).glob("*.json")))
     with BreakingGuard() as guard:
         try:
             module = cast(Study, import_module(STUDIES[options.name]))
             blocks = module.run(options, folder)
-            made = _made(time.monotonic() - start, options.workers)
+            made = _made(time.monotonic() - start, options.workers, before)
             paths = write_page(
                 [*blocks, made],
                 folder,
@@ -93,11 +94,10 @@ def study(config: DictConfig, folder: Path) -> None:
     print(f"time: {time.monotonic() - start:.1f} s")
 
 
-def _made(seconds: float, workers: int) -> Provenance:
-    """How this run made the page."""
+def _made(seconds: float, workers: int, before: int) -> Provenance:
+    """How this run made the page, and how many results an earlier one had left."""
     facts = how_made(_PACKAGES)
-    time_taken = (
-        f"{seconds:.0f} s in this run with {workers} worker process(es); results that were kept "
-        "before are not computed again"
+    time_taken = f"{seconds:.0f} s in this run with {workers} worker process(es), which " + (
+        f"went on from {before} results of earlier ones" if before else "began with no results"
     )
     return Provenance({**facts, "Time": time_taken})
