@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from scipy.optimize import differential_evolution
 
-from nnode.calibrate.gauss_newton import TangentCost, pooled
+from nnode.calibrate.gauss_newton.method import TangentCost, pooled
 from nnode.files import write_json
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import EVERY

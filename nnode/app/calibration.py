@@ -29,7 +29,7 @@ from nnode.plots import force_figure
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from nnode.calibrate.pooling import Own
+    from nnode.calibrate.gauss_newton.pooling import Own
 
 _BOUND = {"low": "lower", "high": "upper"}
 
@@ -262,9 +262,9 @@ def _by_tangents(
     if not isinstance(trainer.optimizer, GaussNewton):
         return {}, None, speeds
     # compiled code takes a second to import
-    from nnode.calibrate.intervals import intervals
-    from nnode.calibrate.pooling import own_parameters
-    from nnode.calibrate.start_speeds import COSTS
+    from nnode.calibrate.gauss_newton.intervals import intervals
+    from nnode.calibrate.gauss_newton.pooling import own_parameters
+    from nnode.calibrate.gauss_newton.start_speeds import COSTS
     from nnode.solvers.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)

@@ -40,7 +40,9 @@ class Monitor(str, Enum):
 
 
 class Pooling(str, Enum):
-    """Whether all sequences share their parameters, see :mod:`nnode.calibrate.pooling`.
+    """Whether all sequences share their parameters.
+
+    See :mod:`nnode.calibrate.gauss_newton.pooling`.
 
     ``pooled``: they do. ``alone``: each has its own. ``shrunk``: each has its own, drawn towards
     those of all as far as this predicts better.

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs
-from nnode.calibrate.gauss_newton import TangentCost, alone, pooled, sandwich
-from nnode.calibrate.intervals import intervals
+from nnode.calibrate.gauss_newton.intervals import intervals
+from nnode.calibrate.gauss_newton.method import TangentCost, alone, pooled, sandwich
 from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
@@ -120,7 +120,7 @@ def test_shrinkage_pulls_towards_the_pool(pairs: Batch) -> None:
 
 def test_the_sandwich_is_that_of_linear_regression() -> None:
     """With clusters of one sequence it is White's, which can be written down."""
-    from nnode.calibrate.gauss_newton import Curved
+    from nnode.calibrate.gauss_newton.method import Curved
 
     rng = np.random.default_rng(5)
     x, e = rng.standard_normal((40, 2)), rng.standard_normal(40)

@@ -11,9 +11,9 @@ import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import TangentCost
+from nnode.calibrate.gauss_newton.method import TangentCost
+from nnode.calibrate.gauss_newton.pooling import Own, own_parameters
 from nnode.calibrate.options import Pooling
-from nnode.calibrate.pooling import Own, own_parameters
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.solvers import FusedSolver

@@ -8,8 +8,8 @@ import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import TangentCost, pooled
-from nnode.calibrate.start_speeds import StartSpeedCost
+from nnode.calibrate.gauss_newton.method import TangentCost, pooled
+from nnode.calibrate.gauss_newton.start_speeds import StartSpeedCost
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import start_smoothed
 from nnode.errors import ConfigError

@@ -50,9 +50,9 @@ class Calibrator:
         leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
         pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
-            pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
+            pool's, in ``result_.own``; see :mod:`nnode.calibrate.gauss_newton.pooling`.
         start_speeds: ``given``, or ``fitted`` beside the parameters to each training sequence; see
-            :mod:`nnode.calibrate.start_speeds`.
+            :mod:`nnode.calibrate.gauss_newton.start_speeds`.
         optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the
             command does, Gauss and Newton's method for the field's laws, else L-BFGS (where the
             command has the paper's stochastic descent).

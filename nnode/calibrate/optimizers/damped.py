@@ -68,7 +68,7 @@ class GaussNewton(Optimizer):
             return
         self._batch = batch
         # compiled code takes a second to import
-        from nnode.calibrate.start_speeds import COSTS
+        from nnode.calibrate.gauss_newton.start_speeds import COSTS
         from nnode.solvers.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate.gauss_newton import TangentCost
-from nnode.calibrate.pooling import scattered
+from nnode.calibrate.gauss_newton.method import TangentCost
+from nnode.calibrate.gauss_newton.pooling import scattered
 from nnode.models.build import build_model
 from nnode.models.field import FIELD, NEURONS
 from nnode.models.system import System

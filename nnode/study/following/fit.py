@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import Fit, TangentCost, pooled
-from nnode.calibrate.pooling import best_alone
+from nnode.calibrate.gauss_newton.method import Fit, TangentCost, pooled
+from nnode.calibrate.gauss_newton.pooling import best_alone
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
 from nnode.models.build import build_model

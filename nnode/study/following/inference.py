@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate import pooling
-from nnode.calibrate.gauss_newton import TangentCost, pooled, sandwich
+from nnode.calibrate.gauss_newton import pooling
+from nnode.calibrate.gauss_newton.method import TangentCost, pooled, sandwich
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import collate
 from nnode.study.following import data

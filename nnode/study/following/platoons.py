@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import TangentCost
-from nnode.calibrate.pooling import best_alone
+from nnode.calibrate.gauss_newton.method import TangentCost
+from nnode.calibrate.gauss_newton.pooling import best_alone
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.models.build import build_model
 from nnode.models.field import FIELD

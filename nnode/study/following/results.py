@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nnode.calibrate.gauss_newton import TangentCost
+from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.models.system import System

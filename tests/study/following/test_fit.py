@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import TangentCost
+from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
 from nnode.solvers.fused.engine import FusedSolver

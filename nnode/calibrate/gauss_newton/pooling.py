@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.calibrate.gauss_newton import TangentCost, alone, pooled
-from nnode.calibrate.intervals import at_bounds
+from nnode.calibrate.gauss_newton.intervals import at_bounds
+from nnode.calibrate.gauss_newton.method import TangentCost, alone, pooled
 from nnode.calibrate.options import Pooling
 from nnode.data.clusters import clusters, folds, index_of
 from nnode.data.sequence import Batch, Sequence, collate
@@ -58,7 +58,7 @@ def best_alone(
     """Every sequence by itself, the best of several starts.
 
     Args:
-        options: of :func:`nnode.calibrate.gauss_newton.alone`.
+        options: of :func:`nnode.calibrate.gauss_newton.method.alone`.
 
     Returns:
         ``(B, P)`` parameters, ``(B,)`` costs with what a pool adds to them.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton import Curved, TangentCost
+from nnode.calibrate.gauss_newton.method import Curved, TangentCost
 from nnode.calibrate.options import StartSpeeds
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError

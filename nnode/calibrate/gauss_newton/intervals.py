@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as students_t
 
-from nnode.calibrate.gauss_newton import TangentCost, sandwich
+from nnode.calibrate.gauss_newton.method import TangentCost, sandwich
 
 #: Level of intervals.
 LEVEL = 0.95
@@ -26,8 +26,8 @@ def intervals(cost: TangentCost, row: np.ndarray, cluster: np.ndarray) -> dict[s
     """What calibrated parameters of a lane are, and what the data say of them.
 
     Intervals are Student's with one degree of freedom less than there are clusters, on the
-    covariance of :func:`nnode.calibrate.gauss_newton.sandwich`. A parameter at a bound has none:
-    it is where the admissible set ends, and the others' hold for it being there.
+    covariance of :func:`~nnode.calibrate.gauss_newton.method.sandwich`. A parameter at a bound has
+    none: it is where the admissible set ends, and the others' hold for it being there.
 
     Args:
         row: ``(P,)`` at the minimum.

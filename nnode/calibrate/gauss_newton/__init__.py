@@ -1,0 +1,1 @@
+"""Gauss and Newton's method on exact tangents: pooled, alone or shrunk, with intervals."""
