@@ -191,7 +191,7 @@ def diagnose(
         for step, one in zip(found.steps, sealed.tried, strict=False)
     ]
     effects_found += [named_agents(one, agent.confirmed) for one, agent in both if agent.named]
-    leads_found = [*sealed.leads(engine, leads), *imitations]
+    leads_found = [*leads, *imitations]
     leads_found += [
         named_agents(one, agent.confirmed) for one, agent in both if agent.found and not agent.named
     ]

@@ -68,7 +68,6 @@ class Sealed:
 
     Attributes:
         tried: the effects in the order in which they were found, until one failed.
-        whole: the fit with all effects that were found.
     """
 
     def __init__(
@@ -86,20 +85,19 @@ class Sealed:
         self.comparing = Comparing(domain, sealed, base, label)
         self.before = self.comparing.squares(base)
         self.tried: list[_Tried] = []
-        self.whole: Fit | None = None
         self._corrected: Fit | None = None
         self._later: dict[str, Later] = {}
 
-    def confirmed(self, engine: Engine, found: Search) -> tuple[Search, list[Step]]:
+    def confirmed(self, engine: Engine, found: Search) -> tuple[Search, list[NamedEffect]]:
         """A search with the effects that sealed clusters confirm, one after the other, and those
-        that they do not."""
+        that they do not, as they are in the model with all that were found."""
         if not found.steps:
             return found, []
-        self.whole = self._corrected = self._unbiased(found.fit)
+        whole = self._corrected = self._unbiased(found.fit)
         best: Fit | None = None
         scores, passed = self.comparing.scores, 0
         before, square = scores(self.base), np.nanmean(self.before)
-        for fit in self._path(engine, found, self.whole):
+        for fit in self._path(engine, found, whole):
             after = scores(fit.system)
             error = np.nanmean(self.comparing.squares(fit.system))
             p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
@@ -109,8 +107,11 @@ class Sealed:
             before, square, passed, best = after, error, passed + 1, fit
         if passed == len(found.steps):
             return found, []
-        leads = found.steps[passed:]
-        kept = without_steps(engine, found, leads, self.base)
+        rest = found.steps[passed:]
+        tried = [self.tried[-1].p_value] + [float("nan")] * (len(rest) - 1)
+        # before the engine's filter is fitted to what the model leaves without them
+        leads = [named(engine, whole, step, p) for step, p in zip(rest, tried, strict=True)]
+        kept = without_steps(engine, found, rest, self.base)
         self._corrected = best or kept.fit
         return kept, leads
 
@@ -133,16 +134,6 @@ class Sealed:
     def corrected(self, found: Search) -> Fit:
         """The fit with the confirmed effects, without what simulations of it are off by."""
         return found.fit if self._corrected is None or not found.steps else self._corrected
-
-    def leads(self, engine: Engine, steps: list[Step]) -> list[NamedEffect]:
-        """Effects that were not confirmed, as they are in the model with all that were found."""
-        rest = [one.p_value for one in self.tried[-1:]] + [float("nan")] * len(steps)
-        assert self.whole is not None or not steps
-        return [
-            named(engine, self.whole, step, p)
-            for step, p in zip(steps, rest, strict=False)
-            if self.whole is not None
-        ]
 
     def confirmation(self, agents: list[Agents]) -> Confirmation:
         """What is said of the effects that were found: those of the population, or else those with

@@ -43,7 +43,9 @@ class Dense:
     def __init__(self, matrix: Tensor, width: int, dt: float) -> None:
         half, one = dt / 2, torch.eye(matrix.shape[-1], dtype=torch.float64)
         self._half, self._width = half, width
-        self._factors = torch.linalg.lu_factor(one - half * matrix[1:])
+        # a model that blows up may have no solution: what it moves is then no number
+        lu, pivots, _ = torch.linalg.lu_factor_ex(one - half * matrix[1:])
+        self._factors = lu, pivots
         self._before = one + half * matrix[:-1]
 
     def moved(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from nnode.discover.lanes.motion import Slopes
 
@@ -109,7 +110,11 @@ def _inverse(own: Mapping[tuple[int, int], np.ndarray], half: float, width: int)
     matrix += np.eye(width)
     for (p, q), slope in own.items():
         matrix[..., p, q] -= half * slope
-    inverse = 1 / matrix if width == 1 else np.linalg.inv(matrix)
+    if width == 1:
+        inverse = 1 / matrix
+    else:  # of a model that blows up there may be none
+        found, info = torch.linalg.inv_ex(torch.from_numpy(matrix))
+        inverse = torch.where(info[..., None, None] == 0, found, torch.nan).numpy()
     return {
         (p, q): np.ascontiguousarray(inverse[..., p, q])
         for p in range(width)
