@@ -67,6 +67,10 @@ DV = -np.diff(SPEEDS)
             [BARE[0], idm(1, P, v0=0.8 * P.v0), idm(2, P, v0=0.6 * P.v0)],
         ),
         (
+            {"name": "slope", "grade": 0.04, "a": 10.0, "b": 35.0},
+            [BARE[0], BARE[1] - 9.81 * 0.04, BARE[2]],
+        ),
+        (
             {"name": "speed_period", "alpha": 0.7, "a": 40.0, "b": 60.0},
             [idm(i, P, v0=0.7 * P.v0) for i in range(3)],
         ),
