@@ -79,7 +79,7 @@ def scene_criteria(rows: list[dict[str, Any]]) -> pd.DataFrame:
     lines = [
         ("the written answer", "85 %", share(sum(row["right"] for row in rows), len(rows))),
         ("a false name", "5 %", share(sum(bool(row["false"]) for row in rows), len(rows))),
-        ("the law that SUMO drives comes first", "",
+        ("the law that the program has comes first", "",
          share(sum(row["law_right"] for row in known), len(known))),
     ]  # fmt: skip
     return pd.DataFrame(lines, columns=["what", "asked for", "reached"])
