@@ -82,9 +82,11 @@ def test_sumo_s_drivers_mind_the_speed_ahead(
         script, tmp_path, "model=lin", "model.leader=measured", "data=sumo",
         f"data.path={drive}", "data.window=null",
     )  # fmt: skip
-    assert report["verdict"] == "named"
     (effect,) = report["effects"]
     assert effect["name"] == "asymmetric_response"
+    # one kappa for both is its special case, and 24 platoons do not tell them apart at 1 %
+    assert [other["name"] for other in effect["alternatives"]] == ["relative_speed"]
+    assert report["verdict"] == "indistinguishable"
     kappa = {name: c["value"] for name, c in effect["coefficients"].items()}
     assert kappa["kappa_close"] == pytest.approx(KAPPA, abs=0.06)
     # they brake harder than they accelerate
