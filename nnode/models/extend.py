@@ -23,10 +23,11 @@ def extended(system: System, effect: Effect) -> tuple[System, int]:
     return found, place
 
 
-def without(system: System, name: str) -> System:
-    """A copy of a model without the effect of a name."""
+def without(system: System, *names: str) -> System:
+    """A copy of a model without the effects of some names."""
     found = copy.deepcopy(system)
-    del found.terms[place_of(found, name)]
+    for name in names:
+        del found.terms[place_of(found, name)]
     return found
 
 

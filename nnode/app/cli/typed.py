@@ -66,7 +66,8 @@ def group_defaults(section: str, group: str, script: str | None = None) -> dict[
         name = script or HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:
-        config = _written(section, group)
+        schema, own = written(section, group)
+        config = OmegaConf.merge(OmegaConf.structured(schema), own)
     plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
     assert isinstance(plain, dict)
     found = {str(key): value for key, value in plain.items()}
@@ -75,13 +76,12 @@ def group_defaults(section: str, group: str, script: str | None = None) -> dict[
     return found
 
 
-def _written(section: str, group: str) -> Any:
-    """A group as its file has it, without Hydra."""
+def written(section: str, group: str) -> tuple[type, DictConfig]:
+    """A group's schema, and what its file has besides."""
     from nnode.config import SCHEMAS
 
     own = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
-    schema = SCHEMAS[section, str(own.pop("defaults")[0])]
-    return OmegaConf.merge(OmegaConf.structured(schema), own)
+    return SCHEMAS[section, str(own.pop("defaults")[0])], own
 
 
 def changes(prefix: str, values: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:

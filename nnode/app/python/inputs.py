@@ -12,6 +12,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
+from nnode.app.cli.typed import written
 from nnode.calibrate.options import TrainerOptions
 from nnode.data.options import DataOptions, TableOptions
 from nnode.data.prepare import FORMATS
@@ -156,17 +157,14 @@ def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False
     Raises:
         ConfigError: an unknown data set or option, or one that must be given.
     """
-    from nnode.config import SCHEMAS
-
-    known = {path.stem: path for path in (configuration() / "data").glob("*.yaml")}
+    known = {path.stem for path in (configuration() / "data").glob("*.yaml")}
     if data not in known:
         near = get_close_matches(data, known, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ConfigError(
             f"data={data} is unknown, expected one of {', '.join(sorted(known))}{hint}"
         )
-    own = cast(DictConfig, OmegaConf.load(known[data]))
-    schema = SCHEMAS["data", str(own.pop("defaults")[0])]
+    schema, own = written("data", data)
     found = merged("data", schema, own, given)
     if in_memory and OmegaConf.is_missing(found, "path"):
         found.path = ""

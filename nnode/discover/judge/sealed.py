@@ -123,10 +123,7 @@ class Sealed:
         yield whole
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
-        system = fit.system
-        for step in steps:
-            system = without(system, step.chosen.name)
-        return refine(engine, copy.deepcopy(system))
+        return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
 
     def _unbiased(self, fit: Fit) -> Fit:
         return unbiased(fit, self.opened, self.seed) if self.domain == "crowd" else fit

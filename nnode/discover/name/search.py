@@ -221,9 +221,7 @@ def _hinted(hint: System | None, system: System, name: str) -> System | None:
     known = set() if hint is None else {effect.name for effect in effects_of(hint)}
     if hint is None or not wanted <= known:
         return None
-    for other in known - wanted:
-        hint = without(hint, other)
-    return copy.deepcopy(hint)
+    return without(hint, *(known - wanted))
 
 
 def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:
@@ -294,10 +292,9 @@ def without_steps(engine: Engine, found: Search, steps: list[Step], base: System
     """
     if not steps:
         return found
-    kept, system = [step for step in found.steps if step not in steps], found.fit.system
-    for step in steps:
-        system = without(system, step.chosen.name)
-    start = copy.deepcopy(system if kept else base)
+    kept = [step for step in found.steps if step not in steps]
+    names = [step.chosen.name for step in steps]
+    start = without(found.fit.system, *names) if kept else copy.deepcopy(base)
     return replace(found, fit=settled(engine, start, rounds=1), steps=kept)
 
 

@@ -147,12 +147,12 @@ class Slope(Effect):
     formula = "dv/dt - g grade for x in [a, b]"
     second = Rule(
         rate="W - gravity*grade*share",
-        where={"share": _INSIDE.format(at="x")},
-        constants={"edge": (EDGE["m"], "m"), "gravity": (9.81, "m/s^2")},
+        where=SpeedZone.rule.where,
+        constants={**SpeedZone.rule.constants, "gravity": (9.81, "m/s^2")},
     )
     source = "mechanics: the part of gravity along the road, grades being small"
     strengths = {"grade": Strength(0.0, 0.01, Interval(-0.3, 0.3), "1", usual=0.02)}
-    settings = {"a": Setting(0.0, Interval(), "m"), "b": Setting(100.0, Interval(), "m")}
+    settings = SpeedZone.settings
     rank = 65  # behind what drivers feel late
     sought = ()  # a driver makes up for it, and then it is a speed_zone
 
