@@ -56,7 +56,7 @@ def both(model: System, batch: Batch) -> None:
     "name",
     [
         "cfsm",
-        "ttc",
+        pytest.param("ttc", marks=pytest.mark.thorough),
         pytest.param("gcfm", marks=pytest.mark.thorough),
         pytest.param("esf", marks=pytest.mark.thorough),
     ],

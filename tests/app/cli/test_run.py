@@ -44,11 +44,11 @@ def test_a_mapping_takes_any_name() -> None:
     assert composed("train", *overrides).data.columns == {"time": "t"}
 
 
-@pytest.mark.parametrize("name", ["train", "prepare_data", "evaluate", "plot_forces", "export"])
-def test_every_choice_of_every_command_composes(name: str) -> None:
-    for group in composed(name).hydra.runtime.choices:
+def test_every_choice_composes() -> None:
+    # other commands have no group that this one does not have
+    for group in composed("train").hydra.runtime.choices:
         for file in sorted((CONF / group).glob("*.yaml")):
-            composed(name, f"{group}={file.stem}")
+            composed("train", f"{group}={file.stem}")
 
 
 #: What is typed, what the answer has to contain, and the exit status.

@@ -59,9 +59,10 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
             ["model=lin", "solver.dt=0.05", "trainer.max_epochs=2",
              "model.effects=[relative_speed]"],
         ),
-        (
+        pytest.param(
             {"model": "ovm", "optimizer": "lbfgs", "cost": "gap", "epochs": 3},
             ["model=ovm", "optimizer=lbfgs", "trainer.cost=gap", "trainer.max_epochs=3"],
+            marks=pytest.mark.thorough,
         ),
     ],
     ids=["idm", "shrunk", "lin", "ovm"],

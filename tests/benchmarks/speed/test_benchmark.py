@@ -229,6 +229,7 @@ def test_script_refuses_unknown_options(tmp_path) -> None:  # type: ignore[no-un
     assert "Key 'shape' not in" in done.stderr
 
 
+@pytest.mark.thorough  # four new processes that compile
 def test_tangents_of_eight_parameters_are_timed(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     (shape,) = SHAPES["tangents"]
     for model in shape.models:

@@ -334,9 +334,8 @@ def in_groups(people: list[Sequence]) -> list[Sequence]:
 @pytest.mark.parametrize(
     ("base", "chosen"),
     [
-        ("sf", ("sums", "force")),
+        ("sf", ("sums", "force", "walls")),
         pytest.param("nn", ("force",), marks=pytest.mark.thorough),
-        pytest.param("sf", ("walls",), marks=pytest.mark.thorough),  # below, among neighbours
     ],
     ids=str,
 )
@@ -344,6 +343,7 @@ def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> 
     check(with_effects(base, *chosen), single(in_groups(people)), FusedSolver(DT, 2))
 
 
+@pytest.mark.thorough
 def test_effects_among_neighbours(people: list[Sequence]) -> None:
     model, batch = with_effects("sf", "walls"), single(in_groups(people))
     check(model, batch, FusedSolver(DT, cutoff=50.0))
