@@ -53,8 +53,9 @@ def acceleration(
         "length_1": np.full(gap.shape, length), "dt": np.full(gap.shape, 0.1),
     }  # fmt: skip
     known = {name: torch.tensor(np.array(x, dtype=float)) for name, x in values.items()}
-    if "q" in law.lane(law.name).starts:
-        known["q"] = law.get_parameter("T").detach().expand(gap.shape)
+    # a remembered time gap has faded to the common one where driving is even
+    for state in law.lane(law.name).starts:
+        known[state] = law.get_parameter("T").detach().expand(gap.shape)
     with torch.no_grad():
         return np.asarray(law.evaluated(known).expand(gap.shape).numpy())
 

@@ -9,6 +9,7 @@ from nnode.models.build import build_model
 from nnode.models.field import FIELD
 from nnode.models.system import System
 from nnode.study.following import stability
+from nnode.study.following.candidates import EVERY
 from nnode.study.following.stability import FREQUENCIES, Slopes, passed
 
 LENGTH = 4.5
@@ -41,6 +42,15 @@ def test_slopes_of_idm() -> None:
     assert found.s == pytest.approx(2 * a * wish**2 / s**3, rel=1e-5)
     assert found.v == pytest.approx(-a * (4 * v**3 / 30**4 + 2 * wish * 1.2 / s**2), rel=1e-5)
     assert found.dv == pytest.approx(-a * 2 * wish * v / (2 * np.sqrt(a * b) * s**2), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", [n for n in EVERY if not n.startswith(stability.MAPS)])
+def test_every_candidate_has_slopes(name: str) -> None:
+    # found.s is what a platoon passes on by: of no candidate it is nothing at every gap
+    one = EVERY[name].system()
+    found = [stability.slopes(one, gap, 6.0, LENGTH).s for gap in (8.0, 12.0, 20.0)]
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() > 0
 
 
 @pytest.mark.parametrize("dv", [0.0, -0.3, -1.0])
