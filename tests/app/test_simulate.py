@@ -1,16 +1,24 @@
-"""``scripts/simulate.py`` from a table to scores."""
+"""``scripts/simulate.py`` and ``nnode.simulate`` from a table to scores."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import nnode
+from nnode.app.python.inputs import model_options
+from nnode.calibrate.checkpoint import load_checkpoint, save_checkpoint
 from nnode.data.options import TableOptions
 from nnode.data.prepare import prepare
-from tests.app.conftest import Script
+from nnode.errors import CheckpointError, ConfigError
+from nnode.models import build_model
+from tests.app.conftest import ROOT, Script
 from tests.app.following import table
+from tests.docs.test_tutorials import blocks
 
 SAMPLES = 39
 
@@ -44,6 +52,13 @@ def test_a_run_is_sampled_and_scored(started: Script, run: Path, tmp_path: Path)
     assert len(store) == 2 * SAMPLES
     assert store[0].n_agents == 3
     assert store[0].name.endswith("~1")
+    # in Python it is the same work
+    same = nnode.simulate(run, samples=SAMPLES)
+    assert json.loads(json.dumps(same.plain())) == found
+    assert [s.name.rpartition("/")[2] for s in same.trajectories] == [
+        s.name.rpartition("/")[2] for s in store
+    ]
+    np.testing.assert_array_equal(same.trajectories[3].x, store[3].x)
 
 
 def test_too_few_samples_are_refused(started: Script, run: Path, tmp_path: Path) -> None:
@@ -51,3 +66,61 @@ def test_too_few_samples_are_refused(started: Script, run: Path, tmp_path: Path)
     assert done.returncode != 0
     assert "samples=10" in done.stderr
     assert "at least 39" in done.stderr
+
+
+def test_in_python_it_is_an_object(tmp_path: Path) -> None:
+    drives = table(10, 20.0)
+    run = nnode.fit(drives, "traffic", model="idm", epochs=2)
+    with pytest.raises(ConfigError, match="a table in memory; give it again, as data=TABLE"):
+        nnode.simulate(run)
+    found = nnode.simulate(run, drives, samples=SAMPLES, seed=3)
+    assert isinstance(found, nnode.Simulated)
+    assert (found.model, found.part, found.run, found.trained_on) == ("idm", "heldout", "", 0)
+    assert found.crps == found.means["idm"]["crps_position_m"]
+    assert found.scores.loc[("idm", "crps_position_m"), "mean"] == found.crps.mean
+    assert found.crps.mean < found.means["constant_speed"]["crps_position_m"].mean
+    assert found.coverage[0.5].mean <= found.coverage[0.95].mean
+    samples = found.to_dataframe()
+    assert set(samples) >= {"sequence", "time", "agent", "x", "length"}
+    assert samples["sequence"].nunique() == SAMPLES * len(found.sampling.indices)
+    # who leads is where he was measured
+    first = found.trajectories[0]
+    own = drives[drives["sequence"] == int(first.name.rpartition("/")[2].partition("~")[0])]
+    lead = own.loc[own["agent"] == int(first.agents[-1]), "x"]
+    np.testing.assert_allclose(first.x[:, -1, 0], lead, atol=1e-9)
+    assert "noise of idm: " in repr(found)
+    assert "<table" in found._repr_html_()
+    paths = found.write(tmp_path / "out", table=False)
+    assert [path.name for path in paths] == ["scores.json", "bands.png"]
+    other = nnode.simulate(run, drives, samples=SAMPLES, seed=4)
+    assert not np.array_equal(other.trajectories[0].x, first.x)
+
+
+def test_what_cannot_be_sampled_in_python(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
+        nnode.simulate(tmp_path / "none")
+    with pytest.raises(ConfigError, match="samples=10: a band of 95 % needs at least 39"):
+        nnode.simulate(run, samples=10)
+    with pytest.raises(ConfigError, match="part=some is unknown"):
+        nnode.simulate(run, part="some")
+    made = load_checkpoint(run / "checkpoints" / "best.pt")
+    walkers = model_options("sf")
+    made = replace(
+        made, config={**made.config, "model": walkers}, model=build_model(walkers).state_dict()
+    )
+    save_checkpoint(made, tmp_path / "people.pt")
+    with pytest.raises(ConfigError, match="the run's model is one of people"):
+        nnode.simulate(tmp_path / "people.pt")
+
+
+def test_the_lines_of_the_page(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (text,) = (t for lang, t in blocks(ROOT / "docs" / "sampling.md") if lang == "python")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(text.replace('"RUN"', repr(str(run))), "sampling.md", "exec"), names)
+    assert "noise of idm: " in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "runs" / "samples").iterdir()} == {
+        "scores.json", "bands.png", "samples.parquet",
+    }  # fmt: skip
