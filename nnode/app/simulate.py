@@ -23,7 +23,7 @@ from nnode.data.prepare import open_data
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError
 from nnode.generate.fit import fit_noise
-from nnode.generate.noise import Noise, behind_measured, constant_speed
+from nnode.generate.noise import Noise, constant_speed, free
 from nnode.generate.scores import LEAST
 from nnode.generate.simulated import Sampling, Simulated, Way, batches
 from nnode.study.statistics import paired
@@ -40,7 +40,7 @@ def simulate_run(
     part: str = "auto",
     seed: int = 0,
 ) -> Simulated:
-    """Sample the motion of vehicles from a calibrated model, and score it.
+    """Sample the motion of vehicles or people from a calibrated model, and score it.
 
     The noise is fitted to the sequences that the model was calibrated to; see
     ``docs/sampling.md``.
@@ -56,7 +56,7 @@ def simulate_run(
 
     Raises:
         CheckpointError: no such run.
-        ConfigError: a model of people, too few samples, no such part.
+        ConfigError: too few samples, no such part.
         DataError: no such data, or sequences too short to see the noise.
     """
     if isinstance(run, Calibration):
@@ -64,7 +64,6 @@ def simulate_run(
     else:
         checkpoint, where = load_checkpoint(checkpoint_of(str(run))), str(run)
     _check(samples)
-    behind_measured(checkpoint.build())  # before anything is read
     store = data_used(checkpoint) if data is None else Sequences.of(data)
     with threads_given_back():
         return _simulated(
@@ -77,12 +76,11 @@ def simulate(config: DictConfig, folder: Path) -> None:
     """What the script does: :func:`simulate_run` on the data that are asked for, and files of it.
 
     Raises:
-        NNodeError: no such run or data, a model of people, too few samples.
+        NNodeError: no such run or data, too few samples.
     """
     _check(config.samples)
     checkpoint = load_checkpoint(checkpoint_of(config.run))
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    behind_measured(checkpoint.build())
     data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     found = _simulated(
         checkpoint, open_data(data, folder / "data"), config.solver, run=str(config.run),
@@ -104,14 +102,14 @@ def _simulated(
     checkpoint: Checkpoint, store: Source, solver: Any, *, run: str, data: str, samples: int,
     part: str, seed: int,
 ) -> Simulated:  # fmt: skip
-    model, name = behind_measured(checkpoint.build()), str(checkpoint.config["model"]["name"])
+    model, name = free(checkpoint.build()), str(checkpoint.config["model"]["name"])
     set_threads(checkpoint.config["trainer"]["threads"], model.domain)
     part, indices, trained = choose(store, checkpoint, part)
     label = clusters(store.index)
     open_ = _some(choose(store, checkpoint, "train")[1], seed)
     seen = [batch for batch, _ in batches(store, open_, 1)]
     steps = {"dt": solver.get("dt"), "method": solver.get("method")}
-    still = constant_speed()
+    still = constant_speed(model.domain)
     noise = {
         name: fit_noise(model, seen, label[open_], seed=seed, **steps),
         "constant_speed": fit_noise(still, seen, label[open_], seed=seed),

@@ -16,15 +16,15 @@ from matplotlib.figure import Figure
 from nnode.data.dataset import Source
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.sequences import Sequences
-from nnode.exchange.trajectories import write_parquet
+from nnode.exchange.trajectories import write_parquet, write_walls
 from nnode.files import write_json
 from nnode.generate.fit import FittedNoise
 from nnode.generate.noise import Noise, numbered, sample
 from nnode.generate.scores import BANDS, Mean, Scores, band
-from nnode.models import Traffic
+from nnode.models import System
 from nnode.study.statistics import Paired
 
-#: At most so many vehicles, samples counted, move at once.
+#: At most so many vehicles or people, samples counted, move at once.
 _AT_ONCE = 4000
 #: Sequences in the picture.
 _SHOWN = 6
@@ -32,9 +32,9 @@ _SHOWN = 6
 
 @dataclass(frozen=True)
 class Way:
-    """A way to move vehicles: a model, its noise, and ``dt`` and ``method`` of its steps."""
+    """A way to move: a model, its noise, and ``dt`` and ``method`` of its steps."""
 
-    system: Traffic
+    system: System
     noise: Noise
     steps: dict[str, Any]
 
@@ -58,7 +58,7 @@ class Sampling:
     def moved(
         self, way: Way, indices: list[int] | None = None
     ) -> Iterator[tuple[Sequence, np.ndarray, np.ndarray | None]]:
-        """Every sequence with places and speeds ``(S, K, N, 1)``, m and m/s."""
+        """Every sequence with places and speeds ``(S, K, N, D)``, m and m/s."""
         places = self.indices if indices is None else indices
         for i, (batch, sequences) in enumerate(batches(self.store, places, self.samples)):
             found = sample(
@@ -77,20 +77,22 @@ class Sampling:
         rng = np.random.default_rng(self.seed)
         found = Scores(self.store[self.indices[0]].dt)
         for s, x, _ in self.moved(way):
-            error = way.noise.measurement**0.5 * rng.normal(size=x.shape[:-1])
-            found.add(s.name, x[..., 0], s.x[..., 0], error)
+            error = way.noise.measurement**0.5 * rng.normal(size=x.shape)
+            found.add(s.name, x, s.x, error)
         return found
 
     def sampled(self, way: Way) -> Iterator[Sequence]:
         """Sequences ``NAME~1``, ``NAME~2``, ... of each."""
         for s, x, v in self.moved(way):
+            if s.x.shape[2] > 1 and s.destination is None:  # what the simulation was told
+                s = replace(s, destination=s.x[-1])
             for i, name in enumerate(numbered((s.name,), self.samples)):
                 yield replace(s, name=name, x=x[i], v=None if v is None else v[i])
 
 
 @dataclass(frozen=True, repr=False)
 class Simulated:
-    """Motion sampled from a calibrated model of vehicles, scored on what was measured.
+    """Motion sampled from a calibrated model, scored on what was measured.
 
     Attributes:
         run: folder or checkpoint that the model is of; empty where it is of none.
@@ -100,8 +102,8 @@ class Simulated:
         clusters: their number.
         noise: of the model and of ``constant_speed``, with intervals and moments.
         means: by model, by score: mean and 95 % interval. Scores are ``crps_position_m``,
-            ``crps_gap_m``, ``coverage_position_50``, ..., and ``SCORE@10s`` that 10 s after the
-            start.
+            ``crps_gap_m`` (of people ``crps_nearest_m``, of how far the nearest other is),
+            ``coverage_position_50``, ..., and ``SCORE@10s`` that 10 s after the start.
         minus: the model's CRPS of places minus another one's, m, by sequence.
         sampling: what is sampled.
         way: how the model itself moves.
@@ -146,24 +148,31 @@ class Simulated:
         return self.trajectories.to_dataframe()
 
     def plot(self) -> Figure:
-        """Gaps of six sequences: measured, and bands of the samples."""
+        """Gaps of six sequences, or how far ahead of their measured places people are: measured,
+        and bands of the samples."""
         from nnode.plots.bands import Bands, band_panels  # loads Matplotlib, which takes a second
 
         indices = self.sampling.indices
         chosen = indices[:: max(1, len(indices) // _SHOWN)][:_SHOWN]
         shown = []
         for s, x, _ in self.sampling.moved(self.way, chosen):
-            gap = x[:, :, -1, 0] - x[:, :, -2, 0]
+            if s.x.shape[2] == 1:
+                measured, gap = s.x[:, -1, 0] - s.x[:, -2, 0], x[:, :, -1, 0] - x[:, :, -2, 0]
+            else:  # along the way of the first person
+                way = s.x[-1, 0] - s.x[0, 0]
+                gap = (x[:, :, 0] - s.x[:, 0]) @ (way / max(float(np.linalg.norm(way)), 1e-9))
+                measured = np.zeros(s.n_samples)
             shown.append(
                 Bands(
                     name=s.name,
                     time=s.time - s.time[0],
-                    measured=s.x[:, -1, 0] - s.x[:, -2, 0],
+                    measured=measured,
                     median=np.median(gap, axis=0),
                     bands={level: band(gap, level) for level in BANDS},
                 )
             )
-        return band_panels(shown)
+        crowd = self.way.system.domain == "crowd"
+        return band_panels(shown, "ahead (m)" if crowd else "gap (m)")
 
     def plain(self) -> dict[str, Any]:
         """The content of ``scores.json``."""
@@ -178,7 +187,8 @@ class Simulated:
         }  # fmt: skip
 
     def write(self, folder: str | Path, *, table: bool = True) -> list[Path]:
-        """Write ``scores.json``, ``bands.png`` and, so asked, ``samples.parquet``."""
+        """Write ``scores.json``, ``bands.png`` and, so asked, ``samples.parquet``, of people with
+        ``walls.csv`` where all sequences have the same ones."""
         from nnode.plots.style import save
 
         place = Path(folder)
@@ -189,19 +199,24 @@ class Simulated:
         if table:
             samples = self.sampling.sampled(self.way)
             paths.append(write_parquet(place / "samples.parquet", samples, self.way.system.dim))
+            measured = (self.sampling.store[i] for i in self.sampling.indices)
+            walls, _ = write_walls(place / "walls.csv", measured)
+            paths += [] if walls is None else [walls]
         return paths
 
     def _head(self) -> list[str]:
-        noise = [_told(name, one, self.way.system.order) for name, one in self.noise.items()]
+        noise = [_told(name, one, self.way.system) for name, one in self.noise.items()]
         job = self.sampling
         number = f"{len(job.indices)} sequences, {job.samples} samples"
         return [*noise, f"{self.data}, {self.part}: {number}"]
 
     def _table(self) -> pd.DataFrame:
-        heads = {"crps_position_m": "CRPS place (m)", "crps_gap_m": "CRPS gap (m)"}
+        heads = {"crps_position_m": "CRPS place (m)"}
+        crowd = self.way.system.domain == "crowd"
+        heads |= {"crps_nearest_m": "CRPS nearest (m)"} if crowd else {"crps_gap_m": "CRPS gap (m)"}
         heads |= {f"coverage_position_{100 * p:g}": f"in {100 * p:g} % band" for p in BANDS}
         rows = {
-            model: {head: _cell(own[name]) for name, head in heads.items()}
+            model: {head: _cell(own[name]) for name, head in heads.items() if name in own}
             for model, own in self.means.items()
         }
         return pd.DataFrame.from_dict(rows, orient="index")
@@ -228,9 +243,9 @@ def batches(
     yield collate(group), group
 
 
-def _told(name: str, fitted: FittedNoise, order: int) -> str:
+def _told(name: str, fitted: FittedNoise, system: System) -> str:
     noise = fitted.noise
-    order = 2 if name == "constant_speed" else order  # whatever the model's own
+    order = 2 if name == "constant_speed" else system.order  # whatever the model's own
     unit = "m/s" if order == 1 else "m/s²"
 
     def interval(ends: tuple[float, float] | None) -> str:
@@ -238,8 +253,9 @@ def _told(name: str, fitted: FittedNoise, order: int) -> str:
 
     drivers = ""
     if noise.drivers:
-        what = "pace" if order == 1 else "time gap"
-        drivers = f"; drivers' {what} ± {100 * noise.drivers:.3g} %"
+        what = "drivers' pace" if order == 1 else "drivers' time gap"
+        what = "preferred speeds" if system.domain == "crowd" else what
+        drivers = f"; {what} ± {100 * noise.drivers:.3g} %"
     return (
         f"noise of {name}: {noise.sigma:.3g} {unit}{interval(fitted.sigma)} for {noise.tau:.3g} s"
         f"{interval(fitted.tau)}; measured places ± {noise.measurement**0.5:.2g} m{drivers}"

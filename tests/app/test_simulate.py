@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import nnode
-from nnode.app.python.inputs import model_options
-from nnode.calibrate.checkpoint import load_checkpoint, save_checkpoint
 from nnode.data.options import TableOptions
 from nnode.data.prepare import prepare
 from nnode.errors import CheckpointError, ConfigError
-from nnode.models import build_model
 from tests.app.conftest import ROOT, Script
 from tests.app.following import table
 from tests.docs.test_tutorials import blocks
@@ -96,21 +93,13 @@ def test_in_python_it_is_an_object(tmp_path: Path) -> None:
     assert not np.array_equal(other.trajectories[0].x, first.x)
 
 
-def test_what_cannot_be_sampled_in_python(run: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_sampled(run: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
         nnode.simulate(tmp_path / "none")
     with pytest.raises(ConfigError, match="samples=10: a band of 95 % needs at least 39"):
         nnode.simulate(run, samples=10)
     with pytest.raises(ConfigError, match="part=some is unknown"):
         nnode.simulate(run, part="some")
-    made = load_checkpoint(run / "checkpoints" / "best.pt")
-    walkers = model_options("sf")
-    made = replace(
-        made, config={**made.config, "model": walkers}, model=build_model(walkers).state_dict()
-    )
-    save_checkpoint(made, tmp_path / "people.pt")
-    with pytest.raises(ConfigError, match="the run's model is one of people"):
-        nnode.simulate(tmp_path / "people.pt")
 
 
 def test_the_lines_of_the_page(
@@ -124,3 +113,47 @@ def test_the_lines_of_the_page(
     assert {path.name for path in (tmp_path / "runs" / "samples").iterdir()} == {
         "scores.json", "bands.png", "samples.parquet",
     }  # fmt: skip
+
+
+def walks(number: int = 10, people: int = 4, seconds: float = 8.0) -> pd.DataFrame:
+    """People abreast who return to a speed of their own within half a second, and are pushed."""
+    rng, rows, step = np.random.default_rng(0), [], 0.1
+    for k in range(number):
+        wish = np.stack([1.3 + 0.1 * rng.normal(size=people), np.zeros(people)], -1)
+        x = np.stack([np.zeros(people), 1.5 * np.arange(people)], -1)
+        v, push = wish.copy(), 0.4 * rng.normal(size=(people, 2))
+        for i in range(round(seconds / step) + 1):
+            rows += [(k, step * i, f"{k}-{n}", *x[n]) for n in range(people)]
+            x, v = x + step * v, v + step * ((wish - v) / 0.5 + push)
+            push = 0.9 * push + 0.4 * np.sqrt(1 - 0.9**2) * rng.normal(size=push.shape)
+    return pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
+
+
+def test_people_are_sampled(tmp_path: Path) -> None:
+    table = walks()
+    (tmp_path / "walls.csv").write_text("x1,y1,x2,y2\n-5,-3,30,-3\n")
+    model = {"term": "social_force", "desired": "direction"}
+    run = nnode.fit(
+        table, "crowd", model=model, walls=tmp_path / "walls.csv", epochs=2, heldout=0.4
+    )
+    data = nnode.sequences(table, data="table", domain="crowd", walls=str(tmp_path / "walls.csv"))
+    found = nnode.simulate(run, data, samples=SAMPLES)
+    name = found.model
+    score = {key: own["crps_position_m"].mean for key, own in found.means.items()}
+    assert found.crps.mean == score[name] < score[f"{name}, no noise"]
+    assert score[name] < score["constant_speed"]
+    assert "crps_nearest_m" in found.means[name]
+    # of 4 sequences with 4 people: far from none and from the band of 50 %
+    assert found.coverage[0.95].mean > 0.75
+    assert {"x", "y", "vx", "vy"} <= set(found.to_dataframe())
+    assert "m/s²" in repr(found)
+    names = {path.name for path in found.write(tmp_path / "out")}
+    assert names == {"scores.json", "bands.png", "samples.parquet", "walls.csv"}
+    again = TableOptions(
+        domain="crowd", path=str(tmp_path / "out" / "samples.parquet"),
+        walls=str(tmp_path / "out" / "walls.csv"),
+    )  # fmt: skip
+    store = prepare(again, tmp_path / "again")
+    assert len(store) == SAMPLES * len(found.sampling.indices)
+    np.testing.assert_array_equal(store[5].x, found.trajectories[5].x)
+    assert store[5].walls is not None
