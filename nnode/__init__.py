@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from nnode.app.python.inputs import sequences
     from nnode.app.python.report import Report
     from nnode.app.replay import replay
+    from nnode.app.simulate import simulate_run as simulate
     from nnode.calibrate.checkpoint import load
     from nnode.data.sequence import Sequence
     from nnode.data.sequences import Sequences
+    from nnode.generate.simulated import Simulated
 
 __all__ = [
     "Calibration",
@@ -28,6 +30,7 @@ __all__ = [
     "Report",
     "Sequence",
     "Sequences",
+    "Simulated",
     "__version__",
     "check",
     "diagnose",
@@ -36,6 +39,7 @@ __all__ = [
     "load",
     "replay",
     "sequences",
+    "simulate",
 ]
 
 #: Where each name comes from: imported on first use, a short command should not wait for torch.
@@ -45,6 +49,7 @@ _HOMES = {
     "Report": ("nnode.app.python.report", "Report"),
     "Sequence": ("nnode.data.sequence", "Sequence"),
     "Sequences": ("nnode.data.sequences", "Sequences"),
+    "Simulated": ("nnode.generate.simulated", "Simulated"),
     "Check": ("nnode.app.check", "Check"),
     "check": ("nnode.app.check", "check_file"),
     "diagnose": ("nnode.app.discover", "diagnose_table"),
@@ -53,6 +58,7 @@ _HOMES = {
     "replay": ("nnode.app.replay", "replay"),
     "load": ("nnode.calibrate.checkpoint", "load"),
     "sequences": ("nnode.app.python.inputs", "sequences"),
+    "simulate": ("nnode.app.simulate", "simulate_run"),
 }
 
 

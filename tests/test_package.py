@@ -8,8 +8,8 @@ import sys
 import nnode
 
 NAMES = [
-    "Calibration", "Calibrator", "Check", "Report", "Sequence", "Sequences", "__version__",
-    "check", "diagnose", "drive", "fit", "load", "replay", "sequences",
+    "Calibration", "Calibrator", "Check", "Report", "Sequence", "Sequences", "Simulated",
+    "__version__", "check", "diagnose", "drive", "fit", "load", "replay", "sequences", "simulate",
 ]  # fmt: skip
 
 

@@ -6,12 +6,9 @@ import json
 import os
 import re
 import runpy
-import shutil
 import subprocess
 import sys
-import venv
 import zipfile
-from collections.abc import Callable
 from email import message_from_string
 from pathlib import Path
 
@@ -19,60 +16,19 @@ import pytest
 
 from tests.app.following import TRUE, pairs
 from tests.discover.platoons import platoons
+from tests.installed import Run, built, installed
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("nnode", "conf", "setup.py", "pyproject.toml", "README.md", "LICENSE")
-
-Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy, so that the checkout stays as it is."""
-    folder = tmp_path_factory.mktemp("wheel")
-    for name in SOURCES:
-        if (ROOT / name).is_dir():
-            ignore = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(ROOT / name, folder / "source" / name, ignore=ignore)
-        else:
-            shutil.copy(ROOT / name, folder / "source")
-    built = subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
-         "--no-index", "--wheel-dir", str(folder), str(folder / "source")],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert built.returncode == 0, built.stdout + built.stderr
-    (found,) = folder.glob("nnode-*.whl")
-    return found
+    return built(tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def alone(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Run a program of an environment that has the wheel and, lent, what the wheel depends on."""
-    place = tmp_path_factory.mktemp("environment")
-    venv.create(place / "venv", with_pip=False)
-    python = place / "venv" / "bin" / "python"
-    lent = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
-    (site,) = (place / "venv" / "lib").glob("python*/site-packages")
-    # of a folder that is named in such a file no .pth file is read, so that no checkout is lent
-    (site / "lent.pth").write_text("\n".join(lent))
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps",
-         "--no-index", "--ignore-installed", str(wheel)],
-        cwd=place, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    work = place / "work"
-    work.mkdir()
-
-    def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [str(python.parent / program), *arguments], cwd=work, capture_output=True, text=True,
-            env={**env, "OMP_NUM_THREADS": "1", "NNODE_DATA": "", "MPLBACKEND": "agg"}, check=False,
-        )  # fmt: skip
-
-    return run
+    return installed(wheel, tmp_path_factory.mktemp("environment"))
 
 
 @pytest.mark.thorough

@@ -132,6 +132,7 @@ def summary(found: Examination, lines: list[str]) -> str:
     if found.source.convert:
         text += ["", "no reader takes the file as it is; in Python:", *found.source.convert]
     text += ["", "to read it:", "  python scripts/prepare_data.py " + " ".join(lines)]
+    text += ["the same options go to python scripts/train.py and python scripts/discover.py"]
     return "\n".join(text)
 
 

@@ -18,16 +18,16 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import Metrics, Simulate, baselines, evaluate
 from nnode.calibrate.options import Device, SolverOptions
+from nnode.data.dataset import Source
 from nnode.data.options import DataOptions
 from nnode.data.prepare import NOT_PREPARATION, open_data
-from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.files import write_json
 
 PARTS = ("auto", "heldout", "train", "unseen", "all")
 
 
-def choose(store: Store, checkpoint: Checkpoint, part: str) -> tuple[str, list[int], int | None]:
+def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[int], int | None]:
     """Which sequences of a store are evaluated.
 
     ``heldout`` and ``train`` are the checkpoint's own parts; ``unseen`` is what it neither

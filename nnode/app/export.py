@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
 
@@ -32,8 +30,8 @@ from nnode.errors import ConfigError
 from nnode.exchange.counterpart import Counterpart, Intervals
 from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import has_type, sumo_type, traffic_of
-from nnode.exchange.tables import write_csv, write_results
-from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy
+from nnode.exchange.tables import write_results
+from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy, write_walls
 from nnode.files import write_json, write_text
 from nnode.models import System
 
@@ -211,19 +209,11 @@ def _parquet(job: _Export) -> _Written:
         write_parquet(job.folder / f"{source}.parquet", job.trajectories(source), job.model.dim)
         for source in job.sources
     ]
-    walls = _walls(job.trajectories("measured"))
-    if len(walls) == 1 and walls[0] is not None:
-        table = pd.DataFrame(walls[0], columns=["x1", "y1", "x2", "y2"])
-        files.append(write_csv(job.folder / "walls.csv", table))
-    elif len(walls) > 1:
-        found.missing.append(f"walls: the sequences have {len(walls)} sets, a table has one")
+    path, sets = write_walls(job.folder / "walls.csv", job.trajectories("measured"))
+    files += [] if path is None else [path]
+    if sets > 1:
+        found.missing.append(f"walls: the sequences have {sets} sets, a table has one")
     return files, found
-
-
-def _walls(sequences: Iterable[Sequence]) -> list[np.ndarray | None]:
-    """Distinct sets of walls, None for none."""
-    known = {None if s.walls is None else s.walls.tobytes(): s.walls for s in sequences}
-    return list(known.values())
 
 
 def _csv(job: _Export) -> _Written:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,16 @@ def set_threads(threads: int | None, domain: str) -> None:
         raise ConfigError(f"trainer.threads={threads} must be at least 1, or null")
     if threads is not None or domain == "traffic":
         torch.set_num_threads(threads or 1)
+
+
+@contextmanager
+def threads_given_back() -> Iterator[None]:
+    """Give torch its threads back at the end."""
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def check(config: DictConfig) -> None:

@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 
 from nnode.calibrate.evaluate import Simulate
 from nnode.data._arrow import open_writer, to_table
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import DataError
+from nnode.exchange.tables import write_csv
 from nnode.files import replacing, write_text
 
 
@@ -74,6 +76,19 @@ def write_parquet(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
         for s in sequences:
             writer.write_table(to_table(_directed(s)))
     return path
+
+
+def write_walls(path: Path, sequences: Iterable[Sequence]) -> tuple[Path | None, int]:
+    """The walls that go with such a table, where all sequences have the same ones.
+
+    Returns:
+        The path, None where nothing is written, and the number of distinct sets.
+    """
+    known = {None if s.walls is None else s.walls.tobytes(): s.walls for s in sequences}
+    (walls, *others) = known.values()
+    if others or walls is None:
+        return None, len(known)
+    return write_csv(path, pd.DataFrame(walls, columns=["x1", "y1", "x2", "y2"])), 1
 
 
 def _directed(s: Sequence) -> Sequence:

@@ -1,1 +1,1 @@
-"""Sampled motion: a calibrated model with noise and drivers drawn at random, and its scores."""
+"""Sampled motion: a calibrated model with noise, and drivers drawn at random, and its scores."""

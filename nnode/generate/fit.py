@@ -1,10 +1,10 @@
-"""Size and time of the drivers' noise, from how far vehicles come away from a model without it.
+"""Size and time of the noise, from how far vehicles and people come away from a model without it.
 
-The residual of a vehicle is its measured minus its simulated place. Its mean square, those of its
-changes over several times, and of the changes of these over the shorter ones, are compared with
-those of sampled motion minus the motion without noise: the method of simulated moments (McFadden
-1989). All are averages over all samples of all clusters; intervals come from clusters drawn with
-replacement.
+The residual of a vehicle, or of a component of a person's place, is its measured minus its
+simulated place. Its mean square, those of its changes over several times, and of the changes of
+these over the shorter ones, are compared with those of sampled motion minus the motion without
+noise: the method of simulated moments (McFadden 1989). All are averages over all samples of all
+clusters; intervals come from clusters drawn with replacement.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from nnode.data.sequence import Batch
 from nnode.discover.lanes.paths import noise_variance
 from nnode.errors import DataError
 from nnode.generate.noise import Noise, sample, takes_drivers
-from nnode.models import Traffic
+from nnode.models import System
 from nnode.study.statistics import group_weights
 
 #: s; times of the noise at which motion is sampled, between which moments are interpolated.
@@ -33,10 +33,14 @@ SAMPLES = 2
 _FIRST = {1: 0.5, 2: 0.2}
 #: Spread of the drivers in the first round; and the least and largest one that is sampled.
 _SPREAD, _SPREADS = 0.15, (0.05, 0.4)
+_WHO = {"traffic": "followers", "crowd": "people"}
 #: Draws of the clusters.
 DRAWS = 200
-#: Number of times over which changes are looked at, from 1 s to a third of the longest sequence.
+#: Number of times over which changes are looked at, from the shortest to a third of the longest
+#: sequence.
 _LAGS = 8
+#: s; the shortest: what people do against the pushes of others lasts half a second.
+_SHORTEST = {"traffic": 1.0, "crowd": 0.25}
 #: Of these the shorter ones, over which changes of changes are looked at.
 _SHORT = 4
 
@@ -79,7 +83,7 @@ class _Sums:
 
 
 def fit_noise(
-    system: Traffic,
+    system: System,
     batches: list[Batch],
     label: np.ndarray,
     *,
@@ -90,7 +94,7 @@ def fit_noise(
     """The noise with which sampled motion comes as far away from the model as measured motion.
 
     Args:
-        system: of :func:`nnode.generate.noise.behind_measured`.
+        system: of :func:`nnode.generate.noise.free`.
         batches: of sequences that the model was calibrated to.
         label: ``(S,)`` cluster of each sequence, in the order of the batches.
         seed: of what is sampled and resampled.
@@ -101,18 +105,21 @@ def fit_noise(
     """
     options: dict[str, Any] = {"dt": dt, "method": method}
     sampling, longest = batches[0].dt, max(batch.n_samples for batch in batches)
-    lags = lags_of(sampling, longest)
+    lags = lags_of(sampling, longest, _SHORTEST[system.domain])
     _, label = np.unique(label, return_inverse=True)
     groups = np.split(label, np.cumsum([len(batch) for batch in batches])[:-1])
     plain = [sample(system, batch, Noise(0.0, 1.0), 1, seed=seed, **options).x for batch in batches]
     error = _measurement(batches)
     number = int(label.max()) + 1
     measured = _sums(
-        [(batch.x - x)[..., 0] for batch, x in zip(batches, plain, strict=True)],
+        [batch.x - x for batch, x in zip(batches, plain, strict=True)],
         batches, groups, lags, number,
     )  # fmt: skip
     if not (measured.number.sum(0) > 0).all():
-        raise DataError("the noise needs followers that are measured for more than 3 s")
+        least = 3 * _SHORTEST[system.domain]
+        raise DataError(
+            f"the noise needs {_WHO[system.domain]} that are measured for more than {least:g} s"
+        )
 
     def sampled(noise: Noise) -> _Sums:
         parts = [
@@ -120,10 +127,10 @@ def fit_noise(
             - x.repeat(1, SAMPLES, 1, 1)
             for i, (batch, x) in enumerate(zip(batches, plain, strict=True))
         ]
-        return _sums([e[..., 0] for e in parts], batches, groups, lags, number)
+        return _sums(parts, batches, groups, lags, number)
 
     every = np.ones(number)
-    sigma, spread = _FIRST[system.order], _SPREAD if takes_drivers(system) else 0.0
+    sigma, spread = _FIRST[system.order], _SPREAD if takes_drivers(system, batches[0]) else 0.0
     starts = TIMES[1:-1:2]
     for _ in range(2):
         search = _Search(
@@ -147,25 +154,30 @@ def fit_noise(
     return replace(fitted, sigma=own_sigma, tau=own_tau, drivers=own_drivers if spread else None)
 
 
-def lags_of(sampling: float, samples: int) -> list[int]:
+def lags_of(sampling: float, samples: int, shortest: float) -> list[int]:
     """Numbers of samples over which changes are looked at.
+
+    Args:
+        sampling: interval, s.
+        samples: of the longest sequence.
+        shortest: time to begin with, s.
 
     Raises:
         DataError: sequences are too short.
     """
-    first, last = max(1, round(1.0 / sampling)), (samples - 1) // 3
+    first, last = max(1, round(shortest / sampling)), (samples - 1) // 3
     if last <= first:
         raise DataError(
             f"the longest sequence has {samples} samples, {sampling:g} s apart; the noise shows in "
-            "sequences of more than 3 s"
+            f"sequences of more than {3 * shortest:g} s"
         )
     return sorted({round(lag) for lag in np.geomspace(first, last, _LAGS)})
 
 
 def _measurement(batches: list[Batch]) -> float:
-    """Variance of the measurement error, m², of followers' and leaders' places."""
+    """Variance of the measurement error, m², of a component of everybody's places."""
     parts = [
-        noise_variance(batch.x[batch.valid[:, b, i], b, i, 0].numpy())
+        noise_variance(batch.x[batch.valid[:, b, i], b, i].numpy())
         for batch in batches
         for b, i in batch.agent.nonzero().tolist()
     ]
@@ -177,15 +189,15 @@ def _sums(
     residuals: list[Tensor], batches: list[Batch], groups: list[np.ndarray], lags: list[int],
     number: int,
 ) -> _Sums:  # fmt: skip
-    """Squares of residuals ``(K, S * B, N)`` and of their changes, by cluster."""
+    """Squares of residuals ``(K, S * B, N, D)`` and of their changes, by cluster."""
     short = lags[:_SHORT]
     squares, count = np.zeros((2, number, len(lags) + len(short) + 1))
     for e, batch, group in zip(residuals, batches, groups, strict=True):
         copies = e.shape[1] // len(batch)
         follower = batch.valid.clone()
-        last = batch.agent.sum(1) - 1
-        follower[:, torch.arange(len(batch)), last] = False
-        valid = follower.repeat(1, copies, 1)
+        if e.shape[-1] == 1:  # who leads is as measured
+            follower[:, torch.arange(len(batch)), batch.agent.sum(1) - 1] = False
+        valid = follower.repeat(1, copies, 1)[..., None].expand(-1, -1, -1, e.shape[-1])
         own = np.tile(group, copies)
         # of short batches nothing is left
         parts = [(e[lag:] - e[: max(len(e) - lag, 0)], valid[lag:]) for lag in lags]
@@ -194,9 +206,9 @@ def _sums(
             parts.append((bend + e[: len(bend)], valid[2 * lag :]))
         parts.append((e[1:], valid[1:]))
         for j, (change, real) in enumerate(parts):
-            total = torch.where(real, change.square(), 0.0).sum((0, 2)).numpy()
+            total = torch.where(real, change.square(), 0.0).sum((0, 2, 3)).numpy()
             squares[:, j] += np.bincount(own, total, number)
-            count[:, j] += np.bincount(own, real.sum((0, 2)).numpy(), number)
+            count[:, j] += np.bincount(own, real.sum((0, 2, 3)).numpy(), number)
     return _Sums(squares, count)
 
 

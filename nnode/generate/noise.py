@@ -1,4 +1,4 @@
-"""The noise of drivers: an Ornstein-Uhlenbeck process on each one's speed or acceleration."""
+"""The noise of drivers and people: an Ornstein-Uhlenbeck process on speeds or accelerations."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from torchdiffeq import odeint
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
+from nnode.generate.people import sample_people, takes_paces
 from nnode.laws.lane import Rule
-from nnode.models import Traffic
+from nnode.models import Crowd, Traffic
 from nnode.models.effects.base import IndividualEffect
+from nnode.models.effects.crowd_individual import GaitSway
 from nnode.models.effects.traffic import DriverHeterogeneity
 from nnode.models.own_law import law_from
 from nnode.models.system import System
@@ -28,17 +30,19 @@ from nnode.solvers.rates import Rates
 
 @dataclass(frozen=True)
 class Noise:
-    """What drivers do beside their law, and what measurements add.
+    """What drivers and people do beside their law, and what measurements add.
 
     In samples a step dt apart the push is autoregressive of first order with the factor
     exp(-dt/tau), in any step.
 
     Attributes:
-        sigma: standard deviation of the push, m/s (first order) or m/s² (second order).
+        sigma: standard deviation of the push, m/s (first order) or m/s² (second order); of people
+            that of each of its two components.
         tau: its correlation time, s.
-        measurement: variance of the white error of measured positions, m².
+        measurement: variance of the white error of measured positions, m², of each component.
         drivers: standard deviation of the pace (first order) or time gap (second order) among
-            drivers, as a share; of models without ``driver_heterogeneity``.
+            drivers, as a share; of models without ``driver_heterogeneity``. Of people, that of
+            their preferred speed from what was taken for it.
     """
 
     sigma: float
@@ -85,16 +89,21 @@ class Push(Term):
         return torch.zeros_like(x)
 
 
-def constant_speed() -> Traffic:
-    """Baseline: every follower keeps its first measured speed."""
+def constant_speed(domain: str = "traffic") -> System:
+    """Baseline: every follower, or everybody, keeps the first measured speed."""
+    if domain == "crowd":
+        return Crowd([])
     law = law_from("constant_speed", {"parameters": {"change": "0 m/s^2"}, "rate": {"v": "change"}})
     return Traffic([law], leader="measured")
 
 
-def takes_drivers(system: Traffic) -> bool:
-    """Whether drivers may differ, and the model does not say how already."""
+def takes_drivers(system: System, batch: Batch) -> bool:
+    """Whether drivers or people may differ, and the model does not say how already."""
     if any(isinstance(term, IndividualEffect) for term in system.terms):
         return False
+    if isinstance(system, Crowd):
+        return takes_paces(system, batch)
+    assert isinstance(system, Traffic)
     trial = copy.deepcopy(system)
     trial.terms.append(DriverHeterogeneity())
     try:
@@ -103,25 +112,19 @@ def takes_drivers(system: Traffic) -> bool:
         return False
 
 
-def behind_measured(system: System) -> Traffic:
-    """A copy of a model of vehicles in which the first one drives as it was measured.
-
-    Raises:
-        ConfigError: people.
-    """
-    if not isinstance(system, Traffic):
-        raise ConfigError(
-            "the run's model is one of people, and simulate draws the motion of vehicles; "
-            "export.py trajectories=simulated writes people's motion without noise"
-        )
+def free(system: System) -> System:
+    """A copy of a model in which all move but the first vehicle, which drives as measured."""
     found = copy.deepcopy(system).double()
-    found.leader = "measured"
+    if isinstance(found, Traffic):
+        found.leader = "measured"
+    if isinstance(found, Crowd):
+        found.neighbours = "simulated"
     return found
 
 
 @torch.no_grad()
 def sample(
-    system: Traffic,
+    system: System,
     batch: Batch,
     noise: Noise,
     samples: int,
@@ -130,13 +133,14 @@ def sample(
     dt: float | None = None,
     method: str | None = None,
 ) -> Trajectory:
-    """Sampled motion from the measured start, each vehicle with its own push.
+    """Sampled motion from the measured start, each vehicle and everybody with an own push.
 
     The push starts in its stationary distribution. Drivers who differ (``driver_heterogeneity``)
-    get numbers drawn from their distribution where the model knows none of them.
+    get numbers drawn from their distribution where the model knows none of them, and so do people
+    (``walker_heterogeneity``).
 
     Args:
-        system: of :func:`behind_measured`.
+        system: of :func:`free`.
         batch: B sequences.
         noise: its measurement error is not added: places are those of the vehicles.
         samples: S.
@@ -146,16 +150,21 @@ def sample(
             by noise, where stages gain nothing.
 
     Returns:
-        ``(K, S * B, N, 1)``, sample by sample.
+        ``(K, S * B, N, D)``, sample by sample.
 
     Raises:
         SimulationError: no finite number.
         ConfigError: a step that does not divide the sampling interval.
     """
     rng = np.random.default_rng(seed)
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     many = batch.select([b for _ in range(samples) for b in range(len(batch))])
     many = replace(many, names=numbered(batch.names, samples))
+    if isinstance(system, Crowd):
+        moving = copy.deepcopy(system)
+        _give_drivers(moving, many, batch.names, rng)
+        own = (noise.sigma, noise.tau, noise.drivers)
+        return sample_people(moving, many, own, rng, dt)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n
     kept = math.exp(-step / noise.tau)
@@ -194,13 +203,18 @@ def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:
 
 
 def _give_drivers(
-    system: Traffic, many: Batch, names: tuple[str, ...], rng: np.random.Generator
+    system: System, many: Batch, names: tuple[str, ...], rng: np.random.Generator
 ) -> None:
-    """Give all drivers a number, in effects that differ by driver."""
+    """Give everybody a number, in effects that differ by driver or person.
+
+    Gait is known or not: nobody's is drawn.
+    """
     for term in system.terms:
         if isinstance(term, IndividualEffect):
             people = {}
             for i, name in enumerate(many.names):
                 own = term.people.get(names[i % len(names)])
+                if own is None and isinstance(term, GaitSway):
+                    continue
                 people[name] = own or drawn(term, [()] * many.agent.shape[1], rng).tolist()
             term.people = people

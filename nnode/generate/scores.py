@@ -74,7 +74,20 @@ def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray, seed: int 
 
 
 #: Times after the start, s, at which scores are shown.
-HORIZONS = (5.0, 10.0, 20.0, 30.0)
+HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
+
+
+def nearest(x: np.ndarray) -> np.ndarray:
+    """``(K, N)`` distance of everybody's nearest other person, m; ``(K, 0)`` of a single person.
+
+    Args:
+        x: ``(K, N, 2)`` m.
+    """
+    if x.shape[1] < 2:
+        return np.zeros((len(x), 0))
+    away = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
+    away[:, range(x.shape[1]), range(x.shape[1])] = np.inf
+    return np.asarray(away.min(2))
 
 
 class Scores:
@@ -94,20 +107,29 @@ class Scores:
 
         Args:
             name: of the sequence.
-            samples: ``(S, K, N)`` m, of places; the last vehicle leads and is not scored.
-            measured: ``(K, N)`` m.
-            error: ``(S, K, N)`` m, of measurement, which is added to what is scored.
+            samples: ``(S, K, N, D)`` m, of places. In a lane the last vehicle leads and is not
+                scored; of people each component is scored by itself, and in place of gaps how far
+                the nearest other person is.
+            measured: ``(K, N, D)`` m.
+            error: ``(S, K, N, D)`` m, of measurement, which is added to what is scored.
         """
         self._names.append(name)
         seen = samples + error
-        seen[:, :, -1] = measured[:, -1]
-        place, known = seen[:, 1:, :-1], measured[1:, :-1]
-        gap, known_gap = np.diff(seen[:, 1:], axis=2), np.diff(measured[1:], axis=1)
+        if measured.shape[2] == 1:
+            seen, measured = seen[..., 0], measured[..., 0]
+            seen[:, :, -1] = measured[:, -1]
+            place, known = seen[:, 1:, :-1], measured[1:, :-1]
+            apart = "gap"
+            gap, known_gap = np.diff(seen[:, 1:], axis=2), np.diff(measured[1:], axis=1)
+        else:
+            place, known = seen[:, 1:], measured[1:]
+            apart = "nearest"
+            gap, known_gap = np.stack([nearest(one) for one in place]), nearest(known)
         scored = crps(place, known)
         self._put("crps_position_m", scored)
-        self._put("crps_gap_m", crps(gap, known_gap))
+        self._put(f"crps_{apart}_m", crps(gap, known_gap))
         for level in BANDS:
-            for what, drawn, value in (("position", place, known), ("gap", gap, known_gap)):
+            for what, drawn, value in (("position", place, known), (apart, gap, known_gap)):
                 low, high = band(drawn, level)
                 inside = (low <= value) & (value <= high)
                 self._put(f"coverage_{what}_{100 * level:g}", inside)

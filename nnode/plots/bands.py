@@ -29,8 +29,8 @@ class Bands:
     bands: Mapping[float, tuple[np.ndarray, np.ndarray]]
 
 
-def band_panels(vehicles: Sequence[Bands]) -> Figure:
-    """A panel per vehicle, two side by side."""
+def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
+    """A panel per vehicle or person, two side by side; ``what`` is on the vertical axis."""
     rows = -(-len(vehicles) // 2)
     figure = new_figure(7.2, 1.9 * rows + 0.5)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
@@ -43,8 +43,9 @@ def band_panels(vehicles: Sequence[Bands]) -> Figure:
             )  # fmt: skip
         ax.plot(one.time, one.median, color=blue, linewidth=1.0, label="median of samples")
         ax.plot(one.time, one.measured, color="black", linewidth=1.2, label="measured")
-        dress(ax, x="time (s)", y="gap (m)", title=one.name)
-        ax.set_ylim(bottom=min(0.0, float(one.measured.min())))
+        dress(ax, x="time (s)", y=what, title=one.name)
+        if what.startswith("gap"):
+            ax.set_ylim(bottom=min(0.0, float(one.measured.min())))
     for ax in panels[len(vehicles) :]:
         ax.set_visible(False)
     handles, labels = panels[0].get_legend_handles_labels()

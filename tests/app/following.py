@@ -10,11 +10,13 @@ TRUE = {"v0": 30.0, "T": 1.2, "s0": 2.2, "a": 1.3, "b": 1.9}
 LONG, STEP = 4.5, 0.1
 
 
-def _idm(v: np.ndarray, s: np.ndarray, closing: np.ndarray) -> np.ndarray:
+def idm(
+    v: np.ndarray, s: np.ndarray, closing: np.ndarray, v0: float | np.ndarray = TRUE["v0"]
+) -> np.ndarray:
     """Treiber, Hennecke & Helbing 2000, equations (2) and (3)."""
     p = TRUE
     wish = p["s0"] + np.maximum(v * p["T"] + v * closing / (2 * np.sqrt(p["a"] * p["b"])), 0)
-    return p["a"] * (1 - (v / p["v0"]) ** 4 - (wish / s) ** 2)
+    return p["a"] * (1 - (v / v0) ** 4 - (wish / s) ** 2)
 
 
 def platoon(rng: np.random.Generator, cars: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -25,7 +27,7 @@ def platoon(rng: np.random.Generator, cars: int, seconds: float) -> tuple[np.nda
     places, speeds = [x], [v]
     for k in range(round(seconds / STEP)):
         lead = mean + deep * np.cos(0.35 * STEP * (k + 1) + phase)
-        force = _idm(v[:-1], np.diff(x) - LONG, -np.diff(v))
+        force = idm(v[:-1], np.diff(x) - LONG, -np.diff(v))
         new = np.append(v[:-1] + STEP * force, lead)
         x, v = x + STEP * (v + new) / 2, new
         places.append(x)

@@ -22,7 +22,7 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     table["x"] /= -0.3048
     table["length"] /= 0.3048
     file = saved(table.rename(columns={"veh": "Vehicle ID"}), tmp_path, "my cars.csv")
-    done = script("check", f"file='{file}'", f"hydra.run.dir={tmp_path / 'run'}")
+    done = script("check", str(file), f"hydra.run.dir={tmp_path / 'run'}")
     assert done.returncode == 0, done.stderr
     assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors, 1 thing" in done.stdout
     assert "look  direction: all vehicles drive towards smaller positions" in done.stdout
@@ -47,7 +47,8 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
         (["file=$T/junk.csv"], "is no text"),
         (["file=$T/junk.csv", "domain=sea"], "domain=sea: expected traffic, crowd, or null"),
         (["file=$T/junk.csv", "frame_rate=-1"], "frame_rate=-1.0: expected a positive number"),
-        ([], "Missing mandatory value: file"),
+        ([], "Missing mandatory value: file; type file=VALUE"),
+        (["$T/junk.csv", "other.csv"], "other.csv is no option: expected NAME=VALUE"),
     ],
 )
 def test_what_cannot_be_looked_at_is_told_in_a_line(
@@ -69,7 +70,7 @@ def test_the_text_says_all(tmp_path: Path) -> None:
     told = summary(found, ["data=pedpy", "data.path=X"])
     assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in told
     assert "units: crowd, positions in cm, times in frames of 1/16 s (sure)" in told
-    assert told.endswith("  python scripts/prepare_data.py data=pedpy data.path=X")
+    assert "\n  python scripts/prepare_data.py data=pedpy data.path=X\n" in told
     for one in found.findings:
         assert one.text in told
 

@@ -1,16 +1,21 @@
-"""``scripts/simulate.py`` from a table to scores."""
+"""``scripts/simulate.py`` and ``nnode.simulate`` from a table to scores."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
+import nnode
 from nnode.data.options import TableOptions
 from nnode.data.prepare import prepare
-from tests.app.conftest import Script
+from nnode.errors import CheckpointError, ConfigError
+from tests.app.conftest import ROOT, Script
 from tests.app.following import table
+from tests.docs.test_tutorials import blocks
 
 SAMPLES = 39
 
@@ -44,6 +49,13 @@ def test_a_run_is_sampled_and_scored(started: Script, run: Path, tmp_path: Path)
     assert len(store) == 2 * SAMPLES
     assert store[0].n_agents == 3
     assert store[0].name.endswith("~1")
+    # in Python it is the same work
+    same = nnode.simulate(run, samples=SAMPLES)
+    assert json.loads(json.dumps(same.plain())) == found
+    assert [s.name.rpartition("/")[2] for s in same.trajectories] == [
+        s.name.rpartition("/")[2] for s in store
+    ]
+    np.testing.assert_array_equal(same.trajectories[3].x, store[3].x)
 
 
 def test_too_few_samples_are_refused(started: Script, run: Path, tmp_path: Path) -> None:
@@ -51,3 +63,97 @@ def test_too_few_samples_are_refused(started: Script, run: Path, tmp_path: Path)
     assert done.returncode != 0
     assert "samples=10" in done.stderr
     assert "at least 39" in done.stderr
+
+
+def test_in_python_it_is_an_object(tmp_path: Path) -> None:
+    drives = table(10, 20.0)
+    run = nnode.fit(drives, "traffic", model="idm", epochs=2)
+    with pytest.raises(ConfigError, match="a table in memory; give it again, as data=TABLE"):
+        nnode.simulate(run)
+    found = nnode.simulate(run, drives, samples=SAMPLES, seed=3)
+    assert isinstance(found, nnode.Simulated)
+    assert (found.model, found.part, found.run, found.trained_on) == ("idm", "heldout", "", 0)
+    assert found.crps == found.means["idm"]["crps_position_m"]
+    assert found.scores.loc[("idm", "crps_position_m"), "mean"] == found.crps.mean
+    assert found.crps.mean < found.means["constant_speed"]["crps_position_m"].mean
+    assert found.coverage[0.5].mean <= found.coverage[0.95].mean
+    samples = found.to_dataframe()
+    assert set(samples) >= {"sequence", "time", "agent", "x", "length"}
+    assert samples["sequence"].nunique() == SAMPLES * len(found.sampling.indices)
+    # who leads is where he was measured
+    first = found.trajectories[0]
+    own = drives[drives["sequence"] == int(first.name.rpartition("/")[2].partition("~")[0])]
+    lead = own.loc[own["agent"] == int(first.agents[-1]), "x"]
+    np.testing.assert_allclose(first.x[:, -1, 0], lead, atol=1e-9)
+    assert "noise of idm: " in repr(found)
+    assert "<table" in found._repr_html_()
+    paths = found.write(tmp_path / "out", table=False)
+    assert [path.name for path in paths] == ["scores.json", "bands.png"]
+    other = nnode.simulate(run, drives, samples=SAMPLES, seed=4)
+    assert not np.array_equal(other.trajectories[0].x, first.x)
+
+
+def test_what_cannot_be_sampled(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
+        nnode.simulate(tmp_path / "none")
+    with pytest.raises(ConfigError, match="samples=10: a band of 95 % needs at least 39"):
+        nnode.simulate(run, samples=10)
+    with pytest.raises(ConfigError, match="part=some is unknown"):
+        nnode.simulate(run, part="some")
+
+
+def test_the_lines_of_the_page(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (text,) = (t for lang, t in blocks(ROOT / "docs" / "sampling.md") if lang == "python")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(text.replace('"RUN"', repr(str(run))), "sampling.md", "exec"), names)
+    assert "noise of idm: " in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "runs" / "samples").iterdir()} == {
+        "scores.json", "bands.png", "samples.parquet",
+    }  # fmt: skip
+
+
+def walks(number: int = 10, people: int = 4, seconds: float = 8.0) -> pd.DataFrame:
+    """People abreast who return to a speed of their own within half a second, and are pushed."""
+    rng, rows, step = np.random.default_rng(0), [], 0.1
+    for k in range(number):
+        wish = np.stack([1.3 + 0.1 * rng.normal(size=people), np.zeros(people)], -1)
+        x = np.stack([np.zeros(people), 1.5 * np.arange(people)], -1)
+        v, push = wish.copy(), 0.4 * rng.normal(size=(people, 2))
+        for i in range(round(seconds / step) + 1):
+            rows += [(k, step * i, f"{k}-{n}", *x[n]) for n in range(people)]
+            x, v = x + step * v, v + step * ((wish - v) / 0.5 + push)
+            push = 0.9 * push + 0.4 * np.sqrt(1 - 0.9**2) * rng.normal(size=push.shape)
+    return pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
+
+
+def test_people_are_sampled(tmp_path: Path) -> None:
+    table = walks()
+    (tmp_path / "walls.csv").write_text("x1,y1,x2,y2\n-5,-3,30,-3\n")
+    model = {"term": "social_force", "desired": "direction"}
+    run = nnode.fit(
+        table, "crowd", model=model, walls=tmp_path / "walls.csv", epochs=2, heldout=0.4
+    )
+    data = nnode.sequences(table, data="table", domain="crowd", walls=str(tmp_path / "walls.csv"))
+    found = nnode.simulate(run, data, samples=SAMPLES)
+    name = found.model
+    score = {key: own["crps_position_m"].mean for key, own in found.means.items()}
+    assert found.crps.mean == score[name] < score[f"{name}, no noise"]
+    assert score[name] < score["constant_speed"]
+    assert "crps_nearest_m" in found.means[name]
+    # of 4 sequences with 4 people: far from none and from the band of 50 %
+    assert found.coverage[0.95].mean > 0.75
+    assert {"x", "y", "vx", "vy"} <= set(found.to_dataframe())
+    assert "m/s²" in repr(found)
+    names = {path.name for path in found.write(tmp_path / "out")}
+    assert names == {"scores.json", "bands.png", "samples.parquet", "walls.csv"}
+    again = TableOptions(
+        domain="crowd", path=str(tmp_path / "out" / "samples.parquet"),
+        walls=str(tmp_path / "out" / "walls.csv"),
+    )  # fmt: skip
+    store = prepare(again, tmp_path / "again")
+    assert len(store) == SAMPLES * len(found.sampling.indices)
+    np.testing.assert_array_equal(store[5].x, found.trajectories[5].x)
+    assert store[5].walls is not None

@@ -65,7 +65,7 @@ def test_scores_of_known_samples() -> None:
     measured = np.stack([np.arange(4.0), np.arange(4.0) + 10], 1)
     samples = np.broadcast_to(measured + np.array([2.0, 0.0]), (39, 4, 2))
     scores = Scores(5.0)
-    scores.add("a", samples, measured, np.zeros((39, 4, 2)))
+    scores.add("a", samples[..., None], measured[..., None], np.zeros((39, 4, 2, 1)))
     means = scores.means(np.zeros(1, int))
     assert means["crps_position_m"].mean == pytest.approx(2.0)
     assert means["crps_gap_m"].mean == pytest.approx(2.0)
@@ -73,3 +73,20 @@ def test_scores_of_known_samples() -> None:
     assert means["coverage_position_95"].mean == 0.0
     # later than the sequence
     assert "crps_position_m@20s" not in means
+
+
+def test_scores_of_people() -> None:
+    measured = np.zeros((4, 3, 2))
+    measured[:, 1] = (3.0, 4.0)
+    measured[:, 2] = (3.0, 5.0)
+    # the first one is 1 m off in one component, which brings nobody nearer than 1 m
+    away = np.zeros((39, 4, 3, 2))
+    away[:, :, 0, 0] = 1.0
+    scores = Scores(1.0)
+    scores.add("a", measured + away, measured, np.zeros_like(away))
+    means = scores.means(np.zeros(1, int))
+    assert means["crps_position_m"].mean == pytest.approx(1 / 6)
+    # of three people one is at another distance from who is nearest
+    assert means["crps_nearest_m"].mean == pytest.approx((5 - np.hypot(2, 4)) / 3)
+    assert means["coverage_position_95"].mean == pytest.approx(5 / 6)
+    assert "crps_gap_m" not in means

@@ -9,11 +9,11 @@ import pytest
 import torch
 import yaml
 
+from nnode.compiled import loops, source
 from nnode.laws import arrays, differentiate, expression, parse, tensors
 from nnode.models import build_model
 from nnode.models.effects import CATALOGUE
 from nnode.models.field import FIELD
-from nnode.simulate import loops, source
 
 METHOD = (
     Path("docs/method.md").read_text("utf-8").split("## A law is one formula")[1].split("\n## ")[0]

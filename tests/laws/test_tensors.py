@@ -9,12 +9,12 @@ import pytest
 import torch
 from numba import njit
 
+from nnode.compiled import loops
 from nnode.laws.arrays import straight
 from nnode.laws.differentiate import derivatives
 from nnode.laws.expression import apply, const
 from nnode.laws.parse import parse
 from nnode.laws.tensors import computed
-from nnode.simulate import loops
 
 FORMULAS = [
     "a*(1 - (b/c)**4) - exp(-a)*log(b)",

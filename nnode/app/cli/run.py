@@ -18,11 +18,12 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nnode.app.cli.help import help_text
 from nnode.app.cli.prepared import prepared_group
 from nnode.app.cli.runs import RESULT, end, failures, say
+from nnode.app.cli.typed import literal
 from nnode.calibrate.distributed import World, join, started_together
 from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
@@ -40,6 +41,7 @@ def run(
     inject: Callable[[list[str]], list[str]] | None = None,
     *,
     parallel: bool = False,
+    bare: str | None = None,
 ) -> None:
     """Run ``job(config, folder)`` as the command ``name``; ends the process on errors.
 
@@ -50,6 +52,7 @@ def run(
             before them.
         parallel: whether the job is for all processes that were started together; otherwise
             the first one does it alone.
+        bare: option whose value may be typed without its name.
     """
     if started_together() and not parallel and os.environ["RANK"] != "0":
         return
@@ -68,6 +71,7 @@ def run(
         if parallel:
             join()
         with World().together():
+            _name_words(bare)
             given = [sys.argv[i] for i in _places()]
             extra = prepared_group(given, folder)
             _insert(extra + (inject([*given, *extra]) if inject else []), first=True)
@@ -90,8 +94,13 @@ def _task(job: Job) -> Callable[[DictConfig], None]:
         try:
             with disk_words(folder):
                 job(config, folder)
+        except MissingMandatoryValue as error:
+            what = str(error).splitlines()[0]
+            failed: NNodeError = ConfigError(
+                f"{what}; type {error.full_key}=VALUE, --help shows examples"
+            )
         except OmegaConfBaseException as error:
-            failed: NNodeError = ConfigError(str(error).splitlines()[0])
+            failed = ConfigError(str(error).splitlines()[0])
         except NNodeError as error:
             failed = error
         else:
@@ -109,6 +118,21 @@ def _task(job: Job) -> Callable[[DictConfig], None]:
         write_json(folder / RESULT, {"error": str(failed)})
 
     return task
+
+
+def _name_words(bare: str | None) -> None:
+    """Give its name to a word that is typed without one.
+
+    Raises:
+        ConfigError: there is no option that such a word could be meant for.
+    """
+    for i, word in enumerate(sys.argv):
+        flag = not i or word[:1] in ("-", "~", "") or sys.argv[i - 1].startswith("-")
+        if flag or "=" in word:
+            continue
+        if bare is None:
+            raise ConfigError(f"{word} is no option: expected NAME=VALUE, --help shows examples")
+        sys.argv[i], bare = f"{bare}={literal(word)}", None
 
 
 def _places() -> list[int]:

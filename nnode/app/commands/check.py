@@ -4,9 +4,9 @@ Columns, units, rate and time scale, identifiers, swaps, overlaps, holes, direct
 comes and goes, how sure all that is, and the options with which the other scripts read the file.
 
 Examples:
-  python scripts/check.py file=mine.csv
+  python scripts/check.py mine.csv
   # what is known need not be guessed
-  python scripts/check.py file=people.txt domain=crowd frame_rate=25
+  python scripts/check.py people.txt domain=crowd frame_rate=25
 
 Results: a text, and check.html, a page that needs no other file. Nothing is changed.
 """
@@ -19,4 +19,4 @@ from nnode.app.cli.run import run
 
 def main() -> None:
     """Run this command on the options of the command line."""
-    run("check", check)
+    run("check", check, bare="file")

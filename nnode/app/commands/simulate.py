@@ -1,4 +1,4 @@
-"""Motion sampled from a calibrated model of vehicles, with its noise and its drivers.
+"""Motion sampled from a calibrated model, with its noise and its drivers or walkers.
 
 Examples:
   # what the run held out, 99 times, scored beside the model without noise and constant speeds
@@ -8,7 +8,8 @@ Examples:
   python scripts/simulate.py run=RUN table=false
 
 Results: scores.json, the noise, CRPS and what bands cover; bands.png; samples.parquet, which
-data=table reads. docs/sampling.md tells how noise is fitted. Data are those of the run.
+data=table reads, of people with walls.csv. docs/sampling.md tells how noise is fitted. Data are
+those of the run.
 """
 
 from __future__ import annotations

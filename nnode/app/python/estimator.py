@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from collections.abc import Sequence as ListLike
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from html import escape
@@ -15,12 +14,18 @@ from pathlib import Path
 from typing import Any, Self
 
 import pandas as pd
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
 from nnode.app.python.inputs import choice, data_of, model_options, sequences
-from nnode.app.training import build_solver, check, model_of, set_threads, trainer_of
+from nnode.app.training import (
+    build_solver,
+    check,
+    model_of,
+    set_threads,
+    threads_given_back,
+    trainer_of,
+)
 from nnode.calibrate.options import Device
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError, NotFittedError
@@ -101,7 +106,7 @@ class Calibrator:
         given = Sequences.of(X)
         config = self._config(given)
         check(config)
-        with _threads():
+        with threads_given_back():
             model = self._built(config, given)
             solver = build_solver(OmegaConf.to_object(config.solver))  # type: ignore[arg-type]
             plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
@@ -134,7 +139,7 @@ class Calibrator:
             raise _unfitted()
         given, model, solver = Sequences.of(X), self.model_, self._solver
         dtype = next(model.parameters()).dtype
-        with _threads():
+        with threads_given_back():
             set_threads(None, model.domain)
             items = simulated(lambda b: solver(model, b), given, size=_TOGETHER, dtype=dtype)
             return Sequences(items, {"simulated": self.result_.name})
@@ -251,16 +256,6 @@ def _unfitted() -> NotFittedError:
         "this Calibrator is not fitted yet; call fit(table) first"
     )
     return error
-
-
-@contextmanager
-def _threads() -> Iterator[None]:
-    """Give torch its threads back at the end."""
-    before = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def fit(

@@ -13,10 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
 from nnode.app.cli.typed import written
+from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.options import TrainerOptions
+from nnode.data.dataset import Source
 from nnode.data.options import DataOptions, TableOptions
 from nnode.data.prepare import FORMATS
 from nnode.data.sequences import Sequences, columns, seen_options
+from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.models.field import FIELD, NEURONS
 from nnode.models.field_crowd import PEOPLE
@@ -181,6 +184,23 @@ def data_of(given: Sequences) -> DataOptions:
     if schema is None or told is None:
         return TableOptions(domain=given.domain, path="")
     return cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
+
+
+def data_used(checkpoint: Checkpoint) -> Source:
+    """The data that a run was calibrated to, read again from their files.
+
+    Raises:
+        ConfigError: the run does not tell where they are.
+        DataError: they are no longer there.
+    """
+    reader, told = checkpoint.manifest.get("reader"), checkpoint.config["data"]
+    schema = next((kind for kind in FORMATS if kind.__name__ == reader), None)
+    if schema is None or told.get("path") == "":
+        raise ConfigError("the run's data were a table in memory; give it again, as data=TABLE")
+    options = cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
+    if options.prepared is not None:
+        return Store(Path(options.prepared).expanduser())
+    return Sequences.of(None, options)
 
 
 def table_options(

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from nnode.calibrate.cost import FOLLOWING, Convention, changed_gap, errors, net_gaps
 from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step, damped_step
+from nnode.compiled import lanes
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, SimulationError
 from nnode.models.system import System, Traffic
 from nnode.models.term import Interval
-from nnode.simulate import lanes
 from nnode.solvers.base import substeps
 from nnode.solvers.fused.engine import FusedSolver
 

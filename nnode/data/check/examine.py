@@ -134,7 +134,7 @@ def _table(
     x, speed, length, lane = _places(raw, found, pairs)
     if pairs:
         time = np.concatenate([time, time])
-    tracks = tracks_of(files, time, x, speed, lane, length)
+    tracks = tracks_of(files, time, x, speed, lane, length, None if pairs else _parts(raw, found))
     if len(tracks) < 2 or not tracks.steps.size:
         raise DataError(
             f"{raw.path}: {len(table)} row{'s' * (len(table) != 1)}, in which no agent of column "
@@ -255,14 +255,22 @@ def _places(raw: Raw, found: Mapping[str, Meaning], pairs: bool) -> _Places:
         speed = np.sqrt(sum(v**2 for v in parts))
     if "lane" in found:
         lane = raw.table.names(found["lane"].column, empty=True)
-    if lane is None and len(axes) == 1 and {"sequence", "recording"} & set(found):
-        whose = [
-            raw.table.names(found[m].column, empty=True)
-            for m in ("recording", "sequence")
-            if m in found
-        ]
-        lane = np.array([" ".join(one) for one in zip(*whose, strict=True)], dtype=object)
+    if lane is None and len(axes) == 1:
+        lane = _parts(raw, found)
     return x, None if speed is None else np.abs(speed), cells("length"), lane
+
+
+def _parts(raw: Raw, found: Mapping[str, Meaning]) -> np.ndarray | None:
+    """Names of the recordings and sequences that the rows are of, where the table has such."""
+    assert raw.table is not None
+    whose = [
+        raw.table.names(found[m].column, empty=True)
+        for m in ("recording", "sequence")
+        if m in found
+    ]
+    if not whose:
+        return None
+    return np.array([" ".join(one) for one in zip(*whose, strict=True)], dtype=object)
 
 
 def _read(source: Source) -> list[Sequence]:

@@ -291,18 +291,21 @@ def coming_and_going(tracks: Tracks, domain: Domain, whole: bool) -> Iterator[Fi
     low, high = np.percentile(tracks.x[:, axis], [1, 99])
     edge = EDGE * (high - low)
 
-    def inside(rows: np.ndarray, moment: float) -> np.ndarray:
+    part = np.zeros(len(tracks), int) if tracks.part is None else tracks.part
+    clock = pd.Series(tracks.time).groupby(part)
+
+    def inside(rows: np.ndarray, moments: pd.Series) -> np.ndarray:
         at = tracks.x[rows, axis]
         found: np.ndarray = (at > low + edge) & (at < high - edge)
-        return found & (np.abs(tracks.time[rows] - moment) > tracks.dt)
+        return found & (np.abs(tracks.time[rows] - moments.to_numpy()[rows]) > tracks.dt)
 
-    born, gone = inside(start, times[0]), inside(end, times[-1])
+    born, gone = inside(start, clock.transform("min")), inside(end, clock.transform("max"))
     if not (born.any() or gone.any()):
         return
     again = _continued(tracks, start[born], end[gone], domain)
     text = (
         f"{born.sum()} agents appear and {gone.sum()} vanish in the middle of what is covered, "
-        "away from its ends and from the recording's"
+        "away from its ends and from the recording's or sequence's"
     )
     if again:
         text += (

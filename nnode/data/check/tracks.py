@@ -45,6 +45,7 @@ class Tracks:
         lane: ``(n,)`` number of the lane, or None.
         length: ``(n,)``, NaN where unknown, or None.
         lanes: names of the lanes.
+        part: ``(n,)`` number of the recording or sequence that the row is of, or None.
     """
 
     agent: np.ndarray
@@ -55,6 +56,7 @@ class Tracks:
     lane: np.ndarray | None = None
     length: np.ndarray | None = None
     lanes: tuple[str, ...] = ()
+    part: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -105,11 +107,12 @@ def tracks_of(
     speed: np.ndarray | None = None,
     lane: np.ndarray | None = None,
     length: np.ndarray | None = None,
+    part: np.ndarray | None = None,
 ) -> Tracks:
     """Put rows in order; those without an agent, a time or a position are left out.
 
     Args:
-        agent, lane: ``(rows,)`` names.
+        agent, lane, part: ``(rows,)`` names.
         time, speed, length: ``(rows,)``.
         x: ``(rows, D)``.
     """
@@ -124,8 +127,10 @@ def tracks_of(
     if lane is not None:
         lane, called = pd.factorize(lane)
         lanes = tuple(map(str, called))
-    parts = {"speed": speed, "lane": lane, "length": length}
-    own = {name: None if part is None else part[order] for name, part in parts.items()}
+    if part is not None:
+        part = pd.factorize(part)[0]
+    cells = {"speed": speed, "lane": lane, "length": length, "part": part}
+    own = {name: None if one is None else one[order] for name, one in cells.items()}
     return Tracks(code[order], list(map(str, names)), time[order], x[order], lanes=lanes, **own)
 
 
@@ -152,5 +157,5 @@ def tracks_from(sequences: Iterable[Sequence], *, cut: bool) -> Tracks:
     agent, time, x, v, long, lane = (np.concatenate(part) for part in zip(*parts, strict=True))
     return tracks_of(
         agent, time, x, None if np.isnan(v).all() else v, lane,
-        None if np.isnan(long).all() else long,
+        None if np.isnan(long).all() else long, lane,
     )  # fmt: skip

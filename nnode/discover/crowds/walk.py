@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
+from nnode.compiled.crowds.alone import WalkSource, compiled
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
 from nnode.discover.residuals.engine import runge_kutta, trained
 from nnode.models.crowd import NetworkForce
@@ -19,7 +20,6 @@ from nnode.models.crowd_formula import CrowdBase, crowd_of, settings_of, walls_o
 from nnode.models.formula import own_values, values_of
 from nnode.models.system import Crowd, System
 from nnode.models.term import State, Term
-from nnode.simulate.crowds.alone import WalkSource, compiled
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -43,7 +43,7 @@ class Beyond(nn.Module):
 
 @dataclass
 class Tables:
-    """What the compiled code knows of the surroundings, see :mod:`nnode.simulate.crowds.alone`."""
+    """What the compiled code knows of the surroundings, see :mod:`nnode.compiled.crowds.alone`."""
 
     others: np.ndarray
     window: np.ndarray

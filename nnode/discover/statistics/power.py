@@ -117,6 +117,8 @@ def _gain(
 
 def _t(gain: np.ndarray) -> np.ndarray:
     """Student's statistic of the mean over the first axis."""
-    error = gain.std(0, ddof=1) / np.sqrt(len(gain))
-    found: np.ndarray = gain.mean(0) / np.maximum(error, 1e-300)
+    # where an effect leaves a cluster no cost, its gain is beyond all numbers: nothing is passed
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = gain.std(0, ddof=1) / np.sqrt(len(gain))
+        found: np.ndarray = gain.mean(0) / np.maximum(error, 1e-300)
     return found

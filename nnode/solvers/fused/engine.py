@@ -10,15 +10,15 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from nnode.compiled import lanes
+from nnode.compiled.crowds import cells
+from nnode.compiled.crowds import runs as crowds
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.laws.steps import METHODS
 from nnode.models.formula import rule_of
 from nnode.models.system import System
 from nnode.models.term import Term
-from nnode.simulate import lanes
-from nnode.simulate.crowds import cells
-from nnode.simulate.crowds import runs as crowds
 from nnode.solvers.base import Trajectory, check_finite, substeps
 from nnode.solvers.ode import TorchdiffeqSolver
 
@@ -51,7 +51,7 @@ class FusedSolver:
         cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
             left out, in units of A. The acceleration of one person is then off by less than
             ``cutoff_error`` A / m through people, and as much through walls; see
-            :func:`nnode.simulate.crowds.cells.cutoff_distance`. 0 lets everybody meet
+            :func:`nnode.compiled.crowds.cells.cutoff_distance`. 0 lets everybody meet
             everybody.
         method: of lanes, one of :data:`nnode.laws.steps.METHODS`; None takes ``ballistic`` for
             accelerations and ``euler`` for speeds.

@@ -64,8 +64,11 @@ WRONG = [
     ("train --max_epochs=3", "unrecognized arguments: --max_epochs=3", 2),
     ("train --config-dir /nowhere", "'/nowhere' not found", 1),
     # the package's, each in one line
-    ("export", "error: Missing mandatory value: run\n$", 2),
-    ("train data=table", "error: Missing mandatory value: data.domain\n$", 2),
+    ("export", "error: Missing mandatory value: run; type run=VALUE, --help shows examples\n$", 2),
+    ("train data=table", "error: Missing mandatory value: data.domain; type data.domain=", 2),
+    ("train mine.csv", "error: mine.csv is no option: expected NAME=VALUE, --help shows", 2),
+    ("check a.csv b.csv", "error: b.csv is no option", 2),
+    ("check none.csv", r"error: there is no file none.csv", 2),
     ("discover discover.alpha=2", "error: .*must lie between 0 and 1", 2),
     ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?", 2),
     ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz", 2),

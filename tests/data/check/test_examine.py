@@ -129,6 +129,20 @@ def test_identifiers_that_change_along_the_way_are_seen(tmp_path: Path) -> None:
     assert "2 of those who appear carry on where another broke off (such as 5 as 99)" in text
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_nobody_comes_or_goes_where_a_sequence_begins_and_ends(told: bool, tmp_path: Path) -> None:
+    """Of three stays one after the other the second begins and ends amid the others."""
+    table = cars()
+    stays = [
+        table.assign(t=table["t"] + 100 * k, x=table["x"] + 300 * (k == 1), veh=100 * k + table.veh)
+        for k in range(3)
+    ]
+    table = pd.concat([one.assign(sequence=k) for k, one in enumerate(stays)])
+    found = examine(saved(table if told else table.drop(columns="sequence"), tmp_path))
+    kinds = {one.kind for one in found.findings}
+    assert ("broken" in kinds) is not told
+
+
 def test_cells_rows_and_holes(tmp_path: Path) -> None:
     table = cars().astype({"x": object})
     table.loc[100, "x"] = "oops"

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.cost import sequence_costs
+from nnode.compiled.crowds import runs as compiled
+from nnode.compiled.crowds.rows import SIZE
+from nnode.compiled.crowds.source import CrowdSource
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError, SimulationError
 from nnode.models import Crowd, Linear, NetworkForce, Relaxation, SocialForce, System, Traffic
 from nnode.models.effects import CATALOGUE
 from nnode.models.network import FeedForward
-from nnode.simulate.crowds import runs as compiled
-from nnode.simulate.crowds.rows import SIZE
-from nnode.simulate.crowds.source import CrowdSource
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
 from nnode.solvers.fused import engine
 from tests.solvers.fused.compare import difference, single
@@ -281,7 +281,7 @@ def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_loops_are_vector_code(name: str) -> None:
     # losing this makes everything ten times slower and nothing else would tell
-    from tests.simulate.test_lane_code import PACKED, platform
+    from tests.compiled.test_lane_code import PACKED, platform
 
     if platform.machine() not in PACKED:
         pytest.skip("unknown instruction set")

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.compiled.lanes import runs as lanes
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Linear, Logarithmic, NetworkSpeed, Relaxation, SocialForce, Traffic
-from nnode.simulate.lanes import runs as lanes
 from nnode.solvers import FusedSolver
 from tests.solvers.fused.compare import difference, single
 from tests.solvers.fused.test_fallback import Sway

@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.compiled.crowds import cells as neighbours
+from nnode.compiled.crowds import runs as crowds
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Linear, NetworkForce, Relaxation, SocialForce, Traffic
-from nnode.simulate.crowds import cells as neighbours
-from nnode.simulate.crowds import runs as crowds
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from tests.solvers.fused.compare import difference
 from tests.solvers.fused.test_crowd import gradient
@@ -283,7 +283,7 @@ import resource
 import torch
 from tests.solvers.fused.test_neighbours import hall
 from nnode.models import Crowd, Relaxation, SocialForce
-from nnode.simulate.crowds import runs as crowds
+from nnode.compiled.crowds import runs as crowds
 torch.set_num_threads(1)
 model = Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0)])
 law = crowds.supports(model)

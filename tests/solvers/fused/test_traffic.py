@@ -7,10 +7,10 @@ from functools import partial
 import pytest
 import torch
 
+from nnode.compiled import lanes
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.models import Linear, Logarithmic, NetworkSpeed, Traffic
-from nnode.simulate import lanes
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from nnode.solvers.fused import engine
 from tests.solvers.fused.compare import difference, gradient, single

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import torch
 
+from nnode.compiled import functions, source
+from nnode.compiled.cache import digest
+from nnode.compiled.lanes import runs as lanes
+from nnode.compiled.lanes.source import LaneSource
 from nnode.errors import ConfigError
 from nnode.models import Linear, Logarithmic, NetworkSpeed, Traffic
 from nnode.models.effects.following import RelativeSpeed
-from nnode.simulate import functions, source
-from nnode.simulate.cache import digest
-from nnode.simulate.lanes import runs as lanes
-from nnode.simulate.lanes.source import LaneSource
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
-from tests.simulate import saturation
+from tests.compiled import saturation
 from tests.solvers.fused.compare import difference, gradient, single
 
 #: Divisions of several numbers at once, by processor.
@@ -170,8 +170,8 @@ batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
 model = Traffic([NetworkSpeed(4)])
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulate.lanes import runs as lanes
-from nnode.simulate.lanes.source import LaneSource
+from nnode.compiled.lanes import runs as lanes
+from nnode.compiled.lanes.source import LaneSource
 module = lanes.compiled(LaneSource(model.lane))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
 print(json.dumps({"hits": hits}))

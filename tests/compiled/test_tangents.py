@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.compiled import lanes
 from nnode.data.sequence import Batch, collate
 from nnode.laws.steps import METHODS
 from nnode.laws.tangent import with_tangents
@@ -16,7 +17,6 @@ from nnode.laws.tensors import computed
 from nnode.models import Traffic, build_model
 from nnode.models.effects.following import ReactionDelay
 from nnode.models.field import FIELD, NEURONS
-from nnode.simulate import lanes
 from nnode.solvers import TorchdiffeqSolver
 from tests.models.following import DT, driven, model, set_
 

@@ -1,6 +1,6 @@
 """What the vectorisable functions are made of: polynomials, and the digits of numbers.
 
-Compiled in place, not called. Used by :mod:`nnode.simulate.functions` alone.
+Compiled in place, not called. Used by :mod:`nnode.compiled.functions` alone.
 """
 
 from __future__ import annotations

@@ -14,12 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from nnode.compiled.lanes.templates import HEAD, SIMULATE
+from nnode.compiled.loops import Loop
 from nnode.laws.expression import Expr, apply, const, symbol, symbols
 from nnode.laws.lane import Lane
 from nnode.laws.tensors import SAFE
 from nnode.laws.text import plain
-from nnode.simulate.lanes.templates import HEAD, SIMULATE
-from nnode.simulate.loops import Loop
 
 #: Weights and times of the stages of a method.
 TABLEAUS = {

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from nnode.compiled import source
+from nnode.compiled.crowds import runs as crowds
+from nnode.compiled.crowds import templates as crowd_templates
+from nnode.compiled.crowds.source import CrowdSource
 from nnode.errors import ConfigError
 from nnode.models import Crowd, Relaxation, SocialForce
 from nnode.models.crowd_formula import crowd_of
-from nnode.simulate import source
-from nnode.simulate.crowds import runs as crowds
-from nnode.simulate.crowds import templates as crowd_templates
-from nnode.simulate.crowds.source import CrowdSource
 
 SCRIPT = """
 import json
@@ -28,8 +28,8 @@ batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x
 model = Crowd([Relaxation(), SocialForce(1.0, 1.0, 1.0)])
 from nnode.solvers import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulate.crowds.runs import compiled, supports
-from nnode.simulate.crowds.source import CrowdSource
+from nnode.compiled.crowds.runs import compiled, supports
+from nnode.compiled.crowds.source import CrowdSource
 module = compiled(CrowdSource(supports(model)))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
 print(json.dumps({"hits": hits}))

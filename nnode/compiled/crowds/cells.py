@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from nnode.compiled.crowds.rows import LOOP, scattered
 from nnode.errors import ConfigError
-from nnode.simulate.crowds.rows import LOOP, scattered
 
 #: Cells are a hair wider than the cutoff, so that no rounding puts partners two cells apart.
 _WIDER = 1.0001

@@ -37,7 +37,7 @@ import numpy as np
 from numba import njit
 from numba.extending import overload
 
-from nnode.simulate.polynomials import (
+from nnode.compiled.polynomials import (
     LOG2,
     LOG2E,
     MANTISSA,

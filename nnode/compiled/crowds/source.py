@@ -12,15 +12,10 @@ from functools import cached_property
 
 import torch
 
-from nnode.laws.crowd import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdLaw
-from nnode.laws.differentiate import derivatives
-from nnode.laws.expression import Expr, apply, below, symbol, symbols
-from nnode.laws.tensors import computed
-from nnode.laws.text import plain
-from nnode.simulate.crowds.least import LEAST
-from nnode.simulate.crowds.neurons import Feature, split
-from nnode.simulate.crowds.rows import SIZE
-from nnode.simulate.crowds.templates import (
+from nnode.compiled.crowds.least import LEAST
+from nnode.compiled.crowds.neurons import Feature, split
+from nnode.compiled.crowds.rows import SIZE
+from nnode.compiled.crowds.templates import (
     ARRANGE,
     DRIVE,
     HEAD,
@@ -31,7 +26,12 @@ from nnode.simulate.crowds.templates import (
     PAIRS,
     SCENE,
 )
-from nnode.simulate.loops import Loop
+from nnode.compiled.loops import Loop
+from nnode.laws.crowd import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdLaw
+from nnode.laws.differentiate import derivatives
+from nnode.laws.expression import Expr, apply, below, symbol, symbols
+from nnode.laws.tensors import computed
+from nnode.laws.text import plain
 
 _STATE = ("x", "y", "vx", "vy")
 _POINT = ("x", "y", "normal_x", "normal_y")

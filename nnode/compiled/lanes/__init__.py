@@ -1,5 +1,5 @@
 """Vehicles behind each other, in compiled code."""
 
-from nnode.simulate.lanes.runs import simulate, supports, tangents
+from nnode.compiled.lanes.runs import simulate, supports, tangents
 
 __all__ = ["simulate", "supports", "tangents"]

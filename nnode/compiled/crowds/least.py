@@ -11,7 +11,7 @@ from typing import Any
 
 from numba import njit
 
-from nnode.simulate.crowds.rows import LOOP
+from nnode.compiled.crowds.rows import LOOP
 
 #: Everybody's smallest values; they are computed behind the sums, which they may depend on.
 LEAST = """

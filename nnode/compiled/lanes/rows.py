@@ -13,7 +13,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from nnode.simulate.functions import INLINE, real
+from nnode.compiled.functions import INLINE, real
 
 #: Rows are computed in multiples of this: four of the widest vectors of float32.
 CHUNK = 64

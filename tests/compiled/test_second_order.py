@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from nnode.compiled import lanes
 from nnode.errors import ConfigError
 from nnode.models import Linear, Traffic, build_model
 from nnode.models.field import FIELD
-from nnode.simulate import lanes
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from tests.solvers.fused.compare import difference, gradient, single
 

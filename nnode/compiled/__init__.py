@@ -15,8 +15,8 @@ def source(model: System) -> str:
     Raises:
         ValueError: the model has a term that is no formula.
     """
-    from nnode.simulate.crowds.source import CrowdSource
-    from nnode.simulate.lanes.source import LaneSource
+    from nnode.compiled.crowds.source import CrowdSource
+    from nnode.compiled.lanes.source import LaneSource
 
     if isinstance(model, Traffic):
         lane = model.lane

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from nnode.simulate import functions
-from nnode.simulate.functions import FLAGS
+from nnode.compiled import functions
+from nnode.compiled.functions import FLAGS
 
 KINDS = [np.float32, np.float64]
 

@@ -13,6 +13,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nnode.compiled import functions, polynomials
+from nnode.compiled.cache import digest, keep
+from nnode.compiled.lanes import rows as lane_rows
+from nnode.compiled.lanes.source import LaneSource
+from nnode.compiled.threads import run_all
 from nnode.data.sequence import Batch
 from nnode.laws.lane import Lane
 from nnode.laws.steps import STAGES, stepped
@@ -20,11 +25,6 @@ from nnode.laws.tangent import with_tangents
 from nnode.models.formula import inputs_of, starts_of
 from nnode.models.system import System, Traffic, initial_with
 from nnode.models.term import Term
-from nnode.simulate import functions, polynomials
-from nnode.simulate.cache import digest, keep
-from nnode.simulate.lanes import rows as lane_rows
-from nnode.simulate.lanes.source import LaneSource
-from nnode.simulate.threads import run_all
 
 #: Bytes of one row: a handful of rows are to stay in the first-level cache.
 _ROW_BYTES = 4800

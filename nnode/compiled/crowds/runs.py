@@ -12,6 +12,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nnode.compiled import functions, polynomials
+from nnode.compiled.cache import digest, keep
+from nnode.compiled.crowds import cells, least
+from nnode.compiled.crowds import rows as crowd_rows
+from nnode.compiled.crowds.cells import check_cutoff, cutoff_distance
+from nnode.compiled.crowds.rows import LANES, SIZE
+from nnode.compiled.crowds.source import CrowdSource
+from nnode.compiled.threads import run_all
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.laws.crowd import OTHERS, SMALLEST, WALLS, CrowdLaw
@@ -21,14 +29,6 @@ from nnode.models.formula import own_values, values_of
 from nnode.models.scene import Scene
 from nnode.models.system import Crowd, System
 from nnode.models.term import Term
-from nnode.simulate import functions, polynomials
-from nnode.simulate.cache import digest, keep
-from nnode.simulate.crowds import cells, least
-from nnode.simulate.crowds import rows as crowd_rows
-from nnode.simulate.crowds.cells import check_cutoff, cutoff_distance
-from nnode.simulate.crowds.rows import LANES, SIZE
-from nnode.simulate.crowds.source import CrowdSource
-from nnode.simulate.threads import run_all
 
 #: From so many people on, social forces use cell lists. They are faster for 50 already; smaller
 #: crowds, and so most recordings, are exact to rounding instead.
@@ -202,7 +202,7 @@ def simulate(
     scheme. Simulations of fewer than LISTS_FROM people, and all models without a cutoff in which
     more than a social force acts between people, let everybody meet everybody. Others use cell
     lists: social forces that are smaller than ``cutoff_error`` times A are left out. See
-    :func:`nnode.simulate.crowds.cells.cutoff_distance` for the bound of the sum.
+    :func:`nnode.compiled.crowds.cells.cutoff_distance` for the bound of the sum.
 
     Args:
         substeps: Euler steps in a sampling interval.

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import overload
 
-from nnode.simulate.functions import INLINE, real
+from nnode.compiled.functions import INLINE, real
 
 #: Numbers in a row of the room; ten rows of float32 stay in the first-level cache.
 SIZE = 512
