@@ -3,8 +3,8 @@
 Models are compared by their predictive likelihood, cluster by cluster: the share by which the sum
 of squared whitened residuals falls, one-sided, by sign flips. That takes at least five clusters at
 5 %. The mean square error of positions, which the report shows, must fall as well. Effects are
-tried in the order in which they were found, each beside those before it, until one fails: so all of
-them together keep the level.
+tried in the order of what they are worth in the open clusters, each beside those before it, until
+one fails: so all of them together keep the level.
 
 Source: Maurer, Hothorn & Lehmacher 1995 (fixed sequences of tests).
 """

@@ -67,7 +67,7 @@ class Sealed:
         seed: of simulations.
 
     Attributes:
-        tried: the effects in the order in which they were found, until one failed.
+        tried: the effects in their order, until one failed.
     """
 
     def __init__(
