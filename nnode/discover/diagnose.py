@@ -187,8 +187,7 @@ def diagnose(
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
     effects_found = [
-        named(engine, final, step, one.p_value)
-        for step, one in zip(found.steps, sealed.tried, strict=False)
+        named(engine, final, step, sealed.tried[step.chosen.name].p_value) for step in found.steps
     ]
     effects_found += [named_agents(one, agent.confirmed) for one, agent in both if agent.named]
     leads_found = [*leads, *imitations]

@@ -2,11 +2,12 @@
 
 Models are compared by their predictive likelihood, cluster by cluster: the share by which the sum
 of squared whitened residuals falls, one-sided, by sign flips. That takes at least five clusters at
-5 %. The mean square error of positions, which the report shows, must fall as well. Effects are
-tried in the order in which they were found, each beside those before it, until one fails: so all of
-them together keep the level.
+5 %. The mean square error of positions, which the report shows, must fall as well. Of
+several effects one is confirmed if the model with all of them beats that without it, and without it
+and any of the others: so the level holds for all names together, and none drowns in what another
+one does.
 
-Source: Maurer, Hothorn & Lehmacher 1995 (fixed sequences of tests).
+Source: Marcus, Peritz & Gabriel 1976 (closed tests).
 """
 
 from __future__ import annotations

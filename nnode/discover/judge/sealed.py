@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from nnode.models.system import System
 
 @dataclass(frozen=True)
 class _Tried:
-    """An effect on the sealed clusters.
+    """Two models on the sealed clusters.
 
     Attributes:
         p_value: one-sided, that their predictive likelihood rises.
@@ -40,6 +40,10 @@ class _Tried:
     @property
     def good(self) -> bool:
         return self.p_value <= LEVEL and self.after < self.before
+
+    def doubt(self) -> tuple[bool, float]:
+        """Grows the less is said for the second model."""
+        return not self.good, self.p_value
 
     @property
     def reason(self) -> str:
@@ -67,7 +71,7 @@ class Sealed:
         seed: of simulations.
 
     Attributes:
-        tried: the effects in the order in which they were found, until one failed.
+        tried: by effect the comparison that speaks least for it.
     """
 
     def __init__(
@@ -84,43 +88,56 @@ class Sealed:
         self.label, self.clusters, self.seed = label, clusters, seed
         self.comparing = Comparing(domain, sealed, base, label)
         self.before = self.comparing.squares(base)
-        self.tried: list[_Tried] = []
+        self.tried: dict[str, _Tried] = {}
         self._corrected: Fit | None = None
         self._later: dict[str, Later] = {}
 
     def confirmed(self, engine: Engine, found: Search) -> tuple[Search, list[NamedEffect]]:
-        """A search with the effects that sealed clusters confirm, one after the other, and those
-        that they do not, as they are in the model with all that were found."""
+        """A search with the effects that sealed clusters confirm, and those that they do not, as
+        they are in the model with all that were found."""
         if not found.steps:
             return found, []
         whole = self._corrected = self._unbiased(found.fit)
-        best: Fit | None = None
-        scores, passed = self.comparing.scores, 0
-        before, square = scores(self.base), np.nanmean(self.before)
-        for fit in self._path(engine, found, whole):
-            after = scores(fit.system)
-            error = np.nanmean(self.comparing.squares(fit.system))
-            p_value = 1.0 if too_few(self.clusters) else improvement(before, after)
-            self.tried.append(_Tried(p_value, float(square), float(error)))
-            if not self.tried[-1].good:
-                break
-            before, square, passed, best = after, error, passed + 1, fit
-        if passed == len(found.steps):
+        self.tried = self._closed(engine, found, whole)
+        rest = [step for step in found.steps if not self.tried[step.chosen.name].good]
+        if not rest:
             return found, []
-        rest = found.steps[passed:]
-        tried = [self.tried[-1].p_value] + [float("nan")] * (len(rest) - 1)
+        best = None
+        if len(rest) < len(found.steps):
+            best = self._unbiased(self._without(engine, found.fit, rest))
+            alone = self._compared(self.base, best.system)
+            if not alone.good:
+                best, rest = None, found.steps
+                self.tried = {step.chosen.name: alone for step in rest}
         # before the engine's filter is fitted to what the model leaves without them
-        leads = [named(engine, whole, step, p) for step, p in zip(rest, tried, strict=True)]
+        leads = [named(engine, whole, step, self.tried[step.chosen.name].p_value) for step in rest]
         kept = without_steps(engine, found, rest, self.base)
         self._corrected = best or kept.fit
         return kept, leads
 
-    def _path(self, engine: Engine, found: Search, whole: Fit) -> Iterator[Fit]:
-        """The models with the first, the first two, ... effects, each made when it is asked for;
-        all of them corrected."""
-        for number in range(1, len(found.steps)):
-            yield self._unbiased(self._without(engine, found.fit, found.steps[number:]))
-        yield whole
+    def _closed(self, engine: Engine, found: Search, whole: Fit) -> dict[str, _Tried]:
+        """For every effect the comparison that speaks least for it: of the model with all effects
+        with that without a set of them that holds it, over all such sets."""
+        worst: dict[str, _Tried] = {}
+        every = range(len(found.steps), 0, -1)
+        for taken in (s for number in every for s in combinations(found.steps, number)):
+            names = [step.chosen.name for step in taken]
+            if all(name in worst and not worst[name].good for name in names):
+                continue
+            lacking = self.base
+            if len(taken) < len(found.steps):
+                lacking = self._unbiased(self._without(engine, found.fit, list(taken))).system
+            tried = self._compared(lacking, whole.system)
+            for name in names:
+                worst[name] = max(worst.get(name, tried), tried, key=_Tried.doubt)
+        return worst
+
+    def _compared(self, before: System, after: System) -> _Tried:
+        """What sealed clusters say of two models."""
+        scores, squares = self.comparing.scores, self.comparing.squares
+        p_value = 1.0 if too_few(self.clusters) else improvement(scores(before), scores(after))
+        errors = (float(np.nanmean(squares(one))) for one in (before, after))
+        return _Tried(p_value, *errors)
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
@@ -137,7 +154,8 @@ class Sealed:
         numbers of agents."""
         few = too_few(self.clusters)
         tried = [(one.confirmed, one.named, one.reason) for one in agents if one.found]
-        tried = [(one.p_value, one.good, few or one.reason) for one in self.tried] or tried
+        least = sorted(self.tried.values(), key=_Tried.doubt)
+        tried = [(one.p_value, one.good, few or one.reason) for one in least] or tried
         if not tried:
             return Confirmation(None, self.clusters, None, few)
         p_value, good, reason = tried[-1]

@@ -125,6 +125,9 @@ def search(
 ) -> Search:
     """Forwards until no effect passes, then backwards.
 
+    An effect that a curve outdoes is kept if a second one comes to it and no curve outdoes both:
+    of two effects that act at once, a curve may show one while the other comes first.
+
     Args:
         engine: of the open sequences.
         fit: the calibrated model, in the engine's filter.
@@ -141,6 +144,7 @@ def search(
             from there as well.
     """
     found, levels = Search(fit), levels or {}
+    doubtful: Search | None = None  # as it was before an effect that a curve outdoes
     while True:
         own = {effect.name for effect in effects_of(found.fit.system)}
         left = [effect for effect in effects if effect.name not in own]
@@ -154,14 +158,23 @@ def search(
         if len(found.steps) >= most:
             break
         step = _round(engine, found, alpha if not found.steps else LATER * alpha, hint)
-        if step is None or _outdone(engine, found.fit, step.chosen, variables or []):
+        if step is None:
             break
+        if _outdone(engine, found.fit, step.chosen, variables or []):
+            if doubtful is not None:
+                break
+            doubtful = replace(found, steps=[*found.steps])
+        elif doubtful is not None:
+            both = _candidate(step.chosen.score, step.chosen.fit, doubtful.fit, found.screen, 0.0)
+            if _outdone(engine, doubtful.fit, both, variables or []):
+                break
+            doubtful = None
         found.steps.append(step)
         found.fit = settled(engine, step.chosen.fit.system, rounds=1)
         if step.chosen.score.effect.consecutive:
             found.fit = moved(engine, found.fit, step.chosen.name)
         log.info("added %s", step.chosen.name)
-    return _pruned(engine, found)
+    return _pruned(engine, doubtful or found)
 
 
 def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> Step | None:
@@ -299,22 +312,52 @@ def without_steps(engine: Engine, found: Search, steps: list[Step], base: System
 
 
 def _pruned(engine: Engine, found: Search) -> Search:
-    """Take back effects that the later ones have made needless; who was a rival of one effect
-    and was added later is none."""
+    """Take back effects that the later ones have made needless, and rivals that are told apart
+    beside them. What held-out clusters need most comes first: beside it others are confirmed, and
+    alone they would drown in what it does."""
+    rest: list[tuple[Comparison, Step, Fit]] = []
     while len(found.steps) > 1:
         losses = heldout(found.fit, engine.cluster)
-        worst: tuple[float, Step, Fit] | None = None
+        rest = []
         for step in found.steps:
             fit = refine(engine, without(found.fit.system, step.chosen.name))
-            test = compare(heldout(fit, engine.cluster), losses)
-            if test.p_value > BETTER and (worst is None or test.gain < worst[0]):
-                worst = test.gain, step, fit
-        if worst is None:
+            rest.append((compare(heldout(fit, engine.cluster), losses), step, fit))
+        rest.sort(key=lambda one: -one[0].gain)
+        found.steps = [step for _, step, _ in rest]
+        needless = [one for one in rest if one[0].p_value > BETTER]
+        if not needless:
             break
-        found.steps.remove(worst[1])
-        found.fit = worst[2]
-        log.info("took back %s", worst[1].chosen.name)
-    added = {step.chosen.name for step in found.steps}
-    for step in found.steps:
-        step.rivals = [rival for rival in step.rivals if rival[0].name not in added]
+        _, step, found.fit = needless[-1]
+        found.steps.remove(step)
+        log.info("took back %s", step.chosen.name)
+    if len(found.steps) > 1:
+        for _, step, before in rest:
+            step.rivals = _rivals_beside(engine, found, step, before)
     return found
+
+
+def _rivals_beside(
+    engine: Engine, found: Search, step: Step, before: Fit
+) -> list[tuple[Candidate, Comparison]]:
+    """The rivals of an effect that are not told apart from it beside the other effects.
+
+    Args:
+        before: the model with the other effects alone.
+    """
+    assert found.screen is not None
+    added = {one.chosen.name for one in found.steps}
+    one = _candidate(step.chosen.score, found.fit, before, found.screen, step.chosen.removed)
+    rivals = []
+    for rival, _ in step.rivals:
+        if rival.name in added:
+            continue
+        try:
+            fit = calibrated(engine, before, rival.score, 0.0)
+        except SimulationError:
+            continue
+        fit = refine(engine, fit.system, tolerance=FINE)
+        other = _candidate(rival.score, fit, before, found.screen, rival.removed)
+        test = _between(other, one, found.screen)
+        if other.gain.gain >= CLOSE * one.gain.gain and test.p_value > apart_at(one, other):
+            rivals.append((other, test))
+    return rivals
