@@ -11,7 +11,7 @@ from nnode.models.build import add_effects
 from nnode.models.crowd_formula import CrowdBase, crowd_of
 from nnode.models.effects import Effect, IndividualEffect
 from nnode.models.extend import effects_of
-from nnode.models.system import System, Traffic
+from nnode.models.system import Crowd, System, Traffic
 
 
 def check_effect(effect: type[Effect]) -> None:
@@ -31,6 +31,11 @@ def check_effect(effect: type[Effect]) -> None:
 
 def not_offered(effect: type[Effect], system: System) -> str:
     """Why an effect cannot act on a model; empty: it can."""
+    if isinstance(system, Crowd) and effect.paced and system.desired != "last":
+        return (
+            f"with desired={system.desired} everybody has a preferred speed already, measured in "
+            "the seconds before: one for all would mend its errors and be no effect"
+        )
     if system.domain != "traffic" or system.order == 1:
         return ""
     try:

@@ -102,6 +102,7 @@ class Effect(Term):
         sought: orders of the laws in which a diagnosis looks for it.
         of_laws: whether other laws of its domain have something like it in themselves, so that
             finding it in one of them is right where another law is nearer to the truth.
+        paced: whether it gives people a preferred speed, which some of their laws have.
     """
 
     domain: ClassVar[Domain]
@@ -116,6 +117,7 @@ class Effect(Term):
     individual: ClassVar[bool] = False
     sought: ClassVar[tuple[int, ...]] = (1, 2)
     of_laws: ClassVar[bool] = False
+    paced: ClassVar[bool] = False
 
     def __init__(self, **values: float) -> None:
         super().__init__()

@@ -90,6 +90,7 @@ class PreferredSpeed(Effect):
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.02, 5.0), "1/s", usual=0.2)}
     settings = {"v_pref": Setting(1.3, Interval(0.0, 3.0), "m/s")}
     kin = "speed"
+    paced = True
     separated_by = "people who walk faster and slower than preferred, in thin crowds"
 
     c: Tensor
