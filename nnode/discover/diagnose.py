@@ -161,6 +161,8 @@ def diagnose(
         [sequences[i] for i in division.sealed], division.label[division.sealed],
         numbers.sealed, options.seed,
     )  # fmt: skip
+    kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
+    beside = [individuals(engine, found.fit, kind) for kind in kinds]
     found, leads = sealed.confirmed(engine, found)
     last = look.first
     if found.fit is not base:
@@ -169,8 +171,11 @@ def diagnose(
     assert found.screen is not None
     absent = absences(found, Way(found.screen, options.alpha, BETTER, numbers.sealed, LEVEL))
     final = sealed.corrected(found)
-    kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
-    seen = [one for kind in kinds if (one := individuals(engine, found.fit, kind)) is not None]
+    if leads:  # what stands out without a lead alone may be the lead
+        without = [individuals(engine, found.fit, kind) for kind in kinds]
+        pairs = [(a, b) for a, b in zip(beside, without, strict=True) if a and b]
+        beside = [max(pair, key=lambda one: one.p_value) for pair in pairs]
+    seen = [one for one in beside if one is not None]
     for one in seen:
         one.p_value = min(1.0, one.p_value * len(seen))
     agents = [sealed.agents(one, final.system, options.alpha, bool(left), enough) for one in seen]

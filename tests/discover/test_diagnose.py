@@ -90,10 +90,10 @@ def test_a_desired_speed_can_be_tested_where_it_would_bind(calm: float, testable
     assert cap.testable == testable
     assert d.not_testable == ([] if testable else ["free_flow_speed"])
     if testable:
-        # nobody keeps to so low a speed; whether to a higher one the data do not tell
+        # nobody keeps to a lower speed, of those that were tried in the open sequences
         speeds = np.concatenate([np.diff(s.x[:, :-1, 0], axis=0).ravel() / 0.2 for s in sequences])
         assert cap.bound is not None
-        assert np.quantile(speeds, 0.4) < cap.bound < np.quantile(speeds, 0.95)
+        assert np.quantile(speeds, 0.4) < cap.bound < speeds.max()
     else:
         assert (cap.bound, cap.detectable) == (None, None)
         assert cap.reason == "it acts too rarely, or in too few clusters, to be named"

@@ -1,13 +1,15 @@
 """What the sealed clusters say, once: is what was found in the open ones true of them?
 
-Models are compared by their predictive likelihood, cluster by cluster: the share by which the sum
-of squared whitened residuals falls, one-sided, by sign flips. That takes at least five clusters at
-5 %. The mean square error of positions, which the report shows, must fall as well. Of
-several effects one is confirmed if the model with all of them beats that without it, and without it
-and any of the others: so the level holds for all names together, and none drowns in what another
-one does.
+Tested is whether the effect is there: whether the whitened residuals of the model without it lean
+the way that the effect bends its predictions, cluster by cluster, one-sided, by sign flips. That
+takes at least five clusters at 5 %. Whether predictions improve is another question: that they do
+so significantly asks for an effect of more than half the strength that the open clusters gave it,
+and has half the standardized distance of this test. So the sums of squared residuals, and the mean
+square error of positions, which the report shows, must fall, and no more. Of several effects one is
+confirmed if the model with all of them passes beside that without it, and without it and any of the
+others: so the level holds for all names together, and none drowns in what another one does.
 
-Source: Marcus, Peritz & Gabriel 1976 (closed tests).
+Sources: Rao 1948 (scores); Marcus, Peritz & Gabriel 1976 (closed tests).
 """
 
 from __future__ import annotations
@@ -16,13 +18,13 @@ from functools import cached_property
 
 import numpy as np
 
-from nnode.data.clusters import better, least_number
+from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.engine import Engine, row_of
 from nnode.discover.residuals.fit import sums
-from nnode.discover.statistics.paired import gains
+from nnode.discover.statistics.paired import leaning
 from nnode.models.system import System
 
 #: Level of a confirmation.
@@ -79,15 +81,16 @@ class Comparing:
     def scores(self, system: System) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the
         negative logarithm of the predictive likelihood, large residuals drawn in."""
+        return sums(self._residuals(system) ** 2, self._windows.cluster)
+
+    def _residuals(self, system: System) -> np.ndarray:
         found = self._windows.residuals(system, row_of(system)[None])[0].numpy()
-        return sums(np.nan_to_num(found, nan=np.inf) ** 2, self._windows.cluster)
+        return np.nan_to_num(found, nan=np.inf)
 
-
-def improvement(before: np.ndarray, after: np.ndarray) -> float:
-    """One-sided p-value that costs ``(G,)`` fall; 1 where any is infinite afterwards."""
-    if not np.isfinite(before).all() or not np.isfinite(after).all():
-        return 1.0
-    return better(gains(before, after))
+    def leaning(self, before: System, after: System) -> np.ndarray:
+        """``(G,)`` by cluster, see :func:`~nnode.discover.statistics.paired.leaning`."""
+        one, other = self._residuals(before), self._residuals(after)
+        return leaning(one, other, self._windows.cluster)
 
 
 def too_few(clusters: int) -> str:

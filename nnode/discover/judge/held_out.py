@@ -37,13 +37,14 @@ class Later:
         used: positions of the sequences that are long enough.
         costs: ``(U,)`` mean square errors, m², by who predicts: :data:`MODELS` and
             ``base`` (the model as it was given), ``own mean velocity``, ``constant velocity``.
-        scores: ``(G,)`` of the models by cluster, see :class:`Comparing`.
+        leaning: ``(G,)`` of the others of :data:`MODELS` towards own numbers, by cluster, see
+            :meth:`Comparing.leaning`.
         floor: of the measurement, m².
     """
 
     used: list[int]
     costs: dict[str, np.ndarray]
-    scores: dict[str, np.ndarray]
+    leaning: dict[str, np.ndarray]
     floor: float
 
 
@@ -79,7 +80,11 @@ def later(
             MODELS[2]: with_people(system, one, shared),
         }
         found = {name: comparing.squares(model) for name, model in each.items()}
-        scores = {name: comparing.scores(model) for name, model in each.items()}
+        leaning = {
+            name: comparing.leaning(model, each[MODELS[1]])
+            for name, model in each.items()
+            if name != MODELS[1]
+        }
         found["base"] = comparing.squares(base)
     except (DataError, SimulationError):
         return None
@@ -88,7 +93,7 @@ def later(
         found["constant velocity"] = comparing.squares(Crowd([]))
     else:
         found |= _straight(early, last)
-    return Later(used, found, scores, comparing.floor)
+    return Later(used, found, leaning, comparing.floor)
 
 
 def _parts(sequences: list[Sequence]) -> tuple[list[Sequence], list[Sequence], list[int]]:

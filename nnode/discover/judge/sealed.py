@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.indirect_inference import unbiased
-from nnode.discover.judge.confirm import LEVEL, Comparing, engine_of, improvement, too_few
+from nnode.discover.judge.confirm import LEVEL, Comparing, engine_of, too_few
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.judge.verdict import named
 from nnode.discover.name.search import Search, Step, without_steps
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
+from nnode.discover.statistics.paired import gains
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import SimulationError
 from nnode.models.extend import without
@@ -29,17 +31,22 @@ class _Tried:
     """Two models on the sealed clusters.
 
     Attributes:
-        p_value: one-sided, that their predictive likelihood rises.
+        p_value: one-sided, that residuals of the first lean towards the second.
+        likelier: whether their predictive likelihood rises.
+        nearer: whether the errors of positions become smaller; asked beside the model without any
+            effect alone.
         before, after: mean square errors of positions, m².
     """
 
     p_value: float
+    likelier: bool
+    nearer: bool
     before: float
     after: float
 
     @property
     def good(self) -> bool:
-        return self.p_value <= LEVEL and self.after < self.before
+        return self.p_value <= LEVEL and self.likelier and self.nearer
 
     def doubt(self) -> tuple[bool, float]:
         """Grows the less is said for the second model."""
@@ -49,9 +56,11 @@ class _Tried:
     def reason(self) -> str:
         if self.p_value > LEVEL:
             return (
-                "the sealed clusters are not predicted better with it "
+                "the sealed clusters do not lean the way that it bends predictions "
                 f"(one-sided p = {self.p_value:.3f}, asked for {LEVEL:g})"
             )
+        if not self.likelier:
+            return "the sealed clusters are not predicted better with it"
         if not self.good:
             return (
                 "the errors of positions on the sealed sequences do not become smaller with it "
@@ -135,9 +144,10 @@ class Sealed:
     def _compared(self, before: System, after: System) -> _Tried:
         """What sealed clusters say of two models."""
         scores, squares = self.comparing.scores, self.comparing.squares
-        p_value = 1.0 if too_few(self.clusters) else improvement(scores(before), scores(after))
-        errors = (float(np.nanmean(squares(one))) for one in (before, after))
-        return _Tried(p_value, *errors)
+        p_value = 1.0 if too_few(self.clusters) else better(self.comparing.leaning(before, after))
+        likelier = bool(gains(scores(before), scores(after)).mean() > 0)
+        first, last = (float(np.nanmean(squares(one))) for one in (before, after))
+        return _Tried(p_value, likelier, last < first or before is not self.base, first, last)
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
@@ -179,10 +189,10 @@ class Sealed:
         if found is not None:
             self._later[one.effect.name] = found
             means = {model: float(np.nanmean(costs)) for model, costs in found.costs.items()}
-            own, *others = (found.scores[model] for model in (MODELS[1], MODELS[0], MODELS[2]))
-            if not too_few(min(len(own), self.clusters)):
-                p_value = max(improvement(other, own) for other in others)
-            if means[MODELS[1]] >= means[MODELS[0]]:
+            others = [found.leaning[model] for model in (MODELS[0], MODELS[2])]
+            if not too_few(min(len(others[0]), self.clusters)):
+                p_value = max(better(other) for other in others)
+            if means[MODELS[1]] >= min(means[MODELS[0]], means[MODELS[2]]):
                 p_value = 1.0
         hindered = _hindered(one, alpha, structure, enough)
         reason = hindered or _why_not(p_value, found, self.clusters)

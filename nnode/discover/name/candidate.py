@@ -29,6 +29,7 @@ class Candidate:
         fit: of the extended model.
         losses: ``(G,)`` held-out cost of each cluster that tells of the effect.
         gain: over the model without it.
+        there: p-value that held-out clusters do not lean its way.
         removed: share of the first model's squared errors of positions that it removed.
     """
 
@@ -36,6 +37,7 @@ class Candidate:
     fit: Fit
     losses: np.ndarray
     gain: Comparison
+    there: float
     removed: float
 
     @property

@@ -15,7 +15,7 @@ from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine, row_of, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
-from nnode.discover.statistics.paired import compare, heldout
+from nnode.discover.statistics.paired import compare, heldout, there
 from nnode.discover.statistics.profile import moved
 from nnode.discover.statistics.score import Score, Screen, traces
 from nnode.errors import SimulationError
@@ -39,16 +39,9 @@ NEAR = 0.97
 RIVALS = 5
 #: A rival whose held-out gain is below this share of the best one's is told apart from it.
 CLOSE = 0.8
-#: A curve counts as better than an effect from this much more held-out gain on, at this error
-#: probability: an interval that was looked for is flattered, and no name is better than a wrong
-#: one.
-MARGIN, RATHER = 0.1, 0.35
-#: An effect must predict clusters that a calibration left out better, at this error probability.
-#: False alarms are held by its score; an effect that acts in few clusters helps few of them.
+#: Clusters that a calibration left out must lean an effect's way at this error probability, and be
+#: predicted better in the mean. False alarms are held by its score.
 BETTER = 0.05
-#: Further effects are held to this share of the error probability: a model that has one more
-#: effect is nearer to the data, but what is left of them is not all chance.
-LATER = 0.5
 #: Two rivals are told apart at this error probability; two of a kin at a smaller one.
 APART, KIN_APART = 0.05, 0.01
 
@@ -157,7 +150,7 @@ def search(
         found.first = found.first or found.scores
         if len(found.steps) >= most:
             break
-        step = _round(engine, found, alpha if not found.steps else LATER * alpha, hint)
+        step = _round(engine, found, alpha, hint)
         if step is None:
             break
         if _outdone(engine, found.fit, step.chosen, variables or []):
@@ -205,7 +198,8 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         c for c in candidates
         if c.score.p_value <= alpha
         and c.removed >= FLOOR
-        and c.gain.p_value < BETTER
+        and c.gain.gain > 0
+        and c.there < BETTER
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]  # fmt: skip
@@ -241,7 +235,8 @@ def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: flo
     """Compared with the model without it, on the clusters that tell of the effect."""
     label = screen.label(score.effect.name)
     losses = heldout(fit, label)
-    return Candidate(score, fit, losses, compare(heldout(before, label), losses), removed)
+    gain = compare(heldout(before, label), losses)
+    return Candidate(score, fit, losses, gain, there(before, fit, label), removed)
 
 
 def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
@@ -270,10 +265,9 @@ def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> l
 def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
     """Whether a curve without a formula predicts better than an effect."""
     for curve in curves(engine, fit, variables) if variables else []:
-        better = curve.gain.gain > (1 + MARGIN) * best.gain.gain
-        if better and curve.p_value < APART:
+        if curve.p_value < APART:
             test = compare(heldout(best.fit, engine.cluster), curve.losses)
-            if test.p_value < RATHER:
+            if test.p_value < APART:
                 return True
     return False
 
@@ -324,7 +318,10 @@ def _pruned(engine: Engine, found: Search) -> Search:
             rest.append((compare(heldout(fit, engine.cluster), losses), step, fit))
         rest.sort(key=lambda one: -one[0].gain)
         found.steps = [step for _, step, _ in rest]
-        needless = [one for one in rest if one[0].p_value > BETTER]
+        needless = [
+            one for one in rest
+            if one[0].gain <= 0 or there(one[2], found.fit, engine.cluster) > BETTER
+        ]  # fmt: skip
         if not needless:
             break
         _, step, found.fit = needless[-1]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from scipy import stats
 
+from nnode.data.clusters import better
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.fit import Fit, sums
 
@@ -20,11 +21,43 @@ def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
 
     See :meth:`Fit.left_out`.
     """
+    return sums(_left_out(fit, cluster) ** 2, cluster)
+
+
+def there(before: Fit, after: Fit, cluster: np.ndarray) -> float:
+    """One-sided p-value that held-out residuals of a model do not lean the way that another one,
+    an extension of it, bends its predictions; see :func:`leaning`."""
+    first, second = _left_out(before, cluster), _left_out(after, cluster)
+    return better(leaning(first, second, cluster))
+
+
+def leaning(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
+    """``(G,)`` how far the residuals of a model lean towards another one's predictions, each
+    cluster's relative to its greater cost.
+
+    The mean is above 0 where the second model bends predictions the right way. That they improve,
+    see :func:`gains`, asks for more than half of the bend to be true, with half the standardized
+    distance.
+
+    Args:
+        first, second: ``(n,)`` residuals of the two models. cluster: ``(n,)``.
+
+    Source: Rao 1948 (scores).
+    """
+    with np.errstate(invalid="ignore"):
+        towards = 2 * sums(first * (first - second), cluster)
+        larger = np.maximum(sums(first**2, cluster), sums(second**2, cluster))
+        found: np.ndarray = towards / np.where(larger > 0, larger, 1)
+    return found
+
+
+def _left_out(fit: Fit, cluster: np.ndarray) -> np.ndarray:
     columns, residual = fit.tangents, fit.residual
-    if columns.shape[1]:
-        moved = fit.left_out(cluster, ALONE)
-        residual = residual + (columns * moved[cluster]).sum(1)
-    return sums(residual**2, cluster)
+    if not columns.shape[1]:
+        return residual
+    moved = fit.left_out(cluster, ALONE)
+    found: np.ndarray = residual + (columns * moved[cluster]).sum(1)
+    return found
 
 
 def gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -32,8 +32,8 @@ class Way:
     Attributes:
         screen: that its score comes from.
         alpha: level of the screen, over all effects.
-        better: level of the held-out improvement.
-        sealed: number of sealed clusters. confirmed: level of their improvement.
+        better: level at which held-out clusters lean the effect's way.
+        sealed: number of sealed clusters. confirmed: level at which they do.
     """
 
     screen: Screen
@@ -57,7 +57,8 @@ class Way:
         costs = _with_effect(self.screen.costs(name)[:, None], parts, grams, size)
         others = -(parts.sum(0) - parts) / np.maximum(total - grams, 1e-300)
         gain = _gain(others, parts, grams, costs)
-        passed &= _t(gain) > stats.t.ppf(1 - self.better, number - 1)
+        leaning = _leaning(others, parts, grams, costs)
+        passed &= (gain.mean(0) > 0) & (_t(leaning) > stats.t.ppf(1 - self.better, number - 1))
         amount = -parts.sum(0) / total
         error = np.sqrt((number - 1) / number * ((others - others.mean(0)) ** 2).sum(0))
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
@@ -73,17 +74,21 @@ class Way:
         size: float,
         amount: np.ndarray,
     ) -> np.ndarray:
-        """``(R,)`` whether sealed clusters are predicted better."""
+        """``(R,)`` whether sealed clusters lean towards the effect and are predicted better."""
         if self.confirmed * 2**self.sealed < 1:
             return np.zeros(RUNS, dtype=bool)
         chosen = rng.integers(0, len(grams), (self.sealed, RUNS))
         drawn = grams[chosen]
         parts = rng.choice([-1.0, 1.0], chosen.shape) * rest[chosen] - size * drawn
-        gain = _gain(amount, parts, drawn, _with_effect(costs[chosen], parts, drawn, size))
+        costs = _with_effect(costs[chosen], parts, drawn, size)
+        gain = _gain(amount, parts, drawn, costs)
+        leaning = _leaning(amount, parts, drawn, costs)
+        likelier: np.ndarray = gain.mean(0) > 0
         if self.sealed > 12:
-            return _t(gain) > stats.t.ppf(1 - self.confirmed, self.sealed - 1)
-        totals = every_sign(self.sealed) @ gain
-        return (totals >= totals[0] - 1e-12).mean(0) <= self.confirmed
+            return likelier & (_t(leaning) > stats.t.ppf(1 - self.confirmed, self.sealed - 1))
+        totals = every_sign(self.sealed) @ leaning
+        passed: np.ndarray = (totals >= totals[0] - 1e-12).mean(0) <= self.confirmed
+        return likelier & passed
 
     def detectable(self, score: Score, one: Evidence, expected: float) -> float:
         """The least size found with a probability of 80 %; infinite where none is."""
@@ -112,7 +117,24 @@ def _gain(
 ) -> np.ndarray:
     """Improvement of each cluster's cost by an amount, relative to the greater cost."""
     gain = -(2 * amount * parts + amount**2 * grams)
-    return gain / np.maximum(np.maximum(costs, costs - gain), 1e-300)
+    found: np.ndarray = gain / _larger(amount, parts, grams, costs)
+    return found
+
+
+def _leaning(
+    amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
+) -> np.ndarray:
+    """How far each cluster leans towards an amount, relative to the greater cost."""
+    found: np.ndarray = -2 * amount * parts / _larger(amount, parts, grams, costs)
+    return found
+
+
+def _larger(
+    amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
+) -> np.ndarray:
+    """The greater one of a cluster's costs before and after."""
+    found: np.ndarray = np.maximum(costs, costs + 2 * amount * parts + amount**2 * grams)
+    return np.maximum(found, 1e-300)
 
 
 def _t(gain: np.ndarray) -> np.ndarray:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nnode.data.clusters import clusters, index_of
+from nnode.data.clusters import better, clusters, index_of
 from nnode.data.sequence import Sequence
-from nnode.discover.judge.confirm import improvement
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
@@ -131,8 +130,7 @@ def test_numbers_of_the_first_part_predict_the_last() -> None:
     plain, own, shared = (found.costs[name].mean() for name in MODELS)
     assert own < 0.6 * plain
     assert own < 0.7 * shared
-    others = [found.scores[name] for name in (MODELS[0], MODELS[2])]
-    assert max(improvement(other, found.scores[MODELS[1]]) for other in others) <= 0.05
+    assert max(better(found.leaning[name]) for name in (MODELS[0], MODELS[2])) <= 0.05
     # near the noise and the moods that nobody can know; by far nearer than without any law
     assert found.floor < own < 0.1 * found.costs["constant velocity"].mean()
 
@@ -140,7 +138,7 @@ def test_numbers_of_the_first_part_predict_the_last() -> None:
 def test_moods_of_the_first_part_predict_nothing() -> None:
     found, _ = held_out(0.0, variance=0.05**2)
     assert found.costs[MODELS[1]].mean() > 0.9 * found.costs[MODELS[0]].mean()
-    assert improvement(found.scores[MODELS[0]], found.scores[MODELS[1]]) > 0.05
+    assert better(found.leaning[MODELS[0]]) > 0.05
 
 
 def test_who_knows_no_law_gets_the_same_first_part() -> None:
