@@ -35,6 +35,7 @@ def diagnose_case(
     peers: bool = False,
     seeds_of: str | None = None,
     structure: bool = True,
+    rules: dict[str, float] | None = None,
 ) -> dict[str, Any]:
     """The score of one diagnosis, and how long it took.
 
@@ -45,11 +46,13 @@ def diagnose_case(
         peers: scores of the peers as well, by name.
         seeds_of: hash of the commit that the seed comes from; is handed through.
         structure: as in the options of the diagnosis.
+        rules: numbers that differ from those of :class:`~nnode.discover.rules.Rules`.
     """
     # imported here: all workers read this file, and tests put another diagnosis in its place
     from benchmarks.discovery.peers import peers_on_table
     from nnode.app import discover
     from nnode.discover.options import DiscoverOptions
+    from nnode.discover.rules import Rules
     from nnode.models.effects import CATALOGUE
 
     what = Case.from_dict(case)
@@ -70,7 +73,13 @@ def diagnose_case(
         }
         table, start, failure = Path(given) / TABLE, time.monotonic(), ""
         try:
-            options = DiscoverOptions(page=False, replay=False, structure=structure, compare=[])
+            options = DiscoverOptions(
+                page=False,
+                replay=False,
+                structure=structure,
+                compare=[],
+                rules=Rules(**(rules or {})),
+            )
             report = discover.diagnose_table(table, what.domain, **told, options=options).plain()
         except NNodeError as error:
             report, failure = {"verdict": ERROR, "effects": []}, f"{type(error).__name__}: {error}"

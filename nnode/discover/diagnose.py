@@ -17,7 +17,7 @@ from nnode.discover.able import check_model, not_offered
 from nnode.discover.compare.laws import Nearer, imitated
 from nnode.discover.division import Division, divide
 from nnode.discover.found import Found
-from nnode.discover.judge.confirm import LEVEL, engine_of
+from nnode.discover.judge.confirm import engine_of
 from nnode.discover.judge.sealed import Sealed
 from nnode.discover.judge.verdict import (
     absences,
@@ -28,7 +28,7 @@ from nnode.discover.judge.verdict import (
     structure,
 )
 from nnode.discover.locate.curves import curves, weighed
-from nnode.discover.name.search import BETTER, Search, begun, search, settled, without_steps
+from nnode.discover.name.search import Search, begun, search, settled, without_steps
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.residuals.engine import Engine, of_residuals, square_of
 from nnode.discover.residuals.fit import Fit
@@ -41,6 +41,7 @@ from nnode.discover.result import (
     Place,
     Verdict,
 )
+from nnode.discover.rules import applied, rules
 from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
@@ -49,11 +50,6 @@ from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.models.system import System
 from nnode.progress import Stages
 
-#: Structure that is left counts from this share of the squared errors of positions on, at this
-#: error probability over all variables.
-LEFT, SURE = 0.02, 0.01
-#: Named effects do not explain the data where what is left is this share of what they removed.
-TOO_MUCH = 0.5
 #: Effects that are described where nothing can be tested.
 LEADS = 3
 
@@ -125,6 +121,18 @@ def diagnose(
         DataError: too few sequences.
         SimulationError: the model cannot be simulated on these data at all.
     """
+    with applied(options.rules):
+        return _diagnosed(system, sequences, options, stages, nearer, hint)
+
+
+def _diagnosed(
+    system: System,
+    sequences: list[Sequence],
+    options: DiscoverOptions,
+    stages: Stages | None,
+    nearer: Nearer | None,
+    hint: System | None,
+) -> Found:
     domain = cast(Domain, system.domain)
     names = check_options(options, domain, system.order)
     check_model(system)
@@ -166,10 +174,10 @@ def diagnose(
     found, leads = sealed.confirmed(engine, found)
     last = look.first
     if found.fit is not base:
-        last = weighed(engine, found.fit, curves(engine, found.fit, look.variables), SURE)
-    left = [one for one in last if one.removed > LEFT]
+        last = weighed(engine, found.fit, curves(engine, found.fit, look.variables), rules().sure)
+    left = [one for one in last if one.removed > rules().least]
     assert found.screen is not None
-    absent = absences(found, Way(found.screen, options.alpha, BETTER, numbers.sealed, LEVEL))
+    absent = absences(found, Way(found.screen, options.alpha, numbers.sealed))
     final = sealed.corrected(found)
     if leads:  # what stands out without a lead alone may be the lead
         without = [individuals(engine, found.fit, kind) for kind in kinds]
@@ -268,7 +276,7 @@ def _looked_for(
     clock.lap("calibrate")
     stages.begin("locating")
     variables = engine.variables() if options.structure else []
-    first = weighed(engine, base, curves(engine, base, variables), SURE)
+    first = weighed(engine, base, curves(engine, base, variables), rules().sure)
     located = places(first, _excess(engine, base))
     clock.lap("locate")
     stages.begin("naming")
@@ -294,7 +302,7 @@ def _least(options: DiscoverOptions, effects: int) -> int:
 def _clusters(look: _Look, options: DiscoverOptions, effects: int) -> Clusters:
     """How many there are, and how many it takes."""
     division, least = look.division, _least(options, effects)
-    least_sealed = least_number(LEVEL, sided=1)
+    least_sealed = least_number(rules().level, sided=1)
     enough = next(
         number for number in count(2)
         if least_sealed <= round(options.sealed * number) <= number - least
@@ -356,7 +364,7 @@ def _verdict(
     if not enough:
         return "not_testable"
     if found.steps:
-        if left and left[0].removed * (1 - removed) > TOO_MUCH * removed:
+        if left and left[0].removed * (1 - removed) > rules().too_much * removed:
             return "unknown"
         return "indistinguishable" if any(step.rivals for step in found.steps) else "named"
     if own:

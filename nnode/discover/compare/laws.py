@@ -21,11 +21,12 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import divide
 from nnode.discover.judge.confirm import engine_of
-from nnode.discover.name.search import APART, Search, Step, begun
+from nnode.discover.name.search import Search, Step, begun
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, row_of, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
+from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.errors import ConfigError
 from nnode.models.effects import CATALOGUE, Effect
@@ -139,7 +140,7 @@ def imitated(
         for system in (found.fit.system, nearer.system)
     ]
     p_value = compare(*costs).p_value
-    if p_value > APART:
+    if p_value > rules().level:
         return [], p_value
     shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [

@@ -24,11 +24,9 @@ from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.engine import Engine, row_of
 from nnode.discover.residuals.fit import sums
+from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
 from nnode.models.system import System
-
-#: Level of a confirmation.
-LEVEL = 0.05
 
 
 def engine_of(
@@ -95,7 +93,7 @@ class Comparing:
 
 def too_few(clusters: int) -> str:
     """Why so many sealed clusters cannot confirm anything; empty where they can."""
-    least = least_number(LEVEL, sided=1)
+    least = least_number(rules().level, sided=1)
     if clusters >= least:
         return ""
     have = {0: "no sealed cluster is", 1: "one sealed cluster is"}.get(

@@ -12,13 +12,14 @@ import numpy as np
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.indirect_inference import unbiased
-from nnode.discover.judge.confirm import LEVEL, Comparing, engine_of, too_few
+from nnode.discover.judge.confirm import Comparing, engine_of, too_few
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.judge.verdict import named
 from nnode.discover.name.search import Search, Step, without_steps
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
+from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import gains
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import SimulationError
@@ -46,7 +47,7 @@ class _Tried:
 
     @property
     def good(self) -> bool:
-        return self.p_value <= LEVEL and self.likelier and self.nearer
+        return self.p_value <= rules().level and self.likelier and self.nearer
 
     def doubt(self) -> tuple[bool, float]:
         """Grows the less is said for the second model."""
@@ -54,10 +55,10 @@ class _Tried:
 
     @property
     def reason(self) -> str:
-        if self.p_value > LEVEL:
+        if self.p_value > rules().level:
             return (
                 "the sealed clusters do not lean the way that it bends predictions "
-                f"(one-sided p = {self.p_value:.3f}, asked for {LEVEL:g})"
+                f"(one-sided p = {self.p_value:.3f}, asked for {rules().level:g})"
             )
         if not self.likelier:
             return "the sealed clusters are not predicted better with it"
@@ -277,7 +278,7 @@ def _why_not(p_value: float, found: Later | None, clusters: int) -> str:
     """Why the sealed clusters do not confirm them; empty where they do."""
     if found is None:
         return "the sealed sequences are too short to be divided"
-    if p_value > LEVEL:
+    if p_value > rules().level:
         return too_few(clusters) or (
             "the last part of the sealed sequences is not predicted better by own numbers than "
             f"without, or by one number per sequence (one-sided p = {p_value:.3f})"

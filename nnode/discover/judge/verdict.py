@@ -23,8 +23,9 @@ from nnode.discover.result import (
     Place,
     Structure,
 )
+from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import clusters_to_tell
-from nnode.discover.statistics.power import POWER, Way
+from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.profile import intervals as edge_intervals
 from nnode.discover.statistics.random_effects import Individuals
 from nnode.discover.statistics.score import Evidence, Score
@@ -33,8 +34,6 @@ from nnode.models.extend import place_of
 
 #: Normal quantile of an interval of 95 %.
 WIDE = 1.96
-#: A curve's knots count as a place where they stand out at this error probability.
-STANDS_OUT = 0.01
 
 
 def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect:
@@ -159,8 +158,8 @@ def _absence(score: Score, way: Way) -> Absence:
         detectable=detectable if math.isfinite(detectable) else None,
         bound=bound if testable else None,
         reason="" if testable else (
-            f"{name} would not be named with these data with a probability of {POWER:.0%} even if "
-            f"it were off by {expected:.3g}{unit}"
+            f"{name} would not be named with these data with a probability of {rules().power:.0%} "
+            f"even if it were off by {expected:.3g}{unit}"
         ),
     )  # fmt: skip
 
@@ -171,7 +170,7 @@ def _without_strength(score: Score, way: Way) -> Absence:
     name, setting = next(iter(effect.settings.items()))
     found = [
         one for one in score.evidence
-        if one.grams.sum() > 0 and way.power(score, one, 1.0) >= POWER
+        if one.grams.sum() > 0 and way.power(score, one, 1.0) >= rules().power
     ]  # fmt: skip
     weakest = min(found, key=_information, default=None)
     value = None if weakest is None else float(weakest.options[name])
@@ -196,7 +195,7 @@ def agents_absent(one: Individuals, alpha: float, enough: bool) -> Absence:
         detectable if math.isfinite(detectable) else None,
         high if testable else None,
         "" if testable else (
-            f"{name} would not stand out with a probability of {POWER:.0%} even if it were "
+            f"{name} would not stand out with a probability of {rules().power:.0%} even if it were "
             f"{strength.expected:.3g}{'' if strength.unit == '1' else ' ' + strength.unit}"
         ),
     )  # fmt: skip
@@ -217,7 +216,7 @@ def places(found: list[Curves], excess: float) -> list[Place]:
     number = sum(len(one.heights) for one in found)
     for one in found:
         chance = tail(one, number)
-        known = chance <= STANDS_OUT
+        known = chance <= rules().sure
         if not known.any() or one.removed <= 0:
             continue
         best = int(np.argmax(np.where(known, np.abs(one.heights), 0.0)))

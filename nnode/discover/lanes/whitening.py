@@ -8,9 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: The past is taken to be known up to this share of its own size. What a wrong model leaves of
-#: data without noise is smooth, and could be extrapolated so well that only wriggles count.
-TRUST = 0.1
+from nnode.discover.rules import rules
 
 
 @dataclass
@@ -52,7 +50,7 @@ class PlatoonFilter:
         columns = _lagged(lively, order)
         e, design = lively[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
         gram = design.T @ design
-        gram += max(TRUST**2 * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
+        gram += max(rules().trust ** 2 * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
         weights = np.linalg.solve(gram, design.T @ e)
         found = cls(weights[:order], weights[order:], 1.0)
         scale = float(found(residual)[valid].square().mean().sqrt())

@@ -15,6 +15,7 @@ from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine, row_of, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
+from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import compare, heldout, there
 from nnode.discover.statistics.profile import moved
 from nnode.discover.statistics.score import Score, Screen, traces
@@ -25,25 +26,10 @@ from nnode.models.system import System
 
 log = logging.getLogger(__name__)
 
-#: An effect must remove this share of the squared errors of positions that the model had before
-#: anything was added to it.
-FLOOR = 0.02
 #: A mean square error of positions, m², below which nothing is left to be explained: 1 mm.
 EXACT = 1e-6
-#: Effects whose trace explains this share of what the best one explains are calibrated too.
-RIVAL = 0.25
-#: Of two effects whose held-out gains differ by less than this share, the simpler one is chosen,
-#: or the likelier one.
-NEAR = 0.97
 #: At most so many effects are calibrated in a round.
 RIVALS = 5
-#: A rival whose held-out gain is below this share of the best one's is told apart from it.
-CLOSE = 0.8
-#: Clusters that a calibration left out must lean an effect's way at this error probability, and be
-#: predicted better in the mean. False alarms are held by its score.
-BETTER = 0.05
-#: Two rivals are told apart at this error probability; two of a kin at a smaller one.
-APART, KIN_APART = 0.05, 0.01
 
 
 @dataclass
@@ -177,7 +163,7 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         return None
     most = max(score.gain for score in scores)
     hinted = set() if hint is None else {effect.name for effect in effects_of(hint)}
-    tried = [score for score in scores if score.gain >= RIVAL * most][:RIVALS]
+    tried = [score for score in scores if score.gain >= rules().rival * most][:RIVALS]
     tried += [score for score in scores if score.effect.name in hinted and score not in tried]
     square = square_of(engine, found.fit.system)
     found.square = found.square or square
@@ -197,9 +183,9 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
     passing = [
         c for c in candidates
         if c.score.p_value <= alpha
-        and c.removed >= FLOOR
+        and c.removed >= rules().least
         and c.gain.gain > 0
-        and c.there < BETTER
+        and c.there < rules().level
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]  # fmt: skip
@@ -208,7 +194,7 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
     best = _simplest(passing, screen)
     rivals = []
     for other in candidates:
-        if other is best or other.gain.gain < CLOSE * best.gain.gain:
+        if other is best or other.gain.gain < rules().close * best.gain.gain:
             continue
         test = _between(other, best, screen)
         if test.p_value > apart_at(best, other) and not _contains(other, best):
@@ -219,7 +205,7 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
 def apart_at(one: Candidate, other: Candidate) -> float:
     """The level at which two effects are told apart."""
     kin = one.score.effect.kin
-    return KIN_APART if kin and kin == other.score.effect.kin else APART
+    return rules().sure if kin and kin == other.score.effect.kin else rules().level
 
 
 def _hinted(hint: System | None, system: System, name: str) -> System | None:
@@ -254,7 +240,8 @@ def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> l
     ended = []
     for one in candidates:
         best = candidates[0]
-        near = one.gain.gain >= CLOSE * best.gain.gain or apart_at(best, one) < APART
+        kin = apart_at(best, one) < rules().level
+        near = kin or one.gain.gain >= rules().close * best.gain.gain
         if best.gain.gain > 0 and near:
             fit = refine(engine, one.fit.system, tolerance=FINE)
             one = _candidate(one.score, fit, found.fit, found.screen, one.removed)
@@ -265,9 +252,9 @@ def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> l
 def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
     """Whether a curve without a formula predicts better than an effect."""
     for curve in curves(engine, fit, variables) if variables else []:
-        if curve.p_value < APART:
+        if curve.p_value < rules().level:
             test = compare(heldout(best.fit, engine.cluster), curve.losses)
-            if test.p_value < APART:
+            if test.p_value < rules().level:
                 return True
     return False
 
@@ -279,8 +266,8 @@ def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
     for other in candidates[1:]:
         number = len(other.fit.row), len(best.fit.row)
         likelier = number[0] == number[1] and other.fit.cost < best.fit.cost
-        near = other.gain.gain >= NEAR * best.gain.gain
-        apart = _between(other, best, screen).p_value <= APART
+        near = other.gain.gain >= rules().near * best.gain.gain
+        apart = _between(other, best, screen).p_value <= rules().level
         if (number[0] < number[1] or likelier) and near and not apart:
             best = other
     return best
@@ -320,7 +307,7 @@ def _pruned(engine: Engine, found: Search) -> Search:
         found.steps = [step for _, step, _ in rest]
         needless = [
             one for one in rest
-            if one[0].gain <= 0 or there(one[2], found.fit, engine.cluster) > BETTER
+            if one[0].gain <= 0 or there(one[2], found.fit, engine.cluster) > rules().level
         ]  # fmt: skip
         if not needless:
             break
@@ -355,6 +342,6 @@ def _rivals_beside(
         fit = refine(engine, fit.system, tolerance=FINE)
         other = _candidate(rival.score, fit, before, found.screen, rival.removed)
         test = _between(other, one, found.screen)
-        if other.gain.gain >= CLOSE * one.gain.gain and test.p_value > apart_at(one, other):
+        if other.gain.gain >= rules().close * one.gain.gain and test.p_value > apart_at(one, other):
             rivals.append((other, test))
     return rivals

@@ -15,12 +15,11 @@ import numpy as np
 from scipy import stats
 
 from nnode.data.clusters import every_sign
+from nnode.discover.rules import rules
 from nnode.discover.statistics.score import Evidence, Score, Screen
 
 #: Simulations; an error of 2 % at a power of 80 %.
 RUNS = 400
-#: What counts as likely to be found.
-POWER = 0.8
 #: Sizes that are tried, relative to the one that is asked for.
 SIZES = 2.0 ** np.linspace(-3, 3, 13)
 
@@ -32,15 +31,12 @@ class Way:
     Attributes:
         screen: that its score comes from.
         alpha: level of the screen, over all effects.
-        better: level at which held-out clusters lean the effect's way.
-        sealed: number of sealed clusters. confirmed: level at which they do.
+        sealed: number of sealed clusters.
     """
 
     screen: Screen
     alpha: float
-    better: float
     sealed: int
-    confirmed: float
 
     def power(self, score: Score, one: Evidence, size: float, seed: int = 0) -> float:
         """Share of the simulations in which an effect of a size is found and confirmed."""
@@ -58,7 +54,7 @@ class Way:
         others = -(parts.sum(0) - parts) / np.maximum(total - grams, 1e-300)
         gain = _gain(others, parts, grams, costs)
         leaning = _leaning(others, parts, grams, costs)
-        passed &= (gain.mean(0) > 0) & (_t(leaning) > stats.t.ppf(1 - self.better, number - 1))
+        passed &= (gain.mean(0) > 0) & (_t(leaning) > stats.t.ppf(1 - rules().level, number - 1))
         amount = -parts.sum(0) / total
         error = np.sqrt((number - 1) / number * ((others - others.mean(0)) ** 2).sum(0))
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
@@ -75,7 +71,7 @@ class Way:
         amount: np.ndarray,
     ) -> np.ndarray:
         """``(R,)`` whether sealed clusters lean towards the effect and are predicted better."""
-        if self.confirmed * 2**self.sealed < 1:
+        if rules().level * 2**self.sealed < 1:
             return np.zeros(RUNS, dtype=bool)
         chosen = rng.integers(0, len(grams), (self.sealed, RUNS))
         drawn = grams[chosen]
@@ -85,22 +81,22 @@ class Way:
         leaning = _leaning(amount, parts, drawn, costs)
         likelier: np.ndarray = gain.mean(0) > 0
         if self.sealed > 12:
-            return likelier & (_t(leaning) > stats.t.ppf(1 - self.confirmed, self.sealed - 1))
+            return likelier & (_t(leaning) > stats.t.ppf(1 - rules().level, self.sealed - 1))
         totals = every_sign(self.sealed) @ leaning
-        passed: np.ndarray = (totals >= totals[0] - 1e-12).mean(0) <= self.confirmed
+        passed: np.ndarray = (totals >= totals[0] - 1e-12).mean(0) <= rules().level
         return likelier & passed
 
     def detectable(self, score: Score, one: Evidence, expected: float) -> float:
         """The least size found with a probability of 80 %; infinite where none is."""
         sizes = expected * SIZES
         powers = np.array([self.power(score, one, size) for size in sizes])
-        enough = np.flatnonzero(powers >= POWER)
+        enough = np.flatnonzero(powers >= rules().power)
         if not len(enough):
             return float("inf")
         k = int(enough[0])
         if k == 0:
             return float(sizes[0])
-        share = (POWER - powers[k - 1]) / (powers[k] - powers[k - 1])
+        share = (rules().power - powers[k - 1]) / (powers[k] - powers[k - 1])
         return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** share)
 
 

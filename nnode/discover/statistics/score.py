@@ -31,17 +31,13 @@ from nnode.data.clusters import signs
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, sums
 from nnode.discover.residuals.fit import grams as grams_of
+from nnode.discover.rules import rules
 from nnode.discover.statistics.leverage import blown_up, orthonormal
-from nnode.discover.statistics.standard import PRIOR, joint, standardised, usual_of
+from nnode.discover.statistics.standard import joint, standardised, usual_of
 from nnode.models.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
 FLIPS = 1999
-#: A strength of which the plausible range allows less than this share speaks for something
-#: else; the linear estimate of a strong effect may overshoot.
-FORBIDDEN = 0.2
-#: Effects up to this share of their least usual size are taken for none.
-MINIMAL = 0.1
 
 
 @dataclass
@@ -260,7 +256,7 @@ class Screen:
         if len(probe.steps) == 1 and value != 0:
             # a strength that is not plausible speaks for something else
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
-            if share < FORBIDDEN:
+            if share < rules().forbidden:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._by_chance(trace.effect.name, chance)
         # of an effect with a memory the trace is that of a finite strength, where it has one
@@ -305,7 +301,8 @@ class Screen:
         amount = -total[i] / size[i]
         rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
         blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
-        error = np.sqrt((blocks * rest + PRIOR * usual * size[i]) / (blocks + PRIOR)) / size[i]
+        prior = rules().prior
+        error = np.sqrt((blocks * rest + prior * usual * size[i]) / (blocks + prior)) / size[i]
         options = dict(trace.probes[0].options)
         options["a"] = trace.probes[first[i]].options["a"]
         options["b"] = trace.probes[last[i]].options["b"]
@@ -333,7 +330,7 @@ class Screen:
 def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
     """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
     not say what size is usual, and of an interval of the road or the clock."""
-    share = 0.0 if effect.consecutive else MINIMAL
+    share = 0.0 if effect.consecutive else rules().minimal
     found = [share * (one.usual or 0.0) for one in effect.strengths.values()]
     return np.array(found or [0.0] * number)[:number]
 

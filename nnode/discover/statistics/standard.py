@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-#: So many usual clusters are added to the clusters that give an error.
-PRIOR = 12.0
+from nnode.discover.rules import rules
+
 #: Median of the square of a standard normal variable.
 MEDIAN = 0.4549
 
@@ -46,8 +46,9 @@ def standardised(
     amount = total / size
     rest = squares - 2 * amount * (signs @ (parts * sizes)) + amount**2 * (sizes**2).sum(0)
     blocks = size**2 / (sizes**2).sum(0)
-    variance = (blocks * np.maximum(rest, 0) + PRIOR * usual * size) / (blocks + PRIOR)
-    return _wallace(total**2 / variance, blocks + PRIOR - 1)
+    prior = rules().prior
+    variance = (blocks * np.maximum(rest, 0) + prior * usual * size) / (blocks + prior)
+    return _wallace(total**2 / variance, blocks + prior - 1)
 
 
 def joint(parts: np.ndarray, grams: np.ndarray, signs: np.ndarray, variance: float) -> np.ndarray:
@@ -64,10 +65,11 @@ def joint(parts: np.ndarray, grams: np.ndarray, signs: np.ndarray, variance: flo
     blocks = float(size.sum() ** 2 / (size**2).sum())
     spread = np.einsum("fbi,fbj->fij", rest, rest)
     usual = usual_of(parts, np.einsum("bii->bi", grams), variance)
-    spread = (blocks * spread + PRIOR * usual * whole) / (blocks + PRIOR)
+    prior = rules().prior
+    spread = (blocks * spread + prior * usual * whole) / (blocks + prior)
     spread += 1e-12 * np.trace(whole) * np.eye(k)
     squares = np.einsum("fi,fi->f", total, np.linalg.solve(spread, total[..., None])[..., 0])
-    degrees = np.array(blocks + PRIOR - 1)
+    degrees = np.array(blocks + prior - 1)
     return _normal(_wallace(squares, degrees) ** 2, k)
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from nnode.data.clusters import better
-from nnode.discover.judge.confirm import LEVEL
-from nnode.discover.name.search import BETTER
 from nnode.discover.residuals.fit import Fit, sums
+from nnode.discover.rules import Rules
 from nnode.discover.statistics.paired import gains, heldout, leaning, there
 from nnode.discover.statistics.power import RUNS, Way
 from nnode.discover.statistics.score import Score, Screen, Trace
@@ -16,7 +15,7 @@ from nnode.models import System
 from nnode.models.effects import Probe
 from nnode.models.effects.following import RelativeSpeed
 
-OPEN, EACH, ALPHA = 30, 12, 0.05
+OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, Rules().level
 
 #: What one parameter of a model and the effect do to the residuals of open and sealed clusters.
 RNG = np.random.default_rng(8)
@@ -56,12 +55,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     wider = fitted(columns, fit.residual - fit.jacobian @ fit.row)
     nearer = heldout(fit, LABEL).sum() > heldout(wider, LABEL).sum()
     low, high = wider.intervals(LABEL)[1]
-    if (
-        score.p_value > ALPHA
-        or not nearer
-        or there(fit, wider, LABEL) >= BETTER
-        or low <= 0 <= high
-    ):
+    if score.p_value > ALPHA or not nearer or there(fit, wider, LABEL) >= LEVEL or low <= 0 <= high:
         return False
     # sealed clusters are like the open ones
     picked = ROWS[rng.integers(0, OPEN, sealed)].ravel()
@@ -81,7 +75,7 @@ def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> 
     powers = []
     for seed in range(40):
         _, screen, score = scored(drawn(rng, LABEL), seed)
-        way = Way(screen, ALPHA, BETTER, sealed, LEVEL)
+        way = Way(screen, ALPHA, sealed)
         powers.append(way.power(score, score.evidence[0], size, seed))
     error = np.sqrt(often * (1 - often) / RUNS + np.var(powers, ddof=1) / len(powers))
     assert 0.05 < often < 0.95
@@ -90,7 +84,7 @@ def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> 
 
 def test_four_sealed_clusters_leave_no_power() -> None:
     _, screen, score = scored(drawn(np.random.default_rng(2), LABEL))
-    one, many = (Way(screen, ALPHA, BETTER, sealed, LEVEL) for sealed in (4, 5))
+    one, many = (Way(screen, ALPHA, sealed) for sealed in (4, 5))
     assert one.power(score, score.evidence[0], 3.0) == 0.0
     assert one.detectable(score, score.evidence[0], 1.0) == np.inf
     assert many.power(score, score.evidence[0], 3.0) == 1.0
@@ -98,6 +92,6 @@ def test_four_sealed_clusters_leave_no_power() -> None:
 
 def test_the_detectable_size_is_found_with_the_power_that_is_asked_for() -> None:
     _, screen, score = scored(drawn(np.random.default_rng(3), LABEL))
-    way = Way(screen, ALPHA, BETTER, 8, LEVEL)
+    way = Way(screen, ALPHA, 8)
     size = way.detectable(score, score.evidence[0], 0.3)
     assert way.power(score, score.evidence[0], size, seed=5) == pytest.approx(0.8, abs=0.08)
