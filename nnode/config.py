@@ -101,7 +101,7 @@ class ExportConfig:
     """``scripts/export.py``: a run's results in the formats of other programs."""
 
     run: str = MISSING  # folder of a training or a diagnosis
-    to: Any = "auto"  # jupedsim | sumo | pedpy | parquet | csv, or a list; auto: all that fit
+    to: Any = "auto"  # jupedsim | sumo | pedpy | fcd | parquet | csv, or a list; auto: all that fit
     trajectories: str = "both"  # measured | simulated | both
     part: str = "all"  # heldout | train | unseen | all | auto
     data: Any = MISSING
@@ -132,7 +132,9 @@ class SimulateConfig:
     run: str = MISSING  # folder of a training or a diagnosis
     samples: int = 99  # of every sequence, at least 39
     part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
-    table: bool = True  # samples.parquet, which data=table reads
+    # of the samples: parquet | csv (data=table reads both) | pedpy (people) | fcd (vehicles, as
+    # SUMO writes them); null: no samples
+    format: str | None = "parquet"
     seed: int = 0  # of all that is drawn
     data: Any = MISSING
     solver: Any = MISSING

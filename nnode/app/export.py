@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,18 @@ from nnode.exchange.counterpart import Counterpart, Intervals
 from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import has_type, sumo_type, traffic_of
 from nnode.exchange.tables import write_results
-from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy, write_walls
+from nnode.exchange.trajectories import (
+    FORMATS,
+    check_format,
+    simulated,
+    write_trajectories,
+    write_walls,
+)
 from nnode.files import write_json, write_text
 from nnode.models import System
 
 #: What can be written, in the order in which it is.
-TARGETS = ("jupedsim", "sumo", "pedpy", "parquet", "csv")
+TARGETS = ("jupedsim", "sumo", "pedpy", "fcd", "parquet", "csv")
 
 #: Which trajectories ``trajectories=`` asks for.
 SOURCES = {
@@ -165,13 +172,14 @@ def targets_of(asked: Any, model: System) -> list[str]:
             fit.add("jupedsim")
         if has_type(model):
             fit.add("sumo")
-        if model.domain == "crowd":
-            fit.add("pedpy")
+        fit.add("pedpy" if model.domain == "crowd" else "fcd")
         return [name for name in TARGETS if name in fit]
     names = [asked] if isinstance(asked, str) else list(asked or [])
     for name in names:
         if name not in TARGETS:
             raise ConfigError(f"to={name} is unknown, expected auto or any of {', '.join(TARGETS)}")
+        if name in FORMATS:
+            check_format("to", name, model.domain)
     if not names:
         raise ConfigError(f"to=[]: expected auto or any of {', '.join(TARGETS)}")
     return [name for name in TARGETS if name in names]
@@ -196,19 +204,16 @@ def _sumo(job: _Export) -> _Written:
     return [write_text(job.folder / "vtype.add.xml", found.text)], found
 
 
-def _pedpy(job: _Export) -> _Written:
+def _paths(name: str, job: _Export) -> _Written:
     files: list[Path] = []
     for source in job.sources:
-        files += write_pedpy(job.folder / "pedpy" / source, job.trajectories(source))
+        paths = job.trajectories(source)
+        files += write_trajectories(job.folder, source, name, paths, job.model.dim)
     return files, Counterpart()
 
 
 def _parquet(job: _Export) -> _Written:
-    found = Counterpart()
-    files = [
-        write_parquet(job.folder / f"{source}.parquet", job.trajectories(source), job.model.dim)
-        for source in job.sources
-    ]
+    files, found = _paths("parquet", job)
     path, sets = write_walls(job.folder / "walls.csv", job.trajectories("measured"))
     files += [] if path is None else [path]
     if sets > 1:
@@ -225,10 +230,11 @@ def _csv(job: _Export) -> _Written:
     return write_results(folder, job.checkpoint, job.model, metrics, unit), Counterpart()
 
 
-WRITERS = {
+WRITERS: dict[str, Callable[[_Export], _Written]] = {
     "jupedsim": _jupedsim,
     "sumo": _sumo,
-    "pedpy": _pedpy,
+    "pedpy": partial(_paths, "pedpy"),
+    "fcd": partial(_paths, "fcd"),
     "parquet": _parquet,
     "csv": _csv,
 }

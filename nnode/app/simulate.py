@@ -22,6 +22,7 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError
+from nnode.exchange.trajectories import check_format
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free
 from nnode.generate.scores import LEAST
@@ -80,6 +81,8 @@ def simulate(config: DictConfig, folder: Path) -> None:
     """
     _check(config.samples)
     checkpoint = load_checkpoint(checkpoint_of(config.run))
+    if config.format is not None:  # before the work that would be lost
+        check_format("format", config.format, checkpoint.build().domain)
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
     data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     found = _simulated(
@@ -87,8 +90,9 @@ def simulate(config: DictConfig, folder: Path) -> None:
         samples=int(config.samples), part=config.part, seed=int(config.seed), data=data.name,
     )  # fmt: skip
     print(found)
-    for path in reversed(found.write(folder, table=config.table)):
-        print(f"{path.stem}: {path}")
+    files = found.write(folder, format=config.format)
+    for path in dict.fromkeys(p.parent if p.suffix == ".txt" else p for p in reversed(files)):
+        print(f"{path.name.partition('.')[0]}: {path}")
 
 
 def _check(samples: int) -> None:

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import gzip
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pandas as pd
 import torch
+from pyarrow.csv import CSVWriter
 
 from nnode.calibrate.evaluate import Simulate
-from nnode.data._arrow import open_writer, to_table
+from nnode.data._arrow import open_writer, schema, to_table
 from nnode.data.sequence import Sequence, collate
-from nnode.errors import DataError
+from nnode.errors import ConfigError, DataError
 from nnode.exchange.tables import write_csv
 from nnode.files import replacing, write_text
+
+#: Formats of trajectories, and of whom each can be.
+FORMATS = {
+    "parquet": ("traffic", "crowd"),
+    "csv": ("traffic", "crowd"),
+    "pedpy": ("crowd",),
+    "fcd": ("traffic",),
+}
 
 
 @torch.no_grad()
@@ -44,6 +56,41 @@ def simulated(
             yield replace(_directed(s), x=x[part], v=None if v is None else v[part])
 
 
+def check_format(option: str, name: str, domain: str) -> None:
+    """Refuse a format that there is not, or that has no place for such positions.
+
+    Args:
+        option: that names the format.
+        domain: ``traffic`` or ``crowd``.
+
+    Raises:
+        ConfigError: names those that fit.
+    """
+    if domain in FORMATS.get(name, ()):
+        return
+    fit = ", ".join(key for key, domains in FORMATS.items() if domain in domains)
+    why = f"is not for {domain}" if name in FORMATS else "is unknown"
+    raise ConfigError(f"{option}={name} {why}; for {domain} take one of {fit}")
+
+
+def write_trajectories(
+    folder: Path, stem: str, name: str, sequences: Iterable[Sequence], dims: int
+) -> list[Path]:
+    """Files of one of the :data:`FORMATS`, as :func:`check_format` let it pass.
+
+    Args:
+        folder: made where it is missing.
+        stem: of the file, or name of the folder of a file per sequence.
+        name: of the format.
+        dims: number of space dimensions.
+    """
+    if name == "pedpy":
+        return write_pedpy(folder / "pedpy" / stem, sequences)
+    if name == "fcd":
+        return [write_fcd(folder / f"{stem}.xml.gz", sequences)]
+    return [write_table(folder / f"{stem}.{name}", sequences, dims)]
+
+
 def write_pedpy(folder: Path, sequences: Iterable[Sequence]) -> list[Path]:
     """Text as PedPy and the Jülich archive have it, one file per sequence, in m.
 
@@ -55,26 +102,63 @@ def write_pedpy(folder: Path, sequences: Iterable[Sequence]) -> list[Path]:
     Raises:
         DataError: a sequence of traffic, which has no second coordinate, or of one sample.
     """
-    files: dict[str, Path] = {}
-    for s in sequences:
-        name = _file_name(s.name)
-        while name in files:  # names may differ in signs that no file name has
-            name += "_"
-        files[name] = _pedpy_file(folder / f"{name}.txt", s)
-    return list(files.values())
+    return [_pedpy_file(folder / f"{name}.txt", s) for name, s in _named(sequences)]
 
 
-def write_parquet(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
+def write_fcd(path: Path, sequences: Iterable[Sequence]) -> Path:
+    """Vehicles as ``sumo --fcd-output`` writes them, XML in gzip, in s, m and m/s.
+
+    Every sequence is a lane of its own, called after it, so that those of one time do not mix;
+    vehicles are called ``LANE.AGENT``. Speeds are there where a sequence has them.
+
+    Source: SUMO's documentation, FCDOutput.
+    """
+    moments: defaultdict[float, list[tuple[Sequence, int, list[str]]]] = defaultdict(list)
+    for lane, s in _named(sequences):
+        agents = s.agents or tuple(map(str, range(s.n_agents)))
+        heads = [f"id={quoteattr(f'{lane}.{name}')} lane={quoteattr(lane)}" for name in agents]
+        if s.kind is not None:
+            heads = [f"{a} type={quoteattr(b)}" for a, b in zip(heads, s.kind, strict=True)]
+        if s.length is not None:
+            known = [f' length="{m}"' if np.isfinite(m) else "" for m in s.length.tolist()]
+            heads = [a + b for a, b in zip(heads, known, strict=True)]
+        for k, t in enumerate(s.time.tolist()):
+            moments[round(t, 9)].append((s, k, heads))
+    with (
+        replacing(path) as temporary,
+        temporary.open("wb") as raw,
+        # without a file's name and a time within: the same vehicles give the same bytes
+        gzip.GzipFile("", "wb", fileobj=raw, mtime=0) as file,
+    ):
+        file.write(b'<?xml version="1.0" encoding="UTF-8"?>\n<fcd-export>\n')
+        for t in sorted(moments):
+            rows = [row for moment in moments[t] for row in _vehicles(*moment)]
+            file.write("\n".join([f'<timestep time="{t}">', *rows, "</timestep>\n"]).encode())
+        file.write(b"</fcd-export>\n")
+    return path
+
+
+def _vehicles(s: Sequence, k: int, heads: list[str]) -> Iterator[str]:
+    """Elements of the sequence's vehicles at its k-th time."""
+    speeds = [""] * s.n_agents if s.v is None else [f' speed="{v}"' for v in s.v[k, :, 0].tolist()]
+    for head, x, speed in zip(heads, s.x[k, :, 0].tolist(), speeds, strict=True):
+        yield f'<vehicle {head} pos="{x}"{speed}/>'
+
+
+def write_table(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
     """The tidy table that ``data=table`` reads, with velocities where there are such.
 
     Args:
-        path: of the table.
+        path: of the table, ``.csv`` or else Parquet.
         sequences: one row per sequence, time and agent.
         dims: number of space dimensions.
     """
-    with replacing(path) as temporary, open_writer(temporary, dims) as writer:
-        for s in sequences:
-            writer.write_table(to_table(_directed(s)))
+    text = path.suffix == ".csv"
+    with replacing(path) as temporary:
+        writer = CSVWriter(temporary, schema(dims)) if text else open_writer(temporary, dims)
+        with writer:
+            for s in sequences:
+                writer.write_table(to_table(_directed(s)))
     return path
 
 
@@ -107,15 +191,22 @@ def _groups(sequences: Iterable[Sequence], size: int) -> Iterator[list[Sequence]
         yield group
 
 
-def _file_name(name: str) -> str:
-    return "".join(sign if sign.isalnum() or sign in "-_.+" else "_" for sign in name)
+def _named(sequences: Iterable[Sequence]) -> Iterator[tuple[str, Sequence]]:
+    """Sequences with names that files, and SUMO's lanes, can have; none comes twice."""
+    taken: set[str] = set()
+    for s in sequences:
+        name = "".join(sign if sign.isalnum() or sign in "-_.+~" else "_" for sign in s.name)
+        while name in taken:  # names may differ in such signs alone
+            name += "_"
+        taken.add(name)
+        yield name, s
 
 
 def _pedpy_file(path: Path, s: Sequence) -> Path:
     if s.x.shape[2] != 2 or s.n_samples < 2:
         raise DataError(
             f"sequence {s.name}: PedPy's text needs two coordinates and two samples, found "
-            f"{s.x.shape[2]} and {s.n_samples}; leave pedpy out of to="
+            f"{s.x.shape[2]} and {s.n_samples}; take another format"
         )
     own = [int(name) for name in s.agents if name.isascii() and name.isdigit() and len(name) < 10]
     numbered = len(own) == s.n_agents and len(set(own)) == len(own)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from nnode.data.dataset import Source
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.sequences import Sequences
-from nnode.exchange.trajectories import write_parquet, write_walls
+from nnode.exchange.trajectories import check_format, write_trajectories, write_walls
 from nnode.files import write_json
 from nnode.generate.fit import FittedNoise
 from nnode.generate.noise import Noise, numbered, sample
@@ -186,19 +186,32 @@ class Simulated:
             "crps_position_minus": {key: asdict(one) for key, one in self.minus.items()},
         }  # fmt: skip
 
-    def write(self, folder: str | Path, *, table: bool = True) -> list[Path]:
-        """Write ``scores.json``, ``bands.png`` and, so asked, ``samples.parquet``, of people with
-        ``walls.csv`` where all sequences have the same ones."""
+    def write(self, folder: str | Path, *, format: str | None = "parquet") -> list[Path]:
+        """Write ``scores.json``, ``bands.png`` and the samples, see ``docs/sampling.md``.
+
+        Args:
+            folder: made where it is missing.
+            format: of the samples, ``parquet`` or ``csv`` (with ``walls.csv`` of people, where all
+                sequences have the same ones), ``pedpy`` (people) or ``fcd`` (vehicles); None: no
+                samples.
+
+        Raises:
+            ConfigError: no such format, or one that is not for the model's vehicles or people.
+        """
         from nnode.plots.style import save
 
+        system = self.way.system
+        if format is not None:
+            check_format("format", format, system.domain)
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         paths = [place / "scores.json", place / "bands.png"]
         write_json(paths[0], self.plain())
         save(self.plot(), paths[1])
-        if table:
+        if format is not None:
             samples = self.sampling.sampled(self.way)
-            paths.append(write_parquet(place / "samples.parquet", samples, self.way.system.dim))
+            paths += write_trajectories(place, "samples", format, samples, system.dim)
+        if format in ("parquet", "csv"):
             measured = (self.sampling.store[i] for i in self.sampling.indices)
             walls, _ = write_walls(place / "walls.csv", measured)
             paths += [] if walls is None else [walls]

@@ -69,8 +69,8 @@ class ReplayBlock:
 
     Attributes:
         name: ``[text](#figure-<name>)`` refers to the player.
-        scenes: the one to begin with first; as many as :data:`BYTES` and :data:`MOST` allow are
-            kept.
+        scenes: in the order of the list; as many as :data:`BYTES` and :data:`MOST` allow are kept.
+            Of vehicles the player begins with the first one, of people with the one with most.
         caption: in Markdown; says what to see.
         alt: what moves, in words, for those who cannot see it.
         zones: shaded in all scenes.
@@ -95,7 +95,9 @@ class ReplayBlock:
             if packed and used > BYTES:
                 break
             packed.append(text)
+        shown = [scene.sequence for scene in scenes[: len(packed)]]
         head = {
+            "first": _first(shown),
             "colours": {"measured": GREY, "simulated": COLOURS},
             "car": CAR,
             "body": BODY,
@@ -106,12 +108,22 @@ class ReplayBlock:
         total = len(scenes) if self.total is None else self.total
         if len(packed) < total:
             said.append(f"{len(packed)} of {total} sequences are here.")
-        shown = [scene.sequence for scene in scenes[: len(packed)]]
         if any(s.x.shape[2] == 1 and not _lengths(s) for s in shown):
             said.append(f"Cars of unknown length are drawn {CAR:g} m long.")
         if any(s.x.shape[2] == 2 for s in shown):
             said.append(f"People are drawn with a radius of {BODY:g} m.")
         return text, " ".join(said)
+
+
+def _first(shown: list[Sequence]) -> int:
+    """Number of the sequence to begin with: one person alone shows no interaction."""
+
+    def much(i: int) -> tuple[int, float]:
+        s = shown[i]
+        return s.n_agents, float(s.time[-1] - s.time[0])
+
+    people = [i for i, s in enumerate(shown) if s.x.shape[2] == 2]
+    return max(people, key=much, default=0)
 
 
 def _json(value: Any) -> str:

@@ -19,8 +19,9 @@ from nnode.app.export import (
     targets_of,
 )
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.options import JuelichOptions, TableOptions
+from nnode.data.options import JuelichOptions, SumoOptions, TableOptions
 from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.sumo import read_sumo
 from nnode.data.readers.table import read_table
 from nnode.errors import CheckpointError, ConfigError
 from nnode.models import Linear, Relaxation, SocialForce, Traffic
@@ -57,7 +58,7 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
     done = script("export", f"run={traffic}", f"hydra.run.dir={tmp_path}")
     assert done.returncode == 0, done.stderr
     account = json.loads((tmp_path / "export.json").read_text())
-    assert list(account["written"]) == ["sumo", "parquet", "csv"]
+    assert list(account["written"]) == ["sumo", "fcd", "parquet", "csv"]
     for entry in account["written"].values():
         for name in entry["files"]:
             assert (tmp_path / name).is_file()
@@ -83,6 +84,11 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
         np.testing.assert_array_equal(a.x[0], b.x[0])
         for k in range(1, a.n_samples):
             errors.setdefault(k, []).extend(((a.x[k] - b.x[k]) ** 2).ravel())
+    lane = SumoOptions(path="", dt=measured[0].dt, min_vehicles=1, min_samples=2, window=None)
+    again = {s.recording: s.x for s in read_sumo(tmp_path / "simulated.xml.gz", lane)}
+    for s in simulated:
+        name = s.name.replace("/", "_")
+        np.testing.assert_allclose(again[f"simulated_{name}"], s.x, rtol=0, atol=1e-9)
     horizons = pd.read_csv(tmp_path / "csv" / "horizons.csv")
     expected = [np.sqrt(np.mean(errors[k])) for k in sorted(errors)]
     np.testing.assert_allclose(horizons["rmse_m"], expected, rtol=1e-9)
@@ -156,11 +162,13 @@ def test_one_clear_error(script: Script, traffic: Path, tmp_path: Path) -> None:
 
 def test_which_targets_fit() -> None:
     force = SocialForce(1.0, 1.0, 1.0)
-    assert targets_of("auto", Traffic([Linear()])) == ["sumo", "parquet", "csv"]
+    assert targets_of("auto", Traffic([Linear()])) == ["sumo", "fcd", "parquet", "csv"]
     assert targets_of("auto", Crowd([force])) == ["jupedsim", "pedpy", "parquet", "csv"]
     assert targets_of("auto", Crowd([Relaxation(), NetworkForce()])) == ["pedpy", "parquet", "csv"]
     assert targets_of(["csv", "pedpy"], Crowd([force])) == ["pedpy", "csv"]
     assert targets_of("sumo", Crowd([force])) == ["sumo"]  # refused later, with the reason
+    with pytest.raises(ConfigError, match="to=fcd is not for crowd"):
+        targets_of(["csv", "fcd"], Crowd([force]))
     for asked in ("vadere", ["csv", "vadere"], [], None):
         with pytest.raises(ConfigError, match=", ".join(TARGETS)):
             targets_of(asked, Crowd([force]))

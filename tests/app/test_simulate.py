@@ -10,8 +10,10 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.data.options import TableOptions
+from nnode.data.options import SumoOptions, TableOptions, WalkwayOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.jupedsim import read_walkway
+from nnode.data.readers.sumo import read_sumo
 from nnode.errors import CheckpointError, ConfigError
 from tests.app.conftest import ROOT, Script
 from tests.app.following import table
@@ -65,6 +67,15 @@ def test_too_few_samples_are_refused(started: Script, run: Path, tmp_path: Path)
     assert "at least 39" in done.stderr
 
 
+def test_a_format_that_does_not_fit_is_refused_at_once(
+    started: Script, run: Path, tmp_path: Path
+) -> None:
+    done = started("simulate", f"run={run}", "format=pedpy", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 2
+    assert "format=pedpy is not for traffic; for traffic take one of parquet, csv" in done.stderr
+    assert "noise of idm" not in done.stdout
+
+
 def test_in_python_it_is_an_object(tmp_path: Path) -> None:
     drives = table(10, 20.0)
     run = nnode.fit(drives, "traffic", model="idm", epochs=2)
@@ -87,8 +98,16 @@ def test_in_python_it_is_an_object(tmp_path: Path) -> None:
     np.testing.assert_allclose(first.x[:, -1, 0], lead, atol=1e-9)
     assert "noise of idm: " in repr(found)
     assert "<table" in found._repr_html_()
-    paths = found.write(tmp_path / "out", table=False)
+    paths = found.write(tmp_path / "out", format=None)
     assert [path.name for path in paths] == ["scores.json", "bands.png"]
+    *_, path = found.write(tmp_path / "out", format="fcd")
+    assert path.name == "samples.xml.gz"
+    options = SumoOptions(path=str(path), dt=first.dt, min_vehicles=2, window=None)
+    again = {s.recording: s.x for s in read_sumo(path, options)}
+    assert len(again) == len(found.trajectories)
+    for s in found.trajectories:
+        lane = s.name.replace("/", "_")
+        np.testing.assert_allclose(again[f"samples_{lane}"], s.x, rtol=0, atol=1e-9)
     other = nnode.simulate(run, drives, samples=SAMPLES, seed=4)
     assert not np.array_equal(other.trajectories[0].x, first.x)
 
@@ -157,3 +176,12 @@ def test_people_are_sampled(tmp_path: Path) -> None:
     assert len(store) == SAMPLES * len(found.sampling.indices)
     np.testing.assert_array_equal(store[5].x, found.trajectories[5].x)
     assert store[5].walls is not None
+    one = found.trajectories[5]
+    folder = tmp_path / "text"
+    assert len(found.write(folder, format="pedpy")) == 2 + len(store)
+    path = folder / "pedpy" / "samples" / f"{one.name.replace('/', '_')}.txt"
+    seconds = float(one.time[-1] - one.time[0])
+    (back,) = read_walkway(path, WalkwayOptions(path=str(path), t_seq=seconds))
+    np.testing.assert_allclose(back.x, one.x, rtol=0, atol=5.1e-7)  # six digits are written
+    with pytest.raises(ConfigError, match="format=fcd is not for crowd"):
+        found.write(folder, format="fcd")

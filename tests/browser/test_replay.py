@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,13 @@ def corridor() -> Scene:
     )
 
 
+def alone() -> Scene:
+    """One of the two."""
+    s = corridor().sequence
+    s = replace(s, name="alone", x=s.x[:, :1])
+    return Scene(s, {"late": s.x})
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with Browser() as found:
@@ -66,6 +74,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
             "p", [lane("first", 4.0), lane("second", 2.0)], "Cars.", "A car drives.", zone
         ),
         "corridor": ReplayBlock("p", [corridor()], "People.", "Two people pass each other."),
+        "dull": ReplayBlock("p", [alone(), corridor()], "People.", "They walk."),
     }
     return {
         name: write_player(block, folder / f"{name}.html", title=name).as_uri()
@@ -115,6 +124,14 @@ def test_the_pixels_are_where_the_cars_are(browser: Browser, pages: dict[str, st
         " r.pen.fillText = (text, ...at) => { said.push(text); old(text, ...at); };"
         " r.show(2); return said.join('; '); })()"
     )
+
+
+def test_a_crowd_begins_with_most_people(browser: Browser, pages: dict[str, str]) -> None:
+    browser.open(pages["dull"], 800)
+    choice = "document.querySelector('.choice')"
+    assert browser.evaluate(f"[...{choice}.options].map((o) => o.text)") == ["alone", "walk"]
+    assert browser.evaluate(f"{choice}.selectedIndex") == 1
+    assert browser.evaluate("document.querySelector('figure').replay.scene.number") == 2
 
 
 def test_the_named_place_is_shaded_where_it_is(browser: Browser, pages: dict[str, str]) -> None:

@@ -1,7 +1,8 @@
-"""Trajectories that are written and read again: PedPy's text, Parquet, and simulated ones."""
+"""Trajectories that are written and read again, in every format, and simulated ones."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,19 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nnode.data.options import JuelichOptions, TableOptions
+from nnode.data.options import JuelichOptions, SumoOptions, TableOptions
 from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.sumo import read_sumo
 from nnode.data.readers.table import read_table
 from nnode.data.sequence import Batch, Sequence
-from nnode.errors import DataError
-from nnode.exchange.trajectories import simulated, write_parquet, write_pedpy
+from nnode.errors import ConfigError, DataError
+from nnode.exchange.trajectories import (
+    check_format,
+    simulated,
+    write_fcd,
+    write_pedpy,
+    write_table,
+)
 from nnode.solvers.base import Trajectory
 
 
@@ -70,14 +78,76 @@ def test_no_file_is_written_twice(tmp_path: Path) -> None:
 
 def test_text_needs_two_coordinates(tmp_path: Path) -> None:
     lane = Sequence(name="a/0", recording="a", time=np.arange(3.0), x=np.zeros((3, 2, 1)))
-    with pytest.raises(DataError, match=r"a/0.*two coordinates.*leave pedpy out"):
+    with pytest.raises(DataError, match=r"a/0.*two coordinates.*take another format"):
         write_pedpy(tmp_path, [lane])
 
 
-def test_a_crowd_s_table_is_read_as_it_was(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "domain", "told"),
+    [
+        ("pedpy", "traffic", r"format=pedpy is not for traffic; .* one of parquet, csv, fcd"),
+        ("fcd", "crowd", r"format=fcd is not for crowd; .* one of parquet, csv, pedpy"),
+        ("xlsx", "crowd", r"format=xlsx is unknown; for crowd take one of parquet, csv, pedpy"),
+    ],
+)
+def test_a_format_that_does_not_fit(name: str, domain: str, told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        check_format("format", name, domain)
+
+
+def drive(name: str, n: int, k: int, start: int = 0, dt: float = 0.1, **more: object) -> Sequence:
+    """Vehicles 20 m apart at 15 m/s, each a little faster than the one behind."""
+    rng = np.random.default_rng(n)
+    v = 15 + np.cumsum(rng.uniform(0.1, 0.5, (k, n)), axis=1)
+    x = 20.0 * np.arange(n) + dt * np.cumsum(v, axis=0)
+    return Sequence(
+        name=name, recording=name.split("/")[0], time=dt * (start + np.arange(k)),
+        x=x[:, :, None], v=v[:, :, None], **more,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_vehicles_are_read_as_they_were(tmp_path: Path) -> None:
+    """All in one file, at the same times, some with the same identifiers and some with none."""
+    given_ = [
+        drive("road/0~1", 3, 40, agents=("a", 'b"<', "c"), kind=("car", "truck", "car"),
+              length=np.array([4.0, np.nan, 12.5])),
+        drive("road/0~2", 3, 40, agents=("a", 'b"<', "c")),
+        drive("road/1~1", 2, 25, start=20),
+        drive("road:1~1", 4, 10, start=33),
+    ]  # fmt: skip
+    path = write_fcd(tmp_path / "samples.xml.gz", given_)
+    options = SumoOptions(path=str(path), dt=0.1, min_vehicles=2, window=None)
+    lanes = ["road_0~1", "road_0~2", "road_1~1", "road_1~1_"]
+    found = {s.recording: s for s in read_sumo(path, options)}
+    assert sorted(found) == [f"samples_{lane}" for lane in lanes]
+    for lane, s in zip(lanes, given_, strict=True):
+        back = found[f"samples_{lane}"]
+        assert back.agents == tuple(f"{lane}.{a}" for a in s.agents or map(str, range(s.n_agents)))
+        np.testing.assert_allclose(back.time, s.time, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(back.x, s.x, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(back.v, s.v, rtol=0, atol=1e-9)
+    first, second = (found[f"samples_{lane}"] for lane in lanes[:2])
+    assert (first.kind, second.kind) == (("car", "truck", "car"), ("", "", ""))
+    np.testing.assert_array_equal(first.length, given_[0].length)
+    assert second.length is None
+    again = write_fcd(tmp_path / "again.xml.gz", given_)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_vehicles_without_speeds(tmp_path: Path) -> None:
+    s = replace(drive("road/0", 2, 12), v=None)
+    path = write_fcd(tmp_path / "fcd.xml.gz", [s])
+    options = SumoOptions(path=str(path), dt=0.1, min_vehicles=2, window=None)
+    (back,) = read_sumo(path, options)
+    assert back.v is None
+    np.testing.assert_allclose(back.x, s.x, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
+def test_a_crowd_s_table_is_read_as_it_was(tmp_path: Path, ending: str) -> None:
     first = walk(group=("g", "", "g"), kind=("child", "", ""), length=np.array([0.3, 0.4, np.nan]))
     second = walk(start=30, name="run/003", group=("", "", ""), kind=("child", "", ""))
-    path = write_parquet(tmp_path / "deep" / "walk.parquet", [first, second], 2)
+    path = write_table(tmp_path / "deep" / f"walk.{ending}", [first, second], 2)
     found = read_table(path, TableOptions(domain="crowd", path=str(path)))
     for back, s in zip(found, (first, second), strict=True):
         assert (back.name, back.recording, back.agents) == (s.name, s.recording, s.agents)
@@ -87,23 +157,25 @@ def test_a_crowd_s_table_is_read_as_it_was(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[0].length, first.length)
 
 
-def test_traffic_s_table_is_read_as_it_was(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
+def test_traffic_s_table_is_read_as_it_was(tmp_path: Path, ending: str) -> None:
     time = np.arange(5) * 0.2
     x = np.array([0.0, 30.0])[None, :, None] + 20 * time[:, None, None]
     s = Sequence(name="road/0", recording="road", time=time, x=x, length=np.array([4.0, np.nan]))
-    path = write_parquet(tmp_path / "road.parquet", [s], 1)
+    path = write_table(tmp_path / f"road.{ending}", [s], 1)
     (back,) = read_table(path, TableOptions(domain="traffic", path=str(path)))
     np.testing.assert_array_equal(back.x, s.x)
     np.testing.assert_array_equal(back.length, s.length)
 
 
-def test_nothing_is_left_of_a_table_that_failed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
+def test_nothing_is_left_of_a_table_that_failed(tmp_path: Path, ending: str) -> None:
     def broken():
         yield walk()
         raise DataError("no more")
 
     with pytest.raises(DataError, match="no more"):
-        write_parquet(tmp_path / "walk.parquet", broken(), 2)
+        write_table(tmp_path / f"walk.{ending}", broken(), 2)
     assert list(tmp_path.iterdir()) == []
 
 

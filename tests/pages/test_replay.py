@@ -61,6 +61,27 @@ def test_dense_samples_are_thinned_out_and_keep_their_times() -> None:
     assert one["dt"] == 0.2
 
 
+def people(name: str, number: int, samples: int) -> Sequence:
+    time = 0.2 * np.arange(samples)
+    x = np.stack(np.broadcast_arrays(time[:, None], np.arange(number)), -1)
+    return Sequence(name=name, recording="hall", time=time, x=x)
+
+
+def test_a_crowd_begins_with_most_people(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = [(1, 90), (4, 20), (4, 30), (4, 30), (2, 60), (9, 10)]
+    many = [scene(people(f"hall/{i}", *size)) for i, size in enumerate(sizes)]
+
+    def read(scenes: list[Scene]) -> tuple[int, list[str]]:
+        content = json.loads(block(scenes).data()[0])
+        return content["first"], [one["name"] for one in content["scenes"]]
+
+    assert read(many) == (5, [f"hall/{i}" for i in range(6)])
+    assert read(many[:5])[0] == 2  # the longer of those with as many
+    monkeypatch.setattr(replay, "MOST", 2)  # only of those that the page has
+    assert read(many) == (1, ["hall/0", "hall/1"])
+    assert read([scene(platoon()), scene(platoon(samples=60))])[0] == 0
+
+
 def test_what_is_left_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     many = [scene(platoon(f"lane/{i}")) for i in range(9)]
     text, said = block(many).data()

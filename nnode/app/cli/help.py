@@ -17,8 +17,12 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.app.cli.saved import plain
 from nnode.app.cli.typed import literal
 from nnode.program import words
+
+#: A dataclass's field with the comments above it and beside it.
+_FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]*(?:  # (.*))?$", re.MULTILINE)
 
 #: Characters of a line, and those before what explains an option.
 WIDTH, LEFT = 100, 34
@@ -41,18 +45,17 @@ def help_text(name: str, conf: Path, *, _root_: DictConfig) -> str:
     """
     hydra = _root_.hydra
     folders = [Path(s.path) for s in hydra.runtime.config_sources if s.schema == "file"]
-    parts = [words(name, conf), "Choices, GROUP=NAME; those with * are taken now"]
+    choices = []
     for group, chosen in hydra.runtime.choices.items():
         if not group.startswith("hydra/"):
             files = sorted(p for folder in folders for p in (folder / group).glob("*.yaml"))
             rows = [_row(f"{' *'[p.stem == chosen]} {p.stem}", said_of(p), 18) for p in files]
-            parts.append("\n".join([f"{group}=", *rows]))
-    if len(parts) == 2:
-        parts.pop()  # a command without choices
-    parts.append("Options, NAME=VALUE, with their values now; null means none")
+            choices.append("\n".join([f"{group}=", *rows]))
+    if choices:
+        choices.insert(0, "Choices, GROUP=NAME; those with * are taken now")
     config = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
-    plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
-    parts.append("\n".join(_options(_root_, plain)))
+    head = "Options, NAME=VALUE, with their values now; null means none"
+    parts = [words(name, conf), *choices, head, "\n".join(_options(_root_, plain(config)))]
     place = re.sub(r"\d{4}(-\d\d){2}_\d\d(-\d\d){2}", "TIME", hydra.run.dir)
     flags = {"hydra.run.dir=FOLDER": f"folder of the results; without it {place}", **_FLAGS}
     parts.append("\n".join(["Running", *(_row(*flag) for flag in flags.items())]))
@@ -65,10 +68,10 @@ def said_of(path: Path) -> str:
     return found[1] if found else ""
 
 
-def _options(node: DictConfig, plain: Any, prefix: str = "") -> Iterator[str]:
+def _options(node: DictConfig, values: dict[str, Any], prefix: str = "") -> Iterator[str]:
     kind = OmegaConf.get_type(node)
     said = remarks(kind) if is_dataclass(kind) else {}
-    for key, value in plain.items():
+    for key, value in values.items():
         if OmegaConf.is_missing(node, key):
             yield _row(f"{prefix}{key}=...", f"must be given: {said.get(key, '')}")
         elif is_dataclass(OmegaConf.get_type(node, key)):
@@ -87,9 +90,10 @@ def _row(left: str, right: str, size: int = LEFT) -> str:
 def remarks(schema: type) -> dict[str, str]:
     """What the comments beside, or above, a dataclass's fields say; choices of enums with it."""
     found: dict[str, str] = {}
-    for kind in reversed(schema.__mro__):
-        if is_dataclass(kind):
-            found.update(_comments(inspect.getsource(kind)))
+    for part in filter(is_dataclass, reversed(schema.__mro__)):
+        for above, name, beside in _FIELD.findall(inspect.getsource(part)):
+            if said := beside or " ".join(re.findall("# (.*)", above)):
+                found[name] = said
     for one in fields(schema):
         if isinstance(one.default, Enum):
             kind = type(one.default)
@@ -97,16 +101,3 @@ def remarks(schema: type) -> dict[str, str]:
             about = (inspect.getdoc(kind) or "").partition("\n")[0]
             found[one.name] = f"{valid}: {found.get(one.name, about)}"
     return found
-
-
-def _comments(source: str) -> dict[str, str]:
-    found, above = {}, ""
-    for line in source.splitlines():
-        comment = re.match(r"    # (.*)", line)
-        field = re.match(r"    (\w+): [^#]*(?:  # (.*))?$", line)
-        if comment:
-            above = f"{above} {comment[1]}".strip()
-        elif field:
-            found[field[1]] = field[2] or above
-            above = ""
-    return {name: words for name, words in found.items() if words}

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import hydra
@@ -71,14 +72,14 @@ def run(
         if parallel:
             join()
         with World().together():
-            _name_words(bare)
-            given = [sys.argv[i] for i in _places()]
-            extra = prepared_group(given, folder)
-            _insert(extra + (inject([*given, *extra]) if inject else []), first=True)
+            given, flags = _parted(bare)
+            extra = prepared_group(given)
+            given = [*extra, *(inject([*given, *extra]) if inject else []), *given]
     except NNodeError as error:
         end(error)
     GlobalHydra.instance().clear()  # of a job that has forked this process
-    with _out_of_sight():
+    with _out_of_sight() as places:
+        sys.argv[1:] = [*given, *places, *flags]
         hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_task(job))()
     World().part()
     if failures():
@@ -94,13 +95,10 @@ def _task(job: Job) -> Callable[[DictConfig], None]:
         try:
             with disk_words(folder):
                 job(config, folder)
-        except MissingMandatoryValue as error:
-            what = str(error).splitlines()[0]
-            failed: NNodeError = ConfigError(
-                f"{what}; type {error.full_key}=VALUE, --help shows examples"
-            )
         except OmegaConfBaseException as error:
-            failed = ConfigError(str(error).splitlines()[0])
+            lacking = isinstance(error, MissingMandatoryValue)
+            hint = f"; type {error.full_key}=VALUE, --help shows examples" if lacking else ""
+            failed: NNodeError = ConfigError(str(error).splitlines()[0] + hint)
         except NNodeError as error:
             failed = error
         else:
@@ -120,46 +118,34 @@ def _task(job: Job) -> Callable[[DictConfig], None]:
     return task
 
 
-def _name_words(bare: str | None) -> None:
-    """Give its name to a word that is typed without one.
+def _parted(bare: str | None) -> tuple[list[str], list[str]]:
+    """Overrides and all else of the command line; Hydra wants overrides side by side.
 
     Raises:
-        ConfigError: there is no option that such a word could be meant for.
+        ConfigError: a word without a name, and no option that it could be meant for.
     """
-    for i, word in enumerate(sys.argv):
-        flag = not i or word[:1] in ("-", "~", "") or sys.argv[i - 1].startswith("-")
-        if flag or "=" in word:
-            continue
-        if bare is None:
+    overrides, flags = [], []
+    for before, word in pairwise(sys.argv):
+        if word[:1] == "~" or ("=" in word and word[0] != "-"):
+            overrides.append(word)
+        elif word[:1] in ("-", "") or before.startswith("-"):
+            flags.append(word)
+        elif bare is None:
             raise ConfigError(f"{word} is no option: expected NAME=VALUE, --help shows examples")
-        sys.argv[i], bare = f"{bare}={literal(word)}", None
-
-
-def _places() -> list[int]:
-    """Where the command line has overrides."""
-    return [i for i, a in enumerate(sys.argv) if i and "=" in a and not a.startswith("-")]
-
-
-def _insert(overrides: list[str], *, first: bool = False) -> None:
-    """Put overrides before or behind the user's; Hydra wants all of them side by side."""
-    places = _places() or [len(sys.argv)]
-    place = places[0] if first else places[-1] + 1
-    sys.argv[place:place] = overrides
+        else:
+            overrides.append(f"{bare}={literal(word)}")
+            bare = None
+    return overrides, flags
 
 
 @contextmanager
-def _out_of_sight() -> Iterator[None]:
+def _out_of_sight() -> Iterator[list[str]]:
     """Silence for all processes but the first, and a folder for Hydra that nobody looks for."""
     if World().first:
-        yield
+        yield []
         return
     with tempfile.TemporaryDirectory(prefix="nnode-") as folder:
-        places = [
-            f"hydra.run.dir={folder}",
-            f"hydra.sweep.dir={folder}",
-            "hydra.output_subdir=null",
-        ]
-        _insert(places)
         logging.disable(logging.CRITICAL)
         warnings.simplefilter("ignore")
-        yield
+        places = [f"hydra.{name}.dir={folder}" for name in ("run", "sweep")]
+        yield [*places, "hydra.output_subdir=null"]

@@ -14,8 +14,6 @@ from typing import Any, NoReturn
 import pandas as pd
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from nnode.calibrate.distributed import World
 from nnode.calibrate.interrupt import Interrupted
@@ -30,7 +28,7 @@ RESULT = "result.json"
 ROOM = 1 << 15
 
 #: The sweep of this process: its folder, and the results that lay there before.
-_sweep: dict[Path, dict[Path, int]] = {}
+_sweep: dict[Path, set[tuple[Path, int]]] = {}
 
 
 class Runs(Callback):
@@ -76,12 +74,8 @@ def say(text: str) -> None:
 
 def failures() -> list[Path]:
     """Folders of the runs of this process's sweep that failed, wherever they ran."""
-    return [
-        path.parent
-        for folder, before in _sweep.items()
-        for path, changed in sorted(_results(folder).items())
-        if before.get(path) != changed and "error" in json.loads(path.read_text())
-    ]
+    new = [path for folder, old in _sweep.items() for path, _ in _results(folder) - old]
+    return sorted(path.parent for path in new if "error" in json.loads(path.read_text()))
 
 
 def _take(folder: Path) -> None:
@@ -98,9 +92,9 @@ def _take(folder: Path) -> None:
         end(error)
 
 
-def _results(folder: Path) -> dict[Path, int]:
+def _results(folder: Path) -> set[tuple[Path, int]]:
     """Result files of the runs in a folder, with the time of their last change."""
-    return {path: path.stat().st_mtime_ns for path in folder.rglob(RESULT)}
+    return {(path, path.stat().st_mtime_ns) for path in folder.rglob(RESULT)}
 
 
 def _table(folder: Path) -> None:
@@ -114,10 +108,5 @@ def _table(folder: Path) -> None:
     rows = [{"run": run, **result.pop("summary", result)} for run, result in results.items()]
     table = pd.DataFrame(rows)
     table.to_csv(folder / "sweep.csv", index=False)
-    shown = Table(title=f"{len(rows)} runs")
-    for column in table.columns:
-        shown.add_column(str(column))
-    for row in table.itertuples(index=False):
-        shown.add_row(*(f"{v:.5g}" if isinstance(v, float) else str(v) for v in row))
-    Console(width=None if os.isatty(1) else 160).print(shown)
+    print(f"{len(rows)} runs", table.to_string(index=False, float_format="{:.5g}".format), sep="\n")
     print(f"table: {folder / 'sweep.csv'}")

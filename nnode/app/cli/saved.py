@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -25,19 +25,23 @@ def in_hydra() -> bool:
     return HydraConfig.initialized() and GlobalHydra.instance().is_initialized()
 
 
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration in plain types."""
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, enum_to_str=True))
+
+
 def plain_config(config: DictConfig) -> dict[str, Any]:
     """The composed configuration in plain types, with the groups it was composed from.
 
     One that was made without Hydra names its groups itself.
     """
-    plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
-    assert isinstance(plain, dict)
-    make_absolute(plain.get("data", {}))
-    if not in_hydra():
-        return {str(k): v for k, v in plain.items() if k != "resume"}
-    choices = HydraConfig.get().runtime.choices
-    groups = {group: str(choices[group]) for group in GROUPS if group in choices}
-    return {**{str(k): v for k, v in plain.items() if k != "resume"}, "groups": groups}
+    found = plain(config)
+    make_absolute(found.get("data", {}))
+    found.pop("resume", None)
+    if in_hydra():
+        choices = HydraConfig.get().runtime.choices
+        found["groups"] = {group: str(choices[group]) for group in GROUPS if group in choices}
+    return found
 
 
 def make_absolute(data: dict[str, Any]) -> None:
@@ -50,11 +54,9 @@ def make_absolute(data: dict[str, Any]) -> None:
 
 def path_given(overrides: list[str], option: str) -> str | None:
     """The first path that ``option=PATH`` or ``option=[PATH, ...]`` names."""
-    for override in reversed(overrides):
-        key, _, value = override.partition("=")
-        if key == option and value not in ("", "null"):
-            return value.strip("[]").split(",")[0].strip().strip("'\"") or None
-    return None
+    given = [value for key, _, value in (o.partition("=") for o in overrides) if key == option]
+    paths = [value.strip("[]").split(",")[0].strip(" '\"") for value in given if value != "null"]
+    return next(filter(None, reversed(paths)), None)
 
 
 def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GROUPS) -> list[str]:
@@ -64,7 +66,7 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
         return []
     saved = load_checkpoint(path).config.get("groups", {})
     given = {override.partition("=")[0] for override in overrides}
-    chosen = [g for g in groups if g in saved and g not in given]
+    chosen = [group for group in groups if group in saved.keys() - given]
     _chosen.update(chosen)
     return [f"{group}={saved[group]}" for group in chosen]
 
@@ -72,10 +74,9 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
 def field_groups(overrides: list[str]) -> list[str]:
     """Overrides that choose compiled code and Gauss and Newton's method for the field's laws where
     the user chooses nothing else; the paper's models keep the paper's."""
-    pairs = (override.partition("=") for override in overrides)
-    chosen = {key.lstrip("+"): value for key, _, value in pairs}
-    laws = chosen.get("model", "").split(",")
-    if not set(laws) <= set(FIELD) or "experiment" in chosen:
+    pairs = (override.lstrip("+").partition("=") for override in overrides)
+    chosen = {key: value for key, _, value in pairs}
+    if "experiment" in chosen or not FIELD.keys() >= set(chosen.get("model", "").split(",")):
         return []
     wanted = {"solver": "fused", "optimizer": "gauss_newton"}
     return [f"{group}={choice}" for group, choice in wanted.items() if group not in chosen]
@@ -84,6 +85,11 @@ def field_groups(overrides: list[str]) -> list[str]:
 def train_groups(overrides: list[str]) -> list[str]:
     """What ``scripts/train.py`` chooses for the user, from a checkpoint or for a law."""
     return saved_groups(overrides, option="resume") or field_groups(overrides)
+
+
+def keys_given() -> list[str]:
+    """Names of the options that this job was started with."""
+    return [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
 
 
 def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, ...]) -> DictConfig:
@@ -96,25 +102,22 @@ def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, 
         CheckpointError: the checkpoint's configuration lacks a section.
     """
     merged = config.copy()
-    choices = HydraConfig.get().runtime.choices
+    if lacking := {"groups", *sections} - saved.keys():
+        raise CheckpointError(
+            f"the checkpoint's configuration has no {', '.join(sorted(lacking))}; it is damaged: "
+            "take another checkpoint"
+        )
+    choices, own = HydraConfig.get().runtime.choices, saved["groups"]
     for name in sections:
-        if name not in saved or "groups" not in saved:
-            raise CheckpointError(
-                f"the checkpoint's configuration has no {name if 'groups' in saved else 'groups'}; "
-                "it is damaged: take another checkpoint"
+        if name not in own or choices[name] == own[name]:
+            OmegaConf.update(merged, name, saved[name], merge=True)
+        elif name in _chosen:
+            raise ConfigError(
+                f"this checkpoint has {name}={own[name]}, the first one of the sweep "
+                f"{name}={choices[name]}; sweep over checkpoints of one {name}"
             )
-        if name in saved["groups"] and choices[name] != saved["groups"][name]:
-            if name in _chosen:
-                raise ConfigError(
-                    f"this checkpoint has {name}={saved['groups'][name]}, the first one of the "
-                    f"sweep {name}={choices[name]}; sweep over checkpoints of one {name}"
-                )
-            continue
-        OmegaConf.update(merged, name, saved[name], merge=True)
-    for override in HydraConfig.get().overrides.task:
-        key = override.partition("=")[0].lstrip("+")
-        option = "." in key or key not in saved["groups"]
-        if option and key.partition(".")[0] in sections:
+    for key in keys_given():
+        if key not in own and key.partition(".")[0] in sections:
             OmegaConf.update(merged, key, OmegaConf.select(config, key), force_add=True)
     return merged
 
@@ -127,15 +130,12 @@ def refuse_changes(
     Raises:
         ConfigError: naming the option, what the checkpoint has and what is asked for.
     """
-    for key in now:
-        full = prefix + key
-        if full in allowed:
-            continue
-        if isinstance(now[key], dict) and isinstance(saved.get(key), dict):
-            refuse_changes(now[key], saved[key], allowed, f"{full}.")
-        elif now[key] != saved.get(key):
+    for key, value in now.items():
+        full, had = prefix + key, saved.get(key)
+        if isinstance(value, dict) and isinstance(had, dict):
+            refuse_changes(value, had, allowed, f"{full}.")
+        elif full not in allowed and value != had:
             raise ConfigError(
-                f"{full} cannot change when a run is resumed: the checkpoint has "
-                f"{saved.get(key)}, asked for is {now[key]}; leave the option out, or start a "
-                "new run without resume="
+                f"{full} cannot change when a run is resumed: the checkpoint has {had}, asked for "
+                f"is {value}; leave the option out, or start a new run without resume="
             )

@@ -14,11 +14,8 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.cli.saved import in_hydra, make_absolute
+from nnode.app.cli.saved import in_hydra, make_absolute, plain
 from nnode.program import configuration
-
-#: What must be escaped in the name of a mapping's entry.
-_SPECIAL = re.compile(r"([\\()\[\]{}:=, \t])")
 
 
 def shell_override(key: str, value: object) -> str:
@@ -46,14 +43,12 @@ def literal(value: object) -> str:
 
 def _name(key: object) -> str:
     """The name of a mapping's entry."""
-    return _SPECIAL.sub(r"\\\1", str(key))
+    return re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", str(key))
 
 
 def plain_options(options: object) -> dict[str, Any]:
     """A dataclass of options in plain types."""
-    found = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
+    return plain(OmegaConf.structured(options))
 
 
 def group_defaults(section: str, group: str, script: str | None = None) -> dict[str, Any]:
@@ -66,11 +61,8 @@ def group_defaults(section: str, group: str, script: str | None = None) -> dict[
         name = script or HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:
-        schema, own = written(section, group)
-        config = OmegaConf.merge(OmegaConf.structured(schema), own)
-    plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
-    assert isinstance(plain, dict)
-    found = {str(key): value for key, value in plain.items()}
+        config = cast(DictConfig, OmegaConf.merge(*written(section, group)))
+    found = plain(config)
     if section == "data":
         make_absolute(found)
     return found

@@ -4,12 +4,14 @@ Examples:
   # what the run held out, 99 times, scored beside the model without noise and constant speeds
   python scripts/simulate.py run=RUN
   python scripts/simulate.py run=RUN samples=399 seed=1
-  # scores alone
-  python scripts/simulate.py run=RUN table=false
+  # the samples as SUMO or PedPy have trajectories; scores alone
+  python scripts/simulate.py run=RUN format=fcd
+  python scripts/simulate.py run=RUN format=pedpy
+  python scripts/simulate.py run=RUN format=null
 
 Results: scores.json, the noise, CRPS and what bands cover; bands.png; samples.parquet, which
-data=table reads, of people with walls.csv. docs/sampling.md tells how noise is fitted. Data are
-those of the run.
+data=table reads, of people with walls.csv. docs/sampling.md has the other formats and how noise is
+fitted. Data are those of the run.
 """
 
 from __future__ import annotations

@@ -41,6 +41,7 @@ def telling(found: Found, sequences: list[Sequence]) -> list[Sequence]:
 def scenes(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Scene]:
     """Sealed sequences as measured and as simulated before and after, the most telling first.
 
+    The still figure has the first one; a crowd's player begins with the one with most people.
     Those that a model cannot be simulated on are left out.
     """
     chosen = telling(found, inputs.sequences)[: SCENES if options.replay else 1]

@@ -15,7 +15,7 @@ class Replay {
     this.choice.onchange = () => this.choose(this.choice.selectedIndex);
     figure.onkeydown = (event) => this.key(event);
     new ResizeObserver(() => this.show(this.time)).observe(this.canvas.parentElement);
-    this.choose(0);
+    this.choose(this.data.first);
   }
 
   choose(number) {

@@ -12,10 +12,10 @@ import pytest
 
 import nnode
 from nnode.app.cli.prepared import prepared_group
+from nnode.app.cli.typed import written
 from nnode.data.options import EsimasOptions, TableOptions, WalkwayOptions
-from nnode.data.prepare import prepare
+from nnode.data.prepare import FORMATS, prepare
 from nnode.errors import DataError
-from tests.app.conftest import CONF
 from tests.discover.recorded import lane
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
@@ -106,25 +106,21 @@ def test_the_group_is_the_folder_s(raw: Path, table: Path, tmp_path: Path) -> No
     given = [f"data.prepared={tmp_path}"]
     options = EsimasOptions(name="demo_traffic", recording="demo", source=str(raw))
     prepare(options, tmp_path)
-    assert prepared_group(given, CONF) == ["data=demo_traffic"]
-    assert prepared_group([*given, "data=esimas"], CONF) == []
-    assert prepared_group(["data.prepared=null"], CONF) == []
+    assert prepared_group(given) == ["data=demo_traffic"]
+    assert prepared_group([*given, "data=esimas"]) == []
+    assert prepared_group(["data.prepared=null"]) == []
     options.name = "mine"  # a name of the user's own, or that of another reader's data
     prepare(options, tmp_path)
-    assert prepared_group(given, CONF) == ["data=esimas"]
+    assert prepared_group(given) == ["data=esimas"]
     options.name = "table"
     prepare(options, tmp_path)
-    assert prepared_group(given, CONF) == ["data=esimas"]
-    assert prepared_group([f"data.prepared={table}"], CONF) == ["data=table"]
+    assert prepared_group(given) == ["data=esimas"]
+    assert prepared_group([f"data.prepared={table}"]) == ["data=table"]
     with pytest.raises(DataError, match="holds no prepared data"):
-        prepared_group([f"data.prepared={raw}"], CONF)
+        prepared_group([f"data.prepared={raw}"])
 
 
 def test_every_reader_has_a_group_of_its_usual_name() -> None:
-    from nnode.app.cli.prepared import _groups
-    from nnode.data.prepare import FORMATS
-
-    groups = _groups(CONF)
     for reader in FORMATS:
-        assert groups[str(reader().name)] is reader
+        assert written("data", str(reader().name))[0] is reader
     assert {TableOptions, WalkwayOptions} <= set(FORMATS)
