@@ -19,6 +19,24 @@ class Coefficient:
 
 
 @dataclass
+class Profile:
+    """How a leader should drive for two effects to be told apart.
+
+    Attributes:
+        mean, swing: the speed is mean + swing sin(2 pi t / period), m/s.
+        period: s.
+        lasts: s that it lasts.
+        platoons: about so many of them tell two effects apart with a probability of 90 %.
+    """
+
+    mean: float
+    swing: float
+    period: float
+    lasts: float
+    platoons: int
+
+
+@dataclass
 class Alternative:
     """An effect that explains the data nearly as well.
 
@@ -29,6 +47,7 @@ class Alternative:
         separated_by: data that would tell the two apart.
         clusters: about how many open clusters like these would tell them apart with a probability
             of 90 %, if the difference that was seen is the true one; None where no number would.
+        profile: of a leader behind whom the fewest platoons tell them apart; of lanes.
     """
 
     name: str
@@ -36,6 +55,7 @@ class Alternative:
     p_value: float
     separated_by: str = ""
     clusters: int | None = None
+    profile: Profile | None = None
 
 
 @dataclass

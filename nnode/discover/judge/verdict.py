@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from nnode.discover.judge.measure_next import advised
+from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import tail
 from nnode.discover.locate.symbolic import symbolic
+from nnode.discover.name.candidate import Candidate
 from nnode.discover.name.search import Search, Step, apart_at
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit
@@ -21,6 +24,7 @@ from nnode.discover.result import (
     Coefficient,
     NamedEffect,
     Place,
+    Profile,
     Structure,
 )
 from nnode.discover.rules import rules
@@ -57,6 +61,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
                 p_value=test.p_value,
                 separated_by=effect.separated_by,
                 clusters=clusters_to_tell(test, apart_at(step.chosen, other)),
+                profile=_profile(engine, fit, other, apart_at(step.chosen, other)),
             )
             for other, test in step.rivals
         ],
@@ -64,6 +69,12 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
         gain=step.chosen.gain.gain,
         confirmed=confirmed,
     )
+
+
+def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profile | None:
+    if not isinstance(engine, TrafficEngine):
+        return None
+    return advised(engine, fit.system, rival.fit.system, level)
 
 
 def named_agents(one: Individuals, confirmed: float) -> NamedEffect:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from nnode.data.quality import KINDS
 from nnode.discover.report.files import amount, estimate, in_unit
-from nnode.discover.result import Diagnosis, Laws, NamedEffect
+from nnode.discover.result import Diagnosis, Laws, NamedEffect, Profile
 from nnode.models.term import short_names
 from nnode.pages.page import TableBlock
 
@@ -186,6 +186,7 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
             "p": amount(other.p_value, 2),
             "what would tell them apart": other.separated_by or "–",
             "or so many open clusters": "–" if other.clusters is None else other.clusters,
+            "or platoons behind such a leader": _leader(other.profile),
         }
         for effect in d.effects
         for other in effect.alternatives
@@ -196,7 +197,18 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
         "Effects that explain the data nearly as well. *p*: of the hypothesis that the other is "
         "as good. Take none of them for granted before such data are there. *open clusters*: that "
         "tell the two apart with a probability of 90 %, if the difference that was seen is the "
-        f"true one; there are {d.clusters.open}.",
+        f"true one; there are {d.clusters.open}. *such a leader*: of those whose speed goes "
+        "up and down evenly, within measured speeds and 2 m/s², the one behind whom both "
+        "calibrated models differ most beyond what their own parameters can mend.",
+    )
+
+
+def _leader(profile: Profile | None) -> str:
+    if profile is None:
+        return "–"
+    return (
+        f"{profile.platoons} of {profile.lasts:g} s: {profile.mean:.0f} ± {profile.swing:.1f} m/s "
+        f"every {profile.period:g} s"
     )
 
 

@@ -1,0 +1,136 @@
+"""What to measure next: how a leader should drive for two effects to be told apart.
+
+Both calibrated models drive the same platoon behind leaders with different profiles of speed. What
+one of them cannot imitate of the other's paths by its own parameters, whitened as the residuals
+are, tells the two apart: d², the expected rise of the sum of squares. In n platoons the sum of
+squares of the wrong model is higher by n d² with a standard deviation of 2 d (n f)^½; f is how far
+the differences of open clusters vary beyond that. So n is 4 f (z_level + z_power)² / d², the larger
+one of both truths.
+
+Source: Box & Hill 1967 (experiments that discriminate between models).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy import stats
+
+from nnode.data.sequence import Sequence
+from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.lanes.paths import velocity
+from nnode.discover.residuals.engine import row_of
+from nnode.discover.residuals.fit import sums
+from nnode.discover.result import Profile
+from nnode.errors import SimulationError
+from nnode.models.system import System
+
+#: s that a profile lasts after as long a drive at its mean speed, in which starts are forgotten.
+LASTS = 30.0
+#: m/s² that a leader brakes and accelerates with at most; comfortable: Treiber & Kesting 2013.
+COMFORTABLE = 2.0
+#: Periods of a leader's speed that are tried, s.
+PERIODS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+#: Probability of telling two effects apart.
+POWER = 0.9
+
+
+def advised(engine: TrafficEngine, one: System, other: System, level: float) -> Profile | None:
+    """The profile of those that are tried which takes the fewest platoons; None where all runs
+    blow up or no number would do.
+
+    Args:
+        engine: of the open sequences, settled.
+        one, other: models with either effect, calibrated.
+        level: at which the two are told apart.
+    """
+    found = tried(engine, one, other, level)
+    return min(found, key=lambda profile: profile.platoons, default=None)
+
+
+def tried(engine: TrafficEngine, one: System, other: System, level: float) -> Iterator[Profile]:
+    """Each profile with its number of platoons; those that no number would do for are left out."""
+    excess = _excess(engine, one, other)
+    quantiles = float(stats.norm.ppf(1 - level) + stats.norm.ppf(POWER))
+    speeds = _leaders(engine)
+    low, mean, high = np.quantile(speeds, [0.0, 0.5, 1.0])
+    room = min(mean - low, high - mean)
+    for period in PERIODS:
+        swing = float(min(room, COMFORTABLE * period / (2 * math.pi)))
+        away = []
+        for truth, wrong in ((one, other), (other, one)):
+            try:
+                away.append(distance(engine, truth, wrong, mean, swing, period))
+            except SimulationError:
+                away.append(0.0)
+        least = min(away)
+        if least > 0 and math.isfinite(least):
+            number = math.ceil(4 * excess * quantiles**2 / least)
+            yield Profile(float(mean), swing, period, LASTS, max(number, 2))
+
+
+def distance(
+    engine: TrafficEngine, truth: System, wrong: System, mean: float, swing: float, period: float
+) -> float:
+    """d² of one platoon: the squared whitened deviations of one model from another one's paths that
+    the former's own parameters cannot take out."""
+    dt = engine.batch.dt
+    time = dt * np.arange(round(2 * LASTS / dt) + 1)
+    later = np.maximum(time - LASTS, 0.0)
+    angle = 2 * math.pi / period
+    place = mean * time + swing / angle * (1 - np.cos(angle * later))
+    template = max(engine.sequences, key=lambda sequence: sequence.n_agents)
+    gaps = np.diff(np.median(template.x[..., 0], axis=0))
+    start = np.concatenate([-np.cumsum(gaps[::-1])[::-1], [0.0]])
+    paths = _driven(engine, truth, template, time, place[:, None] + start)
+    kept = time >= LASTS - dt / 2
+    found = _engine(engine, template, time[kept], paths[kept])
+    row = row_of(wrong)
+    residual = found.residuals(wrong, row[None])[0].numpy()
+    columns = found.tangents(wrong, row).numpy().T
+    if not (np.isfinite(residual).all() and np.isfinite(columns).all()):
+        raise SimulationError("the models blow up behind such a leader")
+    rest = residual - columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
+    return float(rest @ rest)
+
+
+def _driven(
+    engine: TrafficEngine, system: System, template: Sequence, time: np.ndarray, x: np.ndarray
+) -> np.ndarray:
+    """``(K, N)`` paths behind the leader of ``x``, from its starts, m."""
+    found = _engine(engine, template, time, x)
+    with torch.no_grad():
+        states = found.simulate(system, row_of(system)[None])[0]
+    return np.where(
+        np.arange(x.shape[1]) < x.shape[1] - 1, states[:, 0, : x.shape[1], 0].numpy(), x
+    )
+
+
+def _engine(
+    engine: TrafficEngine, template: Sequence, time: np.ndarray, x: np.ndarray
+) -> TrafficEngine:
+    """Of one platoon, in the filter of another engine."""
+    v = velocity(x[..., None], float(time[1] - time[0]))
+    sequence = replace(template, name="advised", time=time, x=x[..., None], v=v, agents=())
+    found = TrafficEngine([sequence], np.inf, None, np.inf)
+    found.filter = engine.filter
+    return found
+
+
+def _leaders(engine: TrafficEngine) -> np.ndarray:
+    """Measured leaders' speeds, m/s."""
+    return np.concatenate([s.velocity()[:, -1, 0] for s in engine.sequences])
+
+
+def _excess(engine: TrafficEngine, one: System, other: System) -> float:
+    """How far the differences of clusters' costs vary beyond those of independent residuals."""
+    first, second = (engine.residuals(s, row_of(s)[None])[0].numpy() for s in (one, other))
+    costs = sums(first**2, engine.cluster) - sums(second**2, engine.cluster)
+    expected = 4 * float(((first - second) ** 2).sum())
+    if len(costs) < 2 or not expected > 0:
+        return 1.0
+    return max(1.0, len(costs) * float(costs.var(ddof=1)) / expected)
