@@ -24,8 +24,6 @@ class Rules:
     least: float = 0.02  # share of the squared errors below which nothing is worth a name
     minimal: float = 0.1  # of an effect's least usual size: taken for none, a crowd's bias is less
     rival: float = 0.25  # of the best score's gain: effects from there on are calibrated, for time
-    # of the best held-out gain: effects from there on may be the same as the best
-    close: float = 0.8
     near: float = 0.97  # of the best held-out gain: from there on the simpler effect is as good
     # what is left, relative to what names removed: from there on they do not explain the data
     too_much: float = 0.5

@@ -194,7 +194,7 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
     best = _simplest(passing, screen)
     rivals = []
     for other in candidates:
-        if other is best or other.gain.gain < rules().close * best.gain.gain:
+        if other is best:
             continue
         test = _between(other, best, screen)
         if test.p_value > apart_at(best, other) and not _contains(other, best):
@@ -234,18 +234,15 @@ def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
 
 
 def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> list[Candidate]:
-    """Candidates in their order, those near the best and its kin calibrated to the end: kin differ
-    by less than a rough calibration leaves."""
+    """Candidates in their order, calibrated to the end: kin differ by less than a rough calibration
+    leaves."""
     assert found.screen is not None
+    if not candidates or candidates[0].gain.gain <= 0:
+        return candidates
     ended = []
     for one in candidates:
-        best = candidates[0]
-        kin = apart_at(best, one) < rules().level
-        near = kin or one.gain.gain >= rules().close * best.gain.gain
-        if best.gain.gain > 0 and near:
-            fit = refine(engine, one.fit.system, tolerance=FINE)
-            one = _candidate(one.score, fit, found.fit, found.screen, one.removed)
-        ended.append(one)
+        fit = refine(engine, one.fit.system, tolerance=FINE)
+        ended.append(_candidate(one.score, fit, found.fit, found.screen, one.removed))
     return sorted(ended, key=lambda c: -c.gain.gain)
 
 
@@ -342,6 +339,6 @@ def _rivals_beside(
         fit = refine(engine, fit.system, tolerance=FINE)
         other = _candidate(rival.score, fit, before, found.screen, rival.removed)
         test = _between(other, one, found.screen)
-        if other.gain.gain >= rules().close * one.gain.gain and test.p_value > apart_at(one, other):
+        if test.p_value > apart_at(one, other):
             rivals.append((other, test))
     return rivals
