@@ -8,7 +8,6 @@ where nothing is hidden but another law.
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.open_world.answers import Answer
+from benchmarks.open_world.answers import Answer, diagnosed
 
 #: Sequences of a scene, people of a group, JuPedSim's step and that of the recording (s), seconds
 #: before the recording and of it.
@@ -182,26 +181,17 @@ def _moved(
 
 def diagnosed_people(scene: str, seed: int) -> dict[str, Any]:
     """One scene, diagnosed with the social force; plain JSON, see :meth:`Answer.judge`."""
-    from nnode.app.discover import diagnose_table
-    from nnode.discover.options import DiscoverOptions
-
     table, walls = recorded(scene, seed)
-    start = time.monotonic()
     model = {"name": "sf", "term": "social_force", "desired": "direction", "walls": False}
     with TemporaryDirectory() as place:
         path = None
         if walls is not None:
             path = Path(place) / "walls.csv"
             walls.to_csv(path, index=False)
-        given = diagnose_table(
-            table, "crowd", model=model, seed=seed, walls=path,
-            options=DiscoverOptions(page=False, replay=False),
-        )  # fmt: skip
-    nearest = None if given.nearest is None else given.nearest.plain()
+        report, nearest, seconds = diagnosed(table, "crowd", seed, model=model, walls=path)
     return {
         "program": "JuPedSim", "scene": scene, "seed": seed, "asked": "sf",
-        **SCENES[scene].answer.judge(given.plain(), nearest),
-        "seconds": time.monotonic() - start,
+        **SCENES[scene].answer.judge(report, nearest), "seconds": seconds,
     }  # fmt: skip
 
 

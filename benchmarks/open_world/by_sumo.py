@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,7 +24,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
-from benchmarks.open_world.answers import NOTHING, Answer
+from benchmarks.open_world.answers import NOTHING, Answer, diagnosed
 from benchmarks.truths.laws.case import accelerations
 
 #: Roads, vehicles on each with the leader, seconds before and of the recording, SUMO's step (s).
@@ -222,18 +221,10 @@ def _read(path: Path) -> pd.DataFrame:
 
 def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]:
     """One scene, diagnosed; plain JSON, see :meth:`Answer.judge`."""
-    from nnode.app.discover import diagnose_table
-    from nnode.discover.options import DiscoverOptions
-
-    table = recorded(scene, seed)
-    start = time.monotonic()
-    options = DiscoverOptions(page=False, replay=False)
-    given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
-    nearest = None if given.nearest is None else given.nearest.plain()
+    report, nearest, seconds = diagnosed(recorded(scene, seed), "traffic", seed, model=asked)
     return {
         "program": "SUMO", "scene": scene, "seed": seed, "asked": asked,
-        **SCENES[scene].answer.judge(given.plain(), nearest),
-        "seconds": time.monotonic() - start,
+        **SCENES[scene].answer.judge(report, nearest), "seconds": seconds,
     }  # fmt: skip
 
 

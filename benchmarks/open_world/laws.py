@@ -7,9 +7,9 @@ other one lacks, :data:`RIGHT`; every other name is false.
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
+from benchmarks.open_world.answers import diagnosed
 from benchmarks.truths.laws.case import LawCase, measured
 from benchmarks.truths.laws.motion import FIRST_ORDER, RANGES
 
@@ -43,25 +43,18 @@ def diagnosed_case(law: str, seed: int, asked: str, **size: Any) -> dict[str, An
         The law that came ``first``, by how much the true one is ``behind`` it, and of the law that
         was asked for and of the first one verdict, names, and names that are ``false``.
     """
-    from nnode.app.discover import diagnose_table
-    from nnode.discover.options import DiscoverOptions
-
     table, parameters = measured(LawCase(law, seed, **size))
-    start = time.monotonic()
-    options = DiscoverOptions(page=False, replay=False)
-    given = diagnose_table(table, "traffic", model=asked, seed=seed, options=options)
-    report = given.plain()
+    report, nearest, seconds = diagnosed(table, "traffic", seed, model=asked)
     ranking = (report["laws_again"] or report["laws"])["ranking"]
     own = next((one for one in ranking if one["name"] == law), None)
     first = ranking[0]["name"]
-    nearest = report if given.nearest is None else given.nearest.plain()
     row: dict[str, Any] = {
         "law": law, "seed": seed, "asked": asked, "parameters": parameters, "first": first,
         "behind": None if own is None else own["behind"],
         "p": None if own is None else own["p_value"],
-        "seconds": time.monotonic() - start,
+        "seconds": seconds,
     }  # fmt: skip
-    for who, what, one in (("asked", asked, report), ("nearest", first, nearest)):
+    for who, what, one in (("asked", asked, report), ("nearest", first, nearest or report)):
         names = [effect["name"] for effect in one["effects"]]
         row[f"{who}_verdict"] = one["verdict"]
         row[f"{who}_names"] = names

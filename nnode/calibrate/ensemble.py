@@ -8,43 +8,28 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import Convention, sequence_costs
-from nnode.data.sequence import Batch
+from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.problem import Problem
 from nnode.models.system import System
 from nnode.models.term import Interval
-from nnode.solvers.fused.engine import FusedSolver
 
 
-class EnsembleCost:
+class EnsembleCost(Problem):
     """Cost of R runs of a model on one batch, each run with parameters of its own.
 
     A run is a row of K numbers: all parameters that are calibrated, one after the other.
     Rows are in float64 whatever the precision of the simulation.
-
-    Args:
-        system: the model; it is not changed. Parameters that need no gradient stay its own.
-        batch: the sequences, in the precision of the system.
-        solver: its step and threads.
-        convention: see :class:`nnode.calibrate.cost.Convention`.
 
     Attributes:
         names: parameters by their names in ``system.named_parameters()``.
         low, high: ``(K,)`` admissible set, from the model's terms; infinite where it is open.
     """
 
-    def __init__(
-        self,
-        system: System,
-        batch: Batch,
-        solver: FusedSolver,
-        convention: Convention = Convention.integral,
-    ) -> None:
-        self.system, self.batch, self.solver = system, batch, solver
-        self.convention = convention
-        self._own = {name: p for name, p in system.named_parameters() if p.requires_grad}
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.names = list(self._own)
         self._sizes = [p.numel() for p in self._own.values()]
-        limits = system.bounds()
+        limits = self.system.bounds()
         free = Interval()
         low = [limits.get(name, free).low for name in self.names]
         high = [limits.get(name, free).high for name in self.names]

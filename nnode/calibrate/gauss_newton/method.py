@@ -18,13 +18,12 @@ from torch import Tensor
 
 from nnode.calibrate.cost import FOLLOWING, Convention, changed_gap, errors, net_gaps
 from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step, damped_step
+from nnode.calibrate.problem import Problem
 from nnode.compiled import lanes
-from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, SimulationError
 from nnode.models.system import System, Traffic
 from nnode.models.term import Interval
 from nnode.solvers.base import substeps
-from nnode.solvers.fused.engine import FusedSolver
 
 #: Share of the cost below which a fall is rounding.
 _ROUNDING = 1e-14
@@ -45,14 +44,8 @@ class Curved:
     hessian: np.ndarray
 
 
-class TangentCost:
+class TangentCost(Problem):
     """Cost of every sequence of a batch with its derivatives, from one simulation.
-
-    Args:
-        system: the model; it is not changed.
-        batch: the sequences, in the precision of the system.
-        solver: its step, method and threads.
-        convention: what is minimised.
 
     Attributes:
         names: symbols of the parameters that are calibrated.
@@ -62,13 +55,11 @@ class TangentCost:
         ConfigError: the model is no formula of a lane.
     """
 
-    def __init__(
-        self,
-        system: System,
-        batch: Batch,
-        solver: FusedSolver,
-        convention: Convention = Convention.integral,
-    ) -> None:
+    system: Traffic  # of no other there is a lane's formula
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        system, batch = self.system, self.batch
         lane = lanes.supports(system, batch)
         added = [] if lane is None else list(lane.rates)[lane.order :]
         if lane is None or any(state not in lane.starts for state in added):
@@ -77,11 +68,8 @@ class TangentCost:
                 "formulas, starts of their memory as well; take another optimizer, or "
                 "nnode.calibrate.least_squares, which takes differences"
             )
-        assert isinstance(system, Traffic)
-        self.system, self.lane, self.batch = system, lane, batch
-        self.solver, self.convention = solver, convention
-        own = {name: p for name, p in system.named_parameters() if p.requires_grad}
-        self._places = {s: at for s, at in lane.owned.items() if at[0] in own}
+        self.lane = lane
+        self._places = {s: at for s, at in lane.owned.items() if at[0] in self._own}
         self.names = list(self._places)
         limits, free = system.bounds(), Interval()
         bounds = [limits.get(name, free) for name, _, _ in self._places.values()]

@@ -8,13 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton.method import Curved, TangentCost
 from nnode.calibrate.options import StartSpeeds
-from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
 
 #: First speeds: steps at most, the share of the cost below which a fall ends them, and the
 #: difference by which their derivatives are taken, m/s.
@@ -39,14 +35,9 @@ class StartSpeedCost(TangentCost):
         Golub & Pereyra 2003, variable projection; Murphy & van der Vaart 2000, profile likelihood.
     """
 
-    def __init__(
-        self,
-        system: System,
-        batch: Batch,
-        solver: FusedSolver,
-        convention: Convention = Convention.integral,
-    ) -> None:
-        super().__init__(system, replace(batch, v=batch.v.clone()), solver, convention)
+    def __post_init__(self) -> None:
+        batch = self.batch = replace(self.batch, v=self.batch.v.clone())
+        super().__post_init__()
         if self.lane.order < 2:
             raise ConfigError(
                 "trainer.start_speeds=fitted needs a law of second order: one of first order has "
