@@ -101,7 +101,8 @@ def case(seed: int, name: str) -> dict[str, Any]:
     if said.verdict != "indistinguishable" or not others:
         return found
     profile = others[0].profile
-    number = min(profile.platoons, MOST)
+    # the advice counts open platoons
+    number = min(round(profile.platoons / (1 - options.sealed)), MOST)
     found |= {"platoons": profile.platoons, "swing": profile.swing, "period": profile.period}
     for how, speeds in (
         ("advised", advised_speeds(profile, number)),

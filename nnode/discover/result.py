@@ -26,7 +26,7 @@ class Profile:
         mean, swing: the speed is mean + swing sin(2 pi t / period), m/s.
         period: s.
         lasts: s that it lasts.
-        platoons: about so many of them tell two effects apart with a probability of 90 %.
+        platoons: about so many open ones tell two effects apart with a probability of 90 %.
     """
 
     mean: float

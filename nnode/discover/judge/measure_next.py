@@ -4,8 +4,9 @@ Both calibrated models drive the same platoon behind leaders with different prof
 one of them cannot imitate of the other's paths by its own parameters, whitened as the residuals
 are, tells the two apart: d², the expected rise of the sum of squares. In n platoons the sum of
 squares of the wrong model is higher by n d² with a standard deviation of 2 d (n f)^½; f is how far
-the differences of open clusters vary beyond that. So n is 4 f (z_level + z_power)² / d², the larger
-one of both truths.
+the differences of open clusters vary beyond that. So n is 4 f (t_level + t_power)² / d² with
+Student's quantiles of n - 1 degrees of freedom, the larger one of both truths; sealed platoons come
+beside these.
 
 Source: Box & Hill 1967 (experiments that discriminate between models).
 """
@@ -55,7 +56,6 @@ def advised(engine: TrafficEngine, one: System, other: System, level: float) -> 
 def tried(engine: TrafficEngine, one: System, other: System, level: float) -> Iterator[Profile]:
     """Each profile with its number of platoons; those that no number would do for are left out."""
     excess = _excess(engine, one, other)
-    quantiles = float(stats.norm.ppf(1 - level) + stats.norm.ppf(POWER))
     speeds = _leaders(engine)
     low, mean, high = np.quantile(speeds, [0.0, 0.5, 1.0])
     room = min(mean - low, high - mean)
@@ -69,8 +69,17 @@ def tried(engine: TrafficEngine, one: System, other: System, level: float) -> It
                 away.append(0.0)
         least = min(away)
         if least > 0 and math.isfinite(least):
-            number = math.ceil(4 * excess * quantiles**2 / least)
-            yield Profile(float(mean), swing, period, LASTS, max(number, 2))
+            number = _platoons(4 * excess / least, level)
+            yield Profile(float(mean), swing, period, LASTS, number)
+
+
+def _platoons(ratio: float, level: float) -> int:
+    """The least n of at least ratio times the square of the sum of Student's quantiles."""
+    least = ratio * stats.norm.ppf([1 - level, POWER]).sum() ** 2
+    number = max(2, math.ceil(least))
+    while number < ratio * stats.t.ppf([1 - level, POWER], number - 1).sum() ** 2:
+        number += 1
+    return number
 
 
 def distance(

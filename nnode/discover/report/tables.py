@@ -186,7 +186,7 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
             "p": amount(other.p_value, 2),
             "what would tell them apart": other.separated_by or "–",
             "or so many open clusters": "–" if other.clusters is None else other.clusters,
-            "or platoons behind such a leader": _leader(other.profile),
+            "or open platoons behind such a leader": _leader(other.profile),
         }
         for effect in d.effects
         for other in effect.alternatives
