@@ -9,7 +9,7 @@ import pandas as pd
 
 from nnode.data.quality import KINDS
 from nnode.discover.report.files import amount, estimate, in_unit
-from nnode.discover.result import Diagnosis, Laws, NamedEffect, Profile
+from nnode.discover.result import Alternative, Diagnosis, Laws, NamedEffect
 from nnode.models.term import short_names
 from nnode.pages.page import TableBlock
 
@@ -184,9 +184,8 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
             "as good": other.name,
             "loss relative to the chosen": amount(other.loss, 4),
             "p": amount(other.p_value, 2),
-            "what would tell them apart": other.separated_by or "–",
+            "what would tell them apart": _apart(other),
             "or so many open clusters": "–" if other.clusters is None else other.clusters,
-            "or open platoons behind such a leader": _leader(other.profile),
         }
         for effect in d.effects
         for other in effect.alternatives
@@ -194,22 +193,23 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
     return _table(
         "alternatives",
         rows,
-        "Effects that explain the data nearly as well. *p*: of the hypothesis that the other is "
+        "Effects that the data do not tell from it. *p*: of the hypothesis that the other is "
         "as good. Take none of them for granted before such data are there. *open clusters*: that "
         "tell the two apart with a probability of 90 %, if the difference that was seen is the "
-        f"true one; there are {d.clusters.open}. *such a leader*: of those whose speed goes "
+        f"true one; there are {d.clusters.open}. *a leader*: of those whose speed goes "
         "up and down evenly, within measured speeds and 2 m/s², the one behind whom both "
         "calibrated models differ most beyond what their own parameters can mend.",
     )
 
 
-def _leader(profile: Profile | None) -> str:
-    if profile is None:
-        return "–"
-    return (
-        f"{profile.platoons} of {profile.lasts:g} s: {profile.mean:.0f} ± {profile.swing:.1f} m/s "
+def _apart(other: Alternative) -> str:
+    profile = other.profile
+    leader = "" if profile is None else (
+        f"{profile.platoons} platoons of {profile.lasts:g} s behind a leader who drives from "
+        f"{profile.mean - profile.swing:.0f} to {profile.mean + profile.swing:.0f} m/s and back "
         f"every {profile.period:g} s"
-    )
+    )  # fmt: skip
+    return "; ".join(part for part in (other.separated_by, leader) if part) or "–"
 
 
 def gap_table(d: Diagnosis) -> TableBlock:
