@@ -16,7 +16,7 @@ from nnode.discover.residuals.engine import Engine, row_of, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.paired import compare, heldout, there
+from nnode.discover.statistics.paired import compare, heldout, outdone, there
 from nnode.discover.statistics.profile import moved
 from nnode.discover.statistics.score import Score, Screen, traces
 from nnode.errors import SimulationError
@@ -226,11 +226,11 @@ def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: flo
 
 
 def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
-    """Whether the second candidate predicts better, on the coarser clusters of the two."""
+    """Whether the second candidate outdoes the first, on the coarser clusters of the two."""
     label = min(
         (screen.label(one.name) for one in (first, second)), key=lambda label: int(label.max())
     )
-    return compare(heldout(first.fit, label), heldout(second.fit, label))
+    return outdone(first.fit, second.fit, label)
 
 
 def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> list[Candidate]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -29,6 +30,19 @@ def there(before: Fit, after: Fit, cluster: np.ndarray) -> float:
     an extension of it, bends its predictions; see :func:`leaning`."""
     first, second = _left_out(before, cluster), _left_out(after, cluster)
     return better(leaning(first, second, cluster))
+
+
+def outdone(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
+    """Of two models neither of which extends the other: whether held-out residuals of the first
+    lean towards the second's predictions, which they do not if the first one is true.
+
+    The p-value is that of sign flips. That the costs differ significantly is a question with half
+    the standardized distance, and its null hypothesis that both are equally wrong.
+
+    Source: Davidson & MacKinnon 1981 (tests of models against rivals that they do not contain).
+    """
+    lean = leaning(_left_out(first, cluster), _left_out(second, cluster), cluster)
+    return replace(_student(lean), p_value=better(lean))
 
 
 def leaning(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
@@ -74,7 +88,10 @@ def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
     Args:
         first, second: ``(G,)`` held-out costs.
     """
-    share = gains(first, second)
+    return _student(gains(first, second))
+
+
+def _student(share: np.ndarray) -> Comparison:
     number = len(share)
     mean = float(share.mean())
     if number < 2:
