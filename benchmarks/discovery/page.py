@@ -19,7 +19,7 @@ SUBTITLE = (
     "diagnosis has ended."
 )
 _DIGITS = {"noise, m": 2, "first screen, p": 3, "final names, p": 3}
-_PACKAGES = ("torch", "numba", "numpy", "scipy")
+_PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-learn", "pysindy")
 
 
 def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int, code: str) -> list[Block]:
@@ -61,10 +61,10 @@ def blocks_of(rows: list[dict[str, Any]], seconds: float, workers: int, code: st
             TableBlock(
                 "methods",
                 methods,
-                "Percent of the same cases, and medians. The peers choose columns of the "
-                "diagnosis's own library, on its residuals and its split, and what they choose is "
-                "calibrated in the same way; effects with a number per agent are not among the "
-                "columns, and cases that hide one are left out.",
+                "Percent of the same cases, and medians. The peers are those of scikit-learn and "
+                "pysindy. They choose columns of the diagnosis's own library, on its residuals and "
+                "its split, and what they choose is calibrated in the same way; effects with a "
+                "number per agent are not among the columns, and cases that hide one are left out.",
                 digits={**dict.fromkeys(methods.columns, 0), "closure (median)": 2},
             ),
         ]

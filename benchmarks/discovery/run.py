@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import cast
 
@@ -29,7 +30,8 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     those of earlier runs of the same code too.
 
     Raises:
-        ConfigError: unknown domains, arms, variants or effects, no hash of a commit, or no case.
+        ConfigError: unknown domains, arms, variants or effects, no hash of a commit, no case, or
+            the peers' packages are not installed.
         StudyError: tasks failed.
         Interrupted: a signal asked to stop; what is done is kept.
     """
@@ -41,6 +43,8 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
         raise ConfigError(f"benchmark_discovery.workers={workers} must be at least 1")
     code = sources()
     last_of_peers = _first(options) + options.peer_seeds
+    if any(case.seed < last_of_peers for case in chosen):
+        _need_peers(options.peer_seeds)
     run_tasks(
         [
             task_of(case, case.seed < last_of_peers, options.seeds_of, options.structure)
@@ -106,6 +110,16 @@ def cases_of(options: DiscoveryBenchmarkOptions) -> list[Case]:
     if not found:
         raise ConfigError("the benchmark has no case: check its domains, arms, variants, effects")
     return found
+
+
+def _need_peers(seeds: int) -> None:
+    """Said before the first diagnosis, not after it."""
+    missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"benchmark_discovery.peer_seeds={seeds} needs {' and '.join(missing)}: install "
+            "pysindy and scikit-learn (the extra bench), or give 0 for no peers"
+        )
 
 
 def _first(options: DiscoveryBenchmarkOptions) -> int:

@@ -21,7 +21,7 @@ TERMS = {"lin": "lin", "log": "log", "sf": "social_force"}
 ERROR = "error"
 
 #: Sources on which a result depends: it does not hold when they have changed.
-_SOURCES = ("nnode/app/discover.py", "benchmarks/discovery/task.py")
+_SOURCES = ("nnode/app/discover.py", *(f"benchmarks/discovery/{n}.py" for n in ("peers", "task")))
 _FOLDERS = ("benchmarks/truths", *(
     f"nnode/{name}" for name in ("discover", "models", "data", "calibrate", "solvers")
 ))  # fmt: skip

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from benchmarks.config import DiscoveryBenchmarkConfig, DiscoveryBenchmarkOptions
 from benchmarks.discovery import criteria, level, tables
+from benchmarks.discovery import run as module
 from benchmarks.discovery.run import benchmark_discovery, cases_of
 from benchmarks.truths.arms import first_seed
 from nnode.app import discover
@@ -96,6 +97,15 @@ def test_weak_effects_and_other_noise_do_not_count_for_the_headline(tmp_path):
     rows["named"] = "relative_speed"
     shown = tables.confusion(rows.assign(hidden=rows["strength"]), "traffic")
     assert list(shown.index) == ["medium"]
+
+
+def test_peers_without_their_packages_are_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None if name == "pysindy" else name)
+    asked = {"domains": ["traffic"], "arms": ["single"], "effects": ["inertia"]}
+    with pytest.raises(ConfigError, match=r"peer_seeds=2 needs pysindy: install .* or give 0"):
+        run(tmp_path, **asked, peer_seeds=2)
+    assert not CALLS
+    assert len(run(tmp_path, **asked)) == 1
 
 
 def test_kin_comes_from_the_catalogue(tmp_path):

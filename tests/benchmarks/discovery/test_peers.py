@@ -31,11 +31,12 @@ def test_strengths_are_kept_in_their_plausible_range():
 
 @pytest.mark.slow
 def test_peers_are_scored_beside_the_diagnosis():
+    pytest.importorskip("pysindy")
     case = Case(domain="crowd", arm="single", effects=("drift",), strength="strong", n_sequences=8)
     row = diagnose_case(case.to_dict(), peers=True)
     assert not row["failure"]
     assert list(row["peers"]) == list(PEERS)
-    nothing, forward = row["peers"]["recalibration"], row["peers"]["forward_bic"]
+    nothing, ensemble = row["peers"]["recalibration"], row["peers"]["ensemble_sindy"]
     assert (nothing["named"], nothing["closure"], nothing["worse"]) == ("nothing", 0.0, False)
-    assert "drift" in forward["named"]
-    assert forward["closure"] > 0.5
+    assert "drift" in ensemble["named"]
+    assert ensemble["closure"] > 0.5
