@@ -2,11 +2,11 @@
 
 Both calibrated models drive the same platoon behind leaders with different profiles of speed. What
 one of them cannot imitate of the other's paths by its own parameters, whitened as the residuals
-are, tells the two apart: d², the expected rise of the sum of squares. In n platoons the sum of
-squares of the wrong model is higher by n d² with a standard deviation of 2 d (n f)^½; f is how far
-the differences of open clusters vary beyond that. So n is 4 f (t_level + t_power)² / d² with
-Student's quantiles of n - 1 degrees of freedom, the larger one of both truths; sealed platoons come
-beside these.
+are, tells the two apart: d², the expected rise of the sum of squares. In n platoons the residuals
+of the wrong model lean towards the true one by n d² with a standard deviation of d (n f)^½; f is
+how far open clusters vary beyond that. So n is f (t_level + t_power)² / d² with Student's quantiles
+of n - 1 degrees of freedom, the larger one of both truths, and no less than sign flips of n
+platoons need, which may outweigh all others; sealed platoons come beside these.
 
 Source: Box & Hill 1967 (experiments that discriminate between models).
 """
@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from scipy import stats
 
+from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.lanes.paths import velocity
@@ -69,14 +70,14 @@ def tried(engine: TrafficEngine, one: System, other: System, level: float) -> It
                 away.append(0.0)
         least = min(away)
         if least > 0 and math.isfinite(least):
-            number = _platoons(4 * excess / least, level)
+            number = _platoons(excess / least, level)
             yield Profile(float(mean), swing, period, LASTS, number)
 
 
 def _platoons(ratio: float, level: float) -> int:
     """The least n of at least ratio times the square of the sum of Student's quantiles."""
     least = ratio * stats.norm.ppf([1 - level, POWER]).sum() ** 2
-    number = max(2, math.ceil(least))
+    number = max(least_number(level, sided=1), math.ceil(least))
     while number < ratio * stats.t.ppf([1 - level, POWER], number - 1).sum() ** 2:
         number += 1
     return number
@@ -136,10 +137,10 @@ def _leaders(engine: TrafficEngine) -> np.ndarray:
 
 
 def _excess(engine: TrafficEngine, one: System, other: System) -> float:
-    """How far the differences of clusters' costs vary beyond those of independent residuals."""
+    """How far clusters' residuals lean beyond what independent ones do."""
     first, second = (engine.residuals(s, row_of(s)[None])[0].numpy() for s in (one, other))
-    costs = sums(first**2, engine.cluster) - sums(second**2, engine.cluster)
-    expected = 4 * float(((first - second) ** 2).sum())
-    if len(costs) < 2 or not expected > 0:
+    lean = sums(first * (first - second), engine.cluster)
+    expected = float(((first - second) ** 2).sum())
+    if len(lean) < 2 or not expected > 0:
         return 1.0
-    return max(1.0, len(costs) * float(costs.var(ddof=1)) / expected)
+    return max(1.0, len(lean) * float(lean.var(ddof=1)) / expected)

@@ -7,7 +7,9 @@ import pytest
 from scipy import stats
 
 from nnode.discover.residuals.comparison import Comparison
-from nnode.discover.statistics.paired import clusters_to_tell, compare
+from nnode.discover.residuals.fit import Fit
+from nnode.discover.statistics.paired import clusters_to_tell, compare, heldout, outdone
+from nnode.models.system import System
 
 
 def seen(mean: float, spread: float, clusters: int) -> Comparison:
@@ -47,3 +49,34 @@ def test_a_comparison_knows_its_clusters() -> None:
     found = compare(np.array([2.0, 3.0, 4.0]), np.array([1.0, 3.0, 2.0]))
     assert found.clusters == 3
     assert found.gain == pytest.approx((0.5 + 0 + 0.5) / 3)
+
+
+def rivals(rng: np.random.Generator, true: int, clusters: int = 24) -> list[Fit]:
+    """Two regressions, neither of which extends the other, on data that one of them made."""
+    cluster = np.repeat(np.arange(clusters), 20)
+    first = rng.normal(size=len(cluster))
+    columns = [first, 0.8 * first + 0.6 * rng.normal(size=len(cluster))]
+    made = 0.25 * columns[true] + rng.normal(size=len(cluster))
+    found = []
+    for one in columns:
+        column = one[:, None]
+        row = np.linalg.lstsq(column, made, rcond=None)[0]
+        rest = made - column @ row
+        found.append(Fit(System([]), ["c"], row, rest, -column, np.ones(1, dtype=bool)))
+    return found
+
+
+def test_a_wrong_rival_is_outdone_and_a_true_one_is_not() -> None:
+    rng = np.random.default_rng(5)
+    cluster = np.repeat(np.arange(24), 20)
+    rejected: dict[str, list[bool]] = {"true": [], "wrong": [], "costs": []}
+    for _ in range(400):
+        one, other = rivals(rng, true=1)
+        rejected["wrong"].append(outdone(one, other, cluster).p_value <= 0.05)
+        rejected["true"].append(outdone(other, one, cluster).p_value <= 0.05)
+        costs = compare(heldout(one, cluster), heldout(other, cluster))
+        rejected["costs"].append(costs.p_value <= 0.05)
+    share = {name: float(np.mean(one)) for name, one in rejected.items()}
+    assert share["true"] < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
+    # twice the standardized distance of a comparison of costs
+    assert share["wrong"] > 0.85 > 0.6 > share["costs"]
