@@ -15,6 +15,7 @@ class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`benchmarks.speed.run`."""
 
     # problems: paper | stress | effects | steps | tangents | crowd | crowd_effects | people | scale
+    # | diagnosis
     shapes: list[str] = field(
         default_factory=lambda: [
             "paper",
@@ -31,6 +32,8 @@ class BenchmarkOptions:
     engines: list[str] | None = None  # null times all that cover a problem
     repeats: int = 5  # timings of each, of which the median counts
     restarts: int = 16  # of the ensemble
+    # of the shape diagnosis: numbers of sequences, each diagnosed once in a process of its own
+    sequences: list[int] = field(default_factory=lambda: [20, 100, 400, 1000])
     # of the timings; agreement is checked in float64
     dtype: Precision = Precision.float32
     redraw: str | None = None  # a benchmark.json to draw, and time nothing
@@ -65,6 +68,8 @@ class DiscoveryBenchmarkOptions:
     structure: bool = True  # look for what has no name too; without, nothing is unknown
     peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
     workers: int | None = None  # processes; null: one per core
+    # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead
+    cluster: str | None = None
 
 
 @dataclass

@@ -17,6 +17,7 @@ from benchmarks.truths.arms import cases, first_seed, hides
 from nnode.errors import ConfigError
 from nnode.machine import cores
 from nnode.pages.page import write_page
+from nnode.study.cluster import on_cluster
 from nnode.study.runner import kept_results, run_tasks
 
 #: The arm that needs many cases: it shows how often something is named where nothing is hidden.
@@ -45,16 +46,17 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     last_of_peers = _first(options) + options.peer_seeds
     if any(case.seed < last_of_peers for case in chosen):
         _need_peers(options.peer_seeds)
-    run_tasks(
-        [
-            task_of(case, case.seed < last_of_peers, options.seeds_of, options.structure)
-            for case in chosen
-        ],
-        folder,
-        workers=workers,
-        fingerprint=code,
-        title="diagnoses",
-    )
+    with on_cluster(options.cluster):
+        run_tasks(
+            [
+                task_of(case, case.seed < last_of_peers, options.seeds_of, options.structure)
+                for case in chosen
+            ],
+            folder,
+            workers=workers,
+            fingerprint=code,
+            title="diagnoses",
+        )
     rows = [
         row
         for row in kept_results(folder, diagnose_case, code).values()

@@ -63,34 +63,36 @@ print(json.dumps({
 """
 
 
-def platoons(number: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def platoons(
+    number: int, seed: int = 0, vehicles: int = VEHICLES, seconds: float = SECONDS
+) -> tuple[np.ndarray, np.ndarray]:
     """Clock times ``(S, K)``, s, and places ``(S, K, N)``, m, by Euler's method."""
     rng = np.random.default_rng(seed)
-    step, samples = DT / STEPS, round(SECONDS / DT) + 1
-    time = step * np.arange(round((SECONDS + BEFORE) / step) + 1)
+    step, samples = DT / STEPS, round(seconds / DT) + 1
+    time = step * np.arange(round((seconds + BEFORE) / step) + 1)
     ends = ((0.8, 2.0), (8.0, 30.0), (0.0, 6.0))
     size, period, turn = (rng.uniform(low, high, (4, number)) for low, high in ends)
     angle = 2 * np.pi * time[:, None, None] / period + turn
     lead = 17 + (size * np.sin(angle)).sum(1)
     gap = LENGTH * V0 / (V0 - lead[0])
-    x = gap[:, None] * np.arange(VEHICLES, dtype=float)
-    push = PUSH * rng.normal(size=(number, VEHICLES - 1))
+    x = gap[:, None] * np.arange(vehicles, dtype=float)
+    push = PUSH * rng.normal(size=(number, vehicles - 1))
     keep, places = np.exp(-step / LASTS), []
     for ahead in lead:
         places.append(x.copy())
         speed = np.empty_like(x)
         speed[:, -1] = ahead
         law = V0 * (1 - LENGTH / np.diff(x, axis=1))
-        for i in range(VEHICLES - 2, -1, -1):
+        for i in range(vehicles - 2, -1, -1):
             speed[:, i] = law[:, i] + KAPPA * (speed[:, i + 1] - law[:, i]) + push[:, i]
         x = x + step * speed
         push = keep * push + PUSH * np.sqrt(1 - keep**2) * rng.normal(size=push.shape)
     seen = np.array(places)[-(samples - 1) * STEPS - 1 :: STEPS].swapaxes(0, 1)
-    clock = (SECONDS + 80) * np.arange(number)[:, None] + DT * np.arange(samples)
+    clock = (seconds + 80) * np.arange(number)[:, None] + DT * np.arange(samples)
     return clock, seen + NOISE * rng.normal(size=seen.shape)
 
 
-def diagnosis_of(checkout: Path, data: Path) -> dict[str, Any]:
+def diagnosis_of(data: Path, checkout: Path = HERE) -> dict[str, Any]:
     """What a checkout's diagnosis said, and what it took."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -109,9 +111,9 @@ def compared(sequences: int, other: Path | None, here: Path = HERE) -> dict[str,
         data = Path(folder) / "platoons.npz"
         time, x = platoons(sequences)
         np.savez(data, time=time, x=x)
-        found: dict[str, Any] = {"sequences": sequences, "here": diagnosis_of(here, data)}
+        found: dict[str, Any] = {"sequences": sequences, "here": diagnosis_of(data, here)}
         if other is not None:
-            found["other"] = diagnosis_of(other, data)
+            found["other"] = diagnosis_of(data, other)
             found["same"] = all(
                 found["here"][key] == found["other"][key] for key in ("verdict", "effects")
             )

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchmarks.speed.growth import draw_growth
 from nnode.plots.style import FONT, GREY, SMALL_FONT, curve_style, dress, new_figure
 
 #: Engines in the order of the legend: words, index of the style, and whether markers are hollow,
@@ -50,7 +51,8 @@ _PANELS = (
 
 
 def performance_figure(results: dict[str, Any]) -> Figure | None:
-    """Time of one gradient against the number of steps and against the number of people.
+    """Time of one gradient against the number of steps and against the number of people; time and
+    memory of a diagnosis against the number of sequences.
 
     Points are medians, bars reach from the fastest to the slowest repeat, both axes are
     logarithmic. The thin grey line is proportional to the number on the horizontal axis.
@@ -66,19 +68,24 @@ def performance_figure(results: dict[str, Any]) -> Figure | None:
         rows = [row for row in results["problems"] if row["shape"] in panel.shapes]
         if len({row[panel.key] for row in rows}) > 1:
             panels.append((panel, sorted(rows, key=lambda row: row[panel.key])))
-    if not panels:
+    grown = [row for row in results["problems"] if row["shape"] == "diagnosis"]
+    number = len(panels) + (len(grown) > 1)
+    if not number:
         return None
-    figure = new_figure(3.4 * len(panels) + 2.3, 3.7)
+    figure = new_figure(3.4 * number + 2.3 * bool(panels), 3.7)
     shown: set[str] = set()
     for i, (panel, rows) in enumerate(panels):
-        shown |= _draw(figure.add_subplot(1, len(panels), i + 1), panel, rows)
+        shown |= _draw(figure.add_subplot(1, number, i + 1), panel, rows)
+    if len(grown) > 1:
+        draw_growth(figure.add_subplot(1, number, number), grown)
     names = [name for name in LOOKS if name in shown] + sorted(shown - set(LOOKS))
     handles = [Line2D([], [], label=_label(name), **_style(name)) for name in names]
     handles.append(Line2D([], [], color=GREY, linewidth=0.7, label="slope 1"))
-    figure.legend(
-        handles=handles, loc="outside right center", fontsize=SMALL_FONT, frameon=False,
-        handlelength=3.2,
-    )  # fmt: skip
+    if panels:
+        figure.legend(
+            handles=handles, loc="outside right center", fontsize=SMALL_FONT, frameon=False,
+            handlelength=3.2,
+        )  # fmt: skip
     machine = results["machine"]
     figure.suptitle(f"{machine['processor']}, {results['dtype']}", fontsize=FONT)
     return figure

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from benchmarks.speed.engines import ENGINES, Call, Engine, torch_call
 from benchmarks.speed.figure import performance_figure
 from benchmarks.speed.floor import evaluations, floor_call
+from benchmarks.speed.growth import diagnosed, print_growth
 from benchmarks.speed.memory import peak_memory
 from benchmarks.speed.problems import SHAPES, Problem, pose
 from benchmarks.speed.report import per_person, print_per_person, print_problem, print_tangents
@@ -33,6 +34,8 @@ PACKAGES = ("torch", "torchdiffeq", "numba", "numpy", "jax", "diffrax")
 
 #: A measurement repeats its call for at least so long, s.
 _LEAST = 0.05
+#: The shape that times whole diagnoses, and no engine.
+_DIAGNOSIS = "diagnosis"
 #: Name of the arithmetic alone among the calls that are timed.
 _FLOOR = "floor"
 
@@ -41,7 +44,8 @@ def benchmark(config: DictConfig, folder: Path) -> None:
     """Time the engines, print tables, and write ``benchmark.json`` and ``benchmark.png``.
 
     The results are written again after every problem. The figure needs two problems that differ
-    in the number of steps, or of people. With ``redraw`` nothing is timed.
+    in the number of steps, of people, or of sequences that are diagnosed. With
+    ``redraw`` nothing is timed.
 
     Raises:
         ConfigError: unknown shapes or engines, no repeat, or results that cannot be drawn.
@@ -53,7 +57,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
         _redraw(Path(options.redraw), folder)
         return
     for name, chosen, known in (
-        ("shapes", options.shapes, SHAPES),
+        ("shapes", options.shapes, [*SHAPES, _DIAGNOSIS]),
         ("engines", options.engines or [], ENGINES),
     ):
         wrong = [item for item in chosen if item not in known]
@@ -61,8 +65,9 @@ def benchmark(config: DictConfig, folder: Path) -> None:
             raise ConfigError(
                 f"benchmark.{name} has {', '.join(wrong)}, expected some of {', '.join(known)}"
             )
-    for name in ("repeats", "restarts"):
-        if options[name] < 1:
+    for name in ("repeats", "restarts", "sequences"):
+        least = min(options[name], default=1) if name == "sequences" else options[name]
+        if least < 1:
             raise ConfigError(f"benchmark.{name}={options[name]} must be at least 1")
     # one thread for all; fused_2 brings its own second one
     torch.set_num_threads(1)
@@ -75,7 +80,10 @@ def benchmark(config: DictConfig, folder: Path) -> None:
         "scale": per_person(found),
     }
     for name in options.shapes:
-        for shape in SHAPES[name]:
+        for number in options.sequences if name == _DIAGNOSIS else []:
+            found.append(diagnosed(number))
+            write_json(folder / "benchmark.json", results)
+        for shape in SHAPES.get(name, []):
             for model in shape.models:
                 problem = pose(shape, model, dtype)
                 if name == "tangents":
@@ -99,6 +107,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                 write_json(folder / "benchmark.json", results)
     print_tangents([row for row in found if row["shape"] == "tangents"])
     print_per_person(results["scale"])
+    print_growth([row for row in found if row["shape"] == _DIAGNOSIS])
     print(f"results: {folder / 'benchmark.json'}")
     _draw(results, folder)
 
@@ -123,7 +132,7 @@ def _redraw(path: Path, folder: Path) -> None:
     if not drawn:
         raise ConfigError(
             f"benchmark.redraw={path} has nothing to draw; expected at least two problems of the "
-            "shape steps, or of people and scale"
+            "shape steps, of people and scale, or of diagnosis"
         )
 
 

@@ -15,6 +15,7 @@ from nnode.calibrate.interrupt import BreakingGuard, Interrupted
 from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Provenance, write_page
+from nnode.study.cluster import on_cluster
 from nnode.study.options import StudyOptions
 from nnode.study.runner import KEPT
 
@@ -73,7 +74,8 @@ def study(config: DictConfig, folder: Path) -> None:
     with BreakingGuard() as guard:
         try:
             module = cast(Study, import_module(STUDIES[options.name]))
-            blocks = module.run(options, folder)
+            with on_cluster(options.cluster):
+                blocks = module.run(options, folder)
             made = _made(time.monotonic() - start, options.workers, before)
             paths = write_page(
                 [*blocks, made],

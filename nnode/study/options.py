@@ -16,6 +16,8 @@ class StudyOptions:
     download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
     quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
     workers: int | None = None  # processes; null: one per core
+    # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead
+    cluster: str | None = None
     seed: int = 0  # of start parameters and of resampling
 
 

@@ -24,6 +24,7 @@ from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.data.store import Store
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
+from nnode.study.cluster import calls_by_joblib, elsewhere
 from nnode.study.progress import TaskProgress
 from nnode.study.workers import Call, Outcome, calls_here, calls_in_processes
 from nnode.version import VERSION
@@ -97,7 +98,9 @@ def run_tasks(
     Args:
         tasks: independent of each other.
         folder: of the study.
-        workers: number of processes, each with one thread; 1 works in this process.
+        workers: number of processes, each with one thread; 1 works in this process. A backend of
+            joblib that reaches beyond this machine takes their place, see
+            :mod:`nnode.study.cluster`.
         fingerprint: of all that the tasks read beside their arguments, such as the data's hash.
         title: of the progress shown.
 
@@ -124,6 +127,8 @@ def run_tasks(
 
     def outcomes(guard: InterruptGuard) -> Generator[tuple[str, Outcome], None, None]:
         calls = [(task.key, task.call()) for task in missing]
+        if elsewhere():
+            return calls_by_joblib(calls, guard, progress.tick)
         if workers == 1:
             return calls_here(calls, guard)
         return calls_in_processes(calls, workers, guard, progress.tick)

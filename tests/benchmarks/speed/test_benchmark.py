@@ -210,6 +210,7 @@ def test_jax(law: str, arrangement: str) -> None:
         ({"engines": ["warp"]}, "benchmark.engines has warp"),
         ({"repeats": 0}, "benchmark.repeats=0"),
         ({"restarts": 0}, "benchmark.restarts=0"),
+        ({"sequences": [20, 0]}, "benchmark.sequences"),
     ],
 )
 def test_refusals(changes, message, tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -28,7 +28,7 @@ def test_a_checkout_is_timed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) 
 
 def test_a_checkout_that_fails_says_why(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="No such file"):
-        diagnosis.diagnosis_of(diagnosis.HERE, tmp_path / "nothing.npz")
+        diagnosis.diagnosis_of(tmp_path / "nothing.npz")
 
 
 @pytest.mark.parametrize(("name", "code"), [("inertia", 0), ("time_gap", 1)])
@@ -39,7 +39,7 @@ def test_another_verdict_is_said(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    def stand_in(checkout: Path, data: Path) -> dict[str, Any]:
+    def stand_in(data: Path, checkout: Path) -> dict[str, Any]:
         return {**FOUND, "effects": [name if checkout == tmp_path else "inertia"]}
 
     monkeypatch.setattr(diagnosis, "diagnosis_of", stand_in)

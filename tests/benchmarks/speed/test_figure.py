@@ -104,3 +104,16 @@ def test_all_engines_differ_in_grey() -> None:
         line = _line(ax, name)
         looks.add((line.get_marker(), line.get_markerfacecolor() == "none"))
     assert len(looks) == len(LOOKS)
+
+
+def test_a_diagnosis_over_sequences() -> None:
+    rows = [
+        {"shape": "diagnosis", "sequences": n, "wall_s": 0.2 * n, "peak_memory_MB": 500.0 + n}
+        for n in (20, 100, 1000)
+    ]
+    (ax,) = _figure(*rows).axes
+    np.testing.assert_allclose(_line(ax, "wall_s").get_ydata(), [4, 20, 200])
+    np.testing.assert_allclose(_line(ax, "peak_memory_MB").get_ydata(), [0.52, 0.6, 1.5])
+    assert [*_figure(*rows, *STEPS).axes[0].get_xlim()] != [*ax.get_xlim()]
+    assert len(_figure(*rows, *STEPS).axes) == 2
+    assert _figure(rows[0]) is None
