@@ -25,6 +25,8 @@ from benchmarks.open_world.answers import Answer, diagnosed
 SEQUENCES, GROUP, STEP, SAMPLE, WARM, SECONDS = 24, 5, 0.01, 0.1, 2.0, 5.0
 #: Half the width of the room and of a corridor, and how far the goals are, m.
 ROOM, HALF, GOAL = 30.0, 1.6, 60.0
+#: Half the width of a door, m.
+DOOR = 1.3
 #: Errors of measured places, m.
 ERROR = (0.005, 0.02)
 
@@ -69,6 +71,7 @@ class Scene:
         answer: what is right to say.
         corridor: walls near the groups; ``known``: they are measured, and the model has none.
         pillar: radius of a pillar in the middle, which nobody measured, m.
+        door: both groups go through one in a wall across the room, which nobody measured.
         speeds: of the two groups, desired, m/s.
     """
 
@@ -77,6 +80,7 @@ class Scene:
     corridor: bool = False
     known: bool = False
     pillar: float = 0.0
+    door: bool = False
     speeds: tuple[float, float] = (1.3, 1.3)
 
 
@@ -99,6 +103,9 @@ SCENES: dict[str, Scene] = {
     "sf_pillar": Scene(_social, replace(_OTHER, right=("obstacle",)), pillar=0.4),
     "sf_speeds": Scene(_social, _OTHER, speeds=(1.0, 1.6)),
     "gcfm_pillar": Scene(_centrifugal, replace(_FORESEEN, right=("obstacle",)), pillar=0.4),
+    # its two ends push like small obstacles; who meets nobody there does not show them
+    "sf_door": Scene(_social, replace(_OTHER, allowed=(*_RANGE, "obstacle")), door=True),
+    "cfsm_door": Scene(_free, replace(_SEEN, allowed=(*_VIEW, "obstacle")), door=True),
 }  # fmt: skip
 
 
@@ -119,6 +126,9 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     room = shapely.box(-1.5 * GOAL, -half, 1.5 * GOAL, half)
     if scene.pillar:
         room = room.difference(shapely.Point(0, 0).buffer(scene.pillar, quad_segs=4))
+    if scene.door:
+        wall = shapely.box(-0.15, -half, 0.15, half)
+        room = room.difference(wall.difference(shapely.box(-1.0, -DOOR, 1.0, DOOR)))
     error = rng.uniform(*ERROR)
     rows: list[pd.DataFrame] = []
     with TemporaryDirectory() as place:

@@ -61,6 +61,11 @@ class Scene:
         period: the limit falls for some seconds, everywhere.
         more: attributes that are drawn besides: of all, or of each vehicle.
         trucks: share of vehicles that are longer and keep a longer time gap.
+        limit: the speed that is allowed on all roads, of which drivers take a factor, m/s.
+        deviation: standard deviation of that factor.
+        red: a light at the stretch's beginning turns red for some seconds; leaders drive on.
+        drop: a second lane ends with the stretch, and a car that nobody recorded comes over
+            between the second and the third vehicle.
     """
 
     follow: str
@@ -71,10 +76,16 @@ class Scene:
     more: dict[str, tuple[float, float]] = field(default_factory=dict)
     each: dict[str, tuple[float, float]] = field(default_factory=dict)
     trucks: float = 0.0
+    limit: tuple[float, float] = (FREE, FREE)
+    deviation: float = 0.0
+    red: bool = False
+    drop: bool = False
 
 
 _LATE = ("reaction_delay", "inertia")
 _SOON = Answer(right=_LATE, unknown=True)
+_ELSEWHERE = Answer(allowed=("speed_zone", "speed_period"), unknown=True)
+_UNSEEN = Answer(allowed=("speed_zone",), unknown=True)
 IDM, KRAUSS = partial(Scene, "IDM", _idm), partial(Scene, "Krauss", _krauss)
 
 
@@ -95,6 +106,15 @@ SCENES: dict[str, Scene] = {
     "idm_trucks": IDM(_says("idm", "vehicle_class"), trucks=0.4),
     "idm_drivers": IDM(_says("idm", "driver_heterogeneity"), each={"tau": (0.7, 2.2)}),
     "krauss_dawdling": KRAUSS(more={"sigma": (0.3, 0.7)}),
+    # who is held up by a leader hardly shows how fast he would like to drive: silence is right
+    "krauss_factors": KRAUSS(
+        Answer(allowed=("driver_heterogeneity",)), limit=(17.0, 20.0), deviation=0.15
+    ),
+    # a stop at one place and time, and cars that nobody measured, are in no catalogue
+    "idm_light": IDM(_ELSEWHERE, red=True),
+    "krauss_light": KRAUSS(_ELSEWHERE, red=True),
+    "idm_lane_drop": IDM(_UNSEEN, drop=True),
+    "krauss_lane_drop": KRAUSS(_UNSEEN, drop=True),
 }
 
 
@@ -123,16 +143,25 @@ def _written(
 ) -> list[str]:
     """Write the roads and the traffic; returns how SUMO is started."""
     ends = {"a": 0.0, "b": STRETCH[0], "c": STRETCH[1], "d": ROAD}
-    limit = rng.uniform(*LIMIT) if scene.stretch else FREE
-    nodes, edges, cars = [], [], []
+    allowed = rng.uniform(*scene.limit)
+    limit = rng.uniform(*LIMIT) if scene.stretch else allowed
+    nodes, edges, cars, goes_on = [], [], [], []
     for k in range(ROADS):
-        nodes += [f'<node id="{n}{k}" x="{x:g}" y="{50 * k}"/>' for n, x in ends.items()]
+        for n, x in ends.items():
+            light = ' type="traffic_light"' if scene.red and n == "b" else ""
+            nodes.append(f'<node id="{n}{k}" x="{x:g}" y="{50 * k}" radius="0"{light}/>')
         for one, two in ("ab", "bc", "cd"):
-            speed = limit if one == "b" else FREE
+            speed = limit if one == "b" else allowed
+            lanes = 2 if scene.drop and one != "c" else 1
             edges.append(
-                f'<edge id="{one}{k}" from="{one}{k}" to="{two}{k}" numLanes="1" speed="{speed}"/>'
+                f'<edge id="{one}{k}" from="{one}{k}" to="{two}{k}" numLanes="{lanes}" '
+                f'speed="{speed}"/>'
             )
-        x = rng.uniform(320.0, 720.0)
+            for lane in range(lanes if one == "a" else 1 if one == "b" else 0):
+                goes_on.append(
+                    f'<connection from="{one}{k}" to="{two}{k}" fromLane="{lane}" toLane="{lane}"/>'
+                )
+        x = rng.uniform(320.0, 720.0) + 200.0 * scene.drop
         for i in range(CARS):
             truck = i > 0 and scene.trucks > 0 and rng.random() < scene.trucks
             own = {**values, **{key: rng.uniform(*ends) for key, ends in scene.each.items()}}
@@ -145,18 +174,23 @@ def _written(
             model = (
                 f'carFollowModel="{scene.follow}" {text}' if i else f'decel="{own["decel"]:.9g}"'
             )
-            cars.append(
-                f'<vType id="{kind}.{k}-{i}" length="{length}" speedFactor="1" speedDev="0" '
-                f'{model}/><vehicle id="{k}-{i}" type="{kind}.{k}-{i}" depart="0" '
-                f'departPos="{x:.3f}" departSpeed="12" insertionChecks="none">'
-                f'<route edges="a{k} b{k} c{k}"/></vehicle>'
-            )
+            beside = [(f"unseen-{k}", 1)] if scene.drop and i == 2 else []
+            for name, lane in ((f"{k}-{i}", 0), *beside):
+                cars.append(
+                    f'<vType id="{kind}.{name}" length="{length}" speedFactor="1" '
+                    f'speedDev="{scene.deviation:g}" {model}/><vehicle id="{name}" '
+                    f'type="{kind}.{name}" depart="0" departPos="{x + 9 * lane:.3f}" '
+                    f'departSpeed="12" departLane="{lane}" insertionChecks="none">'
+                    f'<route edges="a{k} b{k} c{k}"/></vehicle>'
+                )
             x -= length + 2.5 + 12 * rng.uniform(1.0, 1.8)
     (folder / "a.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
     (folder / "a.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
+    (folder / "a.con.xml").write_text(f"<connections>{''.join(goes_on)}</connections>")
     (folder / "a.rou.xml").write_text(f"<routes>{''.join(cars)}</routes>")
     made = [home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-            "-o", folder / "a.net.xml", "--no-internal-links"]  # fmt: skip
+            "-x", folder / "a.con.xml", "-o", folder / "a.net.xml", "--no-internal-links",
+            "--junctions.minimal-shape"]  # fmt: skip
     subprocess.run([str(part) for part in made], check=True, capture_output=True)
     return [str(part) for part in (
         home / "bin" / "sumo", "-n", folder / "a.net.xml", "-r", folder / "a.rou.xml",
@@ -182,6 +216,9 @@ def _simulated(command: list[str], home: Path, scene: Scene, rng: np.random.Gene
         traci.simulationStep()
         for k in range(ROADS):
             traci.vehicle.setSpeedMode(f"{k}-0", 0)
+        for name in traci.vehicle.getIDList() if scene.drop else []:
+            if not name.startswith("unseen"):
+                traci.vehicle.setLaneChangeMode(name, 0)
         for step in range(steps):
             for k in range(ROADS):
                 traci.vehicle.setSpeed(f"{k}-0", float(speeds[k, step]))
@@ -189,6 +226,9 @@ def _simulated(command: list[str], home: Path, scene: Scene, rng: np.random.Gene
                 limit = slow if step == round(begin / STEP) else FREE
                 for name in traci.edge.getIDList():
                     traci.edge.setMaxSpeed(name, limit)
+            for name in traci.trafficlight.getIDList() if scene.red else []:
+                red = begin <= step * STEP < begin + 8
+                traci.trafficlight.setRedYellowGreenState(name, "r" if red else "G")
             traci.simulationStep()
     finally:
         traci.close()
@@ -209,7 +249,10 @@ def _read(path: Path) -> pd.DataFrame:
             continue
         at = round(float(step.attrib["time"]), 3)
         if at >= WARM and round(at / STEP) % EVERY == 0:
-            rows += [(v.get("id"), v.get("type"), at, float(v.get("x", "nan"))) for v in step]
+            rows += [
+                (v.get("id"), v.get("type"), at, float(v.get("x", "nan")))
+                for v in step if not v.get("id", "").startswith("unseen")
+            ]  # fmt: skip
         step.clear()
     table = pd.DataFrame(rows, columns=["agent", "type", "time", "x"])
     kind = table.pop("type").str.partition(".")[0]

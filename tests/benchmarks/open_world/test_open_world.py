@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
 from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.answers import Answer
 from benchmarks.open_world.page import by_law, criteria, scene_criteria, share, write
@@ -124,3 +127,38 @@ def test_shares_have_exact_intervals() -> None:
     # Clopper and Pearson 1934: 0 of 10 leaves up to 1 - 0.025^(1/10)
     assert share(0, 10) == f"0 of 10 (0 %, 0–{100 * (1 - 0.025**0.1):.0f} %)"
     assert share(0, 0) == "–"
+
+
+@pytest.mark.parametrize("name", ["krauss_light", "krauss_lane_drop", "krauss_factors"])
+def test_sumo_drives_a_scene(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sumo")
+    monkeypatch.setattr(by_sumo, "ROADS", 6)
+    table = by_sumo.recorded(name, 5)
+    assert table["agent"].nunique() == 6 * by_sumo.CARS
+    found = table.pivot_table(index="time", columns=["sequence", "agent"], values="x")
+    speed = np.diff(found.to_numpy(), axis=0) / (by_sumo.STEP * by_sumo.EVERY)
+    assert np.isfinite(speed).all()
+    assert speed.max() < 40  # no jumps at nodes of the roads
+    same = by_sumo.recorded(name, 5)
+    np.testing.assert_array_equal(same["x"], table["x"])
+
+
+def test_who_comes_behind_waits_at_a_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sumo")
+    monkeypatch.setattr(by_sumo, "ROADS", 12)
+    table = by_sumo.recorded("idm_light", 555000)
+    found = table.pivot_table(index="time", columns="agent", values="x").to_numpy()
+    still = np.abs(found[25:] - found[:-25]).min(0) < 2.0  # in 5 s, with errors of measurement
+    assert still.any()
+    assert (found[:, still].min(0) < by_sumo.STRETCH[0]).all()
+
+
+@pytest.mark.parametrize("name", ["sf_door", "cfsm_door"])
+def test_people_go_through_a_door(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("jupedsim")
+    monkeypatch.setattr(by_jupedsim, "SEQUENCES", 2)
+    table, walls = by_jupedsim.recorded(name, 5)
+    assert walls is None
+    near = table[table["x"].abs() < 0.1]
+    assert len(near)
+    assert near["y"].abs().max() < by_jupedsim.DOOR + 0.1
