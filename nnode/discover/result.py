@@ -43,10 +43,11 @@ class Alternative:
     Attributes:
         name: of the effect.
         loss: its held-out cost over that of the effect that was chosen.
-        p_value: of the hypothesis that it is as good.
+        p_value: of the hypothesis that it is the true one: held-out residuals with it do not lean
+            towards the model with the effect that was chosen.
         separated_by: data that would tell the two apart.
         clusters: about how many open clusters like these would tell them apart with a probability
-            of 90 %, if the difference that was seen is the true one; None where no number would.
+            of 90 %, if they lean as these do; None where no number would.
         profile: of a leader behind whom the fewest platoons tell them apart; of lanes.
     """
 
@@ -69,7 +70,7 @@ class NamedEffect:
         alternatives: effects that the data cannot tell from it.
         p_value: of its score, with regard to all effects that were looked for.
         gain: held-out share of the whitened cost that it removed when it was added.
-        confirmed: one-sided p-value that sealed clusters are predicted better with it.
+        confirmed: one-sided p-value that sealed clusters do not lean its way.
     """
 
     name: str

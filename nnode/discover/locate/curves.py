@@ -30,7 +30,7 @@ MOST = 6
 #: A share of the knowledge of a height that is none, but for rounding.
 UNKNOWN = 1e-9
 #: Waves that are looked at together.
-WAVES = 64
+WAVES = 16
 
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
@@ -89,6 +89,9 @@ class _Look:
             self._look_for_waves()
         else:
             self._look_for_curves()
+        # all variables' columns at once would fill the memory
+        self.grams = grams(self.z, engine.cluster)
+        del self.z
 
     def _looked(self, variable: Variable) -> tuple[np.ndarray, np.ndarray]:
         """Columns of a variable's weights, and their sums ``(F, M)`` under sign flips."""
@@ -99,7 +102,7 @@ class _Look:
 
     def _settle(self, columns: np.ndarray) -> None:
         """Keep what is said of the weights with these columns."""
-        self.parts = sums(self.z * self.fit.residual[:, None], self.engine.cluster)
+        self.parts = sums(self.z, self.engine.cluster, self.fit.residual)
         self.absorbed = np.linalg.lstsq(self.fit.jacobian, columns, rcond=1e-9)[0]
 
     def _look_for_curves(self) -> None:
@@ -151,8 +154,8 @@ class _Look:
         """
         label = self.engine.cluster
         plain = sums(self.fit.residual**2, label)
-        count, number = len(plain), self.z.shape[1]
-        gram, score = grams(self.z, label), -self.parts
+        count, number = len(plain), self.grams.shape[1]
+        gram, score = self.grams, -self.parts
         whole, total = gram.sum(0), score.sum(0)
         change, penalty = np.full(count, np.inf), self.penalties[0]
         for tried in self.penalties:

@@ -90,8 +90,8 @@ class Fit:
         kept = size > COLLINEAR * size[0]
         basis, back = basis[:, kept], (turn[kept] / size[kept, None] / scale).T
         found = []
-        for s in range(int(cluster.max()) + 1):
-            part, residual = basis[cluster == s], self.residual[cluster == s]
+        for rows in members(cluster):
+            part, residual = basis[rows], self.residual[rows]
             known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
             # at the minimum the gradient of the others is minus that of this cluster
             found.append((known, back @ vector, vector.T @ (part.T @ residual)))
@@ -133,22 +133,25 @@ def _moved(parts: list[_Others], least: float) -> np.ndarray:
     )
 
 
-def sums(values: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1."""
+def sums(values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+    """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1, each
+    times its ``weight`` ``(n,)``."""
     number, count = int(label.max()) + 1, len(label)
-    member = csr_array((np.ones(count), (label, np.arange(count))), (number, count))
+    weight = np.ones(count) if weight is None else weight
+    member = csr_array((weight, (label, np.arange(count))), (number, count))
     found: np.ndarray = member @ values
     return found
 
 
+def members(label: np.ndarray) -> list[np.ndarray]:
+    """The rows of each label 0 ... G - 1, in their order."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(label))[:-1])
+
+
 def grams(z: np.ndarray, label: np.ndarray) -> np.ndarray:
     """``(G, k, k)`` products of the columns ``(n, k)`` with each other over each label's rows."""
-    found = np.zeros((int(label.max()) + 1, z.shape[1], z.shape[1]))
-    order = np.argsort(label, kind="stable")
-    ends = np.flatnonzero(np.diff(label[order])) + 1
-    for rows in np.split(order, ends):
-        found[label[rows[0]]] = z[rows].T @ z[rows]
-    return found
+    return np.stack([z[rows].T @ z[rows] for rows in members(label)])
 
 
 def limits(system: System) -> tuple[np.ndarray, np.ndarray]:

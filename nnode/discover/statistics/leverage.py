@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nnode.discover.residuals.fit import grams
+from nnode.discover.residuals.fit import grams, members
 
 
 def blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -16,8 +16,7 @@ def blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.n
     found = residual.copy()
     if not basis.shape[1]:
         return found
-    for own, gram in enumerate(grams(basis, label)):
-        part = label == own
+    for part, gram in zip(members(label), grams(basis, label), strict=True):
         size, turn = np.linalg.eigh(gram)
         known = (size > 1e-12) & (size < 1 - 1e-6)
         size, turn = size[known], turn[:, known]

@@ -165,7 +165,7 @@ class Screen:
         if own not in self._blown:
             self._blown[own] = blown_up(self.residual, self._basis, label), label
         raw = z.T @ self.residual
-        found, size = sums(z * self._blown[own][0][:, None], label), sums(z**2, label)
+        found, size = sums(z, label, self._blown[own][0]), sums(z**2, label)
         share = size / np.maximum(size.sum(0), 1e-300)
         spread: np.ndarray = found + (raw - found.sum(0)) * share
         return spread
