@@ -82,6 +82,7 @@ def difference(a: Path, b: Path) -> float:
     return max(float((first.model[k] - second.model[k]).abs().max()) for k in first.model)
 
 
+@pytest.mark.thorough  # as tests of the trainer do with fewer commands
 def test_two_processes_train_as_one(alone: Path, prepared: str, tmp_path: Path) -> None:
     run, temporary = tmp_path / "run", tmp_path / "tmp"
     process = start(*PROBLEM, prepared, f"hydra.run.dir={run}", temporary=temporary)

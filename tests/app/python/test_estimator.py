@@ -52,7 +52,11 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
     ("given", "options"),
     [
         ({"model": "idm"}, ["model=idm"]),
-        ({"model": "helly", "pooling": "shrunk"}, ["model=helly", "trainer.pooling=shrunk"]),
+        pytest.param(
+            {"model": "helly", "pooling": "shrunk"},
+            ["model=helly", "trainer.pooling=shrunk"],
+            marks=pytest.mark.thorough,
+        ),
         (
             {"model": "lin", "optimizer": "adadelta", "solver": "torchdiffeq", "epochs": 2,
              "dt": 0.05, "effects": ["relative_speed"]},

@@ -105,8 +105,8 @@ def test_states_and_gradient(name: str, people: list[Sequence]) -> None:
         check(model, batch, FusedSolver(DT, threads))
 
 
-# each precision is compiled for
-@pytest.mark.parametrize("name", ["sf", pytest.param("nn", marks=pytest.mark.thorough)])
+@pytest.mark.thorough  # each precision is compiled for
+@pytest.mark.parametrize("name", ["sf", "nn"])
 def test_single_precision(name: str, people: list[Sequence]) -> None:
     batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)

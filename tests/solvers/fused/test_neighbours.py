@@ -154,6 +154,7 @@ def test_the_bound_of_a_given_distance(cutoff: float) -> None:
     assert 0 < away < math.exp((0.5 - cutoff) / decay) * A / mass
 
 
+@pytest.mark.thorough  # compiled for
 def test_no_error_is_everybody() -> None:
     batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0)])
