@@ -79,7 +79,10 @@ class Anticipation(ForceEffect):
             "more_y": ("N", "force_y(dx=dx + T_a*dvx, dy=dy + T_a*dvy) - force_y"),
         },
     )
-    source = "Zanlungo, Ikeda & Kanda 2011 (positions at a later time)"
+    source = (
+        "a fixed time: Johansson, Helbing & Shukla 2007; positions then: Zanlungo, Ikeda & Kanda "
+        "2011"
+    )
     of_laws = True
     strengths = {"T_a": Strength(0.0, 0.1, Interval(-0.5, 2.0), "s", usual=0.2)}
     separated_by = "approaches at different speeds that come equally near"

@@ -124,7 +124,10 @@ class DensitySlowdown(PairEffect):
         others={"density": ("1/m²", f"exp(-d**2/(2*h**2))/({2 * math.pi!r}*h**2)")},
         constants={"h": (1.0, "m")},
     )
-    source = "Weidmann 1993; density: Helbing, Johansson & Al-Abideen 2007"
+    source = (
+        "a drag that grows with density; that of Helbing, Johansson & Al-Abideen 2007, not "
+        "Weidmann's relation"
+    )
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.05, 5.0), "m²/s", usual=0.1)}
     kin = "speed"
     separated_by = "the same people at different densities"

@@ -39,7 +39,7 @@ class RelativeSpeed(Effect):
     formula = "W + kappa (ẋ_{i+1} - W)"
     rule = Rule(rate="W + kappa*(dx_1 - W)")
     second = Rule(rate="W - kappa*dv/per", constants=_PER)
-    source = "full velocity difference: Jiang, Wu & Zhu 2001"
+    source = "first-order analogue of the full velocity difference of Jiang, Wu & Zhu 2001"
     of_laws = True
     strengths = {"kappa": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2)}
     rank = 50
@@ -58,7 +58,7 @@ class AsymmetricResponse(Effect):
     formula = "W + kappa_open (ẋ_{i+1} - W)+ - kappa_close (W - ẋ_{i+1})+"
     rule = Rule(rate="W + kappa_open*max(dx_1 - W, 0) + kappa_close*min(dx_1 - W, 0)")
     second = Rule(rate="W + (kappa_open*max(-dv, 0) + kappa_close*min(-dv, 0))/per", constants=_PER)
-    source = "Gong, Liu & Wang 2008"
+    source = "first-order analogue of Gong, Liu & Wang 2008"
     of_laws = True
     strengths = {
         "kappa_open": Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", usual=0.2),

@@ -121,7 +121,7 @@ class SpeedZone(Effect):
         constants={"edge": (EDGE["m"], "m")},
     )
     second = replace(rule, rate=_SLOWER)
-    source = "variable speed limits: Hegyi, De Schutter & Hellendoorn 2005"
+    source = "a factor on all speeds; limits, which cap them: Hegyi, De Schutter & Hellendoorn 2005"
     strengths = {"alpha": _FACTOR}
     settings = {"a": Setting(0.0, Interval(), "m"), "b": Setting(100.0, Interval(), "m")}
     rank = 10
@@ -299,7 +299,9 @@ class MultiAnticipation(Effect):
     second = Rule(
         rate="choose(second, W + c*(law(gap=(gap + gap_1)/2, dv=v - v_2, v_1=v_2) - law()), W)"
     )
-    source = "Lenz, Wagner & Sollacher 1999"
+    source = (
+        "after Lenz, Wagner & Sollacher 1999, whose drivers react to mean gaps of j vehicles ahead"
+    )
     strengths = {"c": Strength(0.0, 0.05, Interval(-1.0, 1.0), "1", usual=0.2)}
     rank = 30
     kin = "reaction to the vehicle ahead"
@@ -369,7 +371,9 @@ class TimeGap(Effect):
         rate="W + law(gap=gap*L/max(L + h*dx_1, least)) - law()",
         constants={"least": (0.1, "m")},
     )
-    source = "constant time headway: Pipes 1953; Treiber, Hennecke & Helbing 2000"
+    source = (
+        "by the speed ahead, where Pipes 1953 and Treiber, Hennecke & Helbing 2000 have one's own"
+    )
     of_laws = True
     strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s", usual=0.2)}
     rank = 40
