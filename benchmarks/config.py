@@ -66,6 +66,7 @@ class DiscoveryBenchmarkOptions:
     noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
     sizes: list[int] = field(default_factory=lambda: [20])  # numbers of platoons or crowds
     structure: bool = True  # look for what has no name too; without, nothing is unknown
+    fresh: int = 0  # sequences of the same truth that are kept back, to try what was named on them
     peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
     workers: int | None = None  # processes; null: one per core
     # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead

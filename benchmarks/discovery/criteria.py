@@ -32,6 +32,8 @@ CRITERIA: tuple[tuple[str, str, float, bool], ...] = (
     ("zones and periods: median overlap", "overlap", 0.7, True),
     ("sealed gap closed: median of the truth's share", "closure", 0.95, True),
     ("sealed cost not above the base model's", "not_worse", 0.98, True),
+    ("fresh sequences' gap closed: median of the truth's share", "fresh_closure", 0.95, True),
+    ("fresh sequences' cost not above the base model's", "fresh_not_worse", 0.98, True),
 )
 #: Strengths that are not those of the headline: effects that hardly show, or hide all else.
 OTHER = ("weak", "strong")
@@ -70,6 +72,7 @@ def measures(frame: pd.DataFrame, coefficients: pd.DataFrame) -> dict[str, tuple
     relative = coefficients["relative"].dropna().astype(float)
     closure = asked["closure"].dropna().astype(float)
     overlap = asked["overlap"].dropna().astype(float)
+    later = asked.reindex(columns=["fresh_closure", "fresh_worse"]).astype(float)
     return {
         "single_exact": share(single["exact"]),
         "single_class": share(single["class_right"]),
@@ -93,6 +96,11 @@ def measures(frame: pd.DataFrame, coefficients: pd.DataFrame) -> dict[str, tuple
         "overlap": (float(overlap.median()), len(overlap)),
         "closure": (float(closure.median()), len(closure)),
         "not_worse": share(1.0 - frame["worse"].dropna().astype(float)),
+        "fresh_closure": (
+            float(later["fresh_closure"].median()),
+            int(later["fresh_closure"].count()),
+        ),
+        "fresh_not_worse": share(1.0 - later["fresh_worse"].dropna()),
     }
 
 

@@ -49,7 +49,13 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     with on_cluster(options.cluster):
         run_tasks(
             [
-                task_of(case, case.seed < last_of_peers, options.seeds_of, options.structure)
+                task_of(
+                    case,
+                    case.seed < last_of_peers,
+                    options.seeds_of,
+                    options.structure,
+                    options.fresh,
+                )
                 for case in chosen
             ],
             folder,

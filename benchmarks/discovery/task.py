@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,7 +22,10 @@ TERMS = {"lin": "lin", "log": "log", "sf": "social_force"}
 ERROR = "error"
 
 #: Sources on which a result depends: it does not hold when they have changed.
-_SOURCES = ("nnode/app/discover.py", *(f"benchmarks/discovery/{n}.py" for n in ("peers", "task")))
+_SOURCES = (
+    "nnode/app/discover.py",
+    *(f"benchmarks/discovery/{n}.py" for n in ("fresh", "peers", "task")),
+)
 _FOLDERS = ("benchmarks/truths", *(
     f"nnode/{name}" for name in ("discover", "models", "data", "calibrate", "solvers")
 ))  # fmt: skip
@@ -36,6 +40,7 @@ def diagnose_case(
     seeds_of: str | None = None,
     structure: bool = True,
     rules: dict[str, float] | None = None,
+    fresh: int = 0,
 ) -> dict[str, Any]:
     """The score of one diagnosis, and how long it took.
 
@@ -47,8 +52,10 @@ def diagnose_case(
         seeds_of: hash of the commit that the seed comes from; is handed through.
         structure: as in the options of the diagnosis.
         rules: numbers that differ from those of :class:`~nnode.discover.rules.Rules`.
+        fresh: so many sequences more are made, and kept back to try what was named on them.
     """
     # imported here: all workers read this file, and tests put another diagnosis in its place
+    from benchmarks.discovery.fresh import kept_back, on_fresh
     from benchmarks.discovery.peers import peers_on_table
     from nnode.app import discover
     from nnode.discover.options import DiscoverOptions
@@ -59,7 +66,8 @@ def diagnose_case(
     classes = {effect.name: effect.kin for effect in CATALOGUE.effects.values()}
     with TemporaryDirectory(prefix="nnode-case-") as made, TemporaryDirectory() as given:
         start = time.monotonic()
-        truth = generate(what, Path(made))
+        truth = generate(replace(what, n_sequences=what.n_sequences + fresh), Path(made))
+        whole, truth = truth, {**truth, "case": case}
         generated = time.monotonic() - start
         for name in (TABLE, WALLS):
             if (Path(made) / name).exists():
@@ -71,7 +79,9 @@ def diagnose_case(
             "leader": model.get("leader", "measured"),
             "seed": what.seed,
         }
-        table, start, failure = Path(given) / TABLE, time.monotonic(), ""
+        table = Path(given) / TABLE
+        back = kept_back(table, fresh)
+        start, failure, later = time.monotonic(), "", {}
         try:
             options = DiscoverOptions(
                 page=False,
@@ -80,18 +90,21 @@ def diagnose_case(
                 compare=[],
                 rules=Rules(**(rules or {})),
             )
-            report = discover.diagnose_table(table, what.domain, **told, options=options).plain()
+            found = discover.diagnose_table(table, what.domain, **told, options=options)
+            report = found.plain()
         except NNodeError as error:
             report, failure = {"verdict": ERROR, "effects": []}, f"{type(error).__name__}: {error}"
         seconds = time.monotonic() - start
+        if fresh and not failure:
+            later = on_fresh(back, found, whole, what.domain, told["walls"])
         others: dict[str, Any] = {}
         if peers and not failure:
-            found = peers_on_table(table, what.domain, **told)
-            for name, other in found.items():
+            for name, other in peers_on_table(table, what.domain, **told).items():
                 scored = score(truth, other, classes)
                 others[name] = {key: scored[key] for key in _KEPT}
     return {
         **score(truth, report, classes),
+        **later,
         "seeds_of": seeds_of,
         "seconds": seconds,
         "seconds_to_generate": generated,
@@ -101,11 +114,14 @@ def diagnose_case(
     }
 
 
-def task_of(case: Case, peers: bool, seeds_of: str | None, structure: bool = True) -> Task:
+def task_of(
+    case: Case, peers: bool, seeds_of: str | None, structure: bool = True, fresh: int = 0
+) -> Task:
     """A case as a task that is kept; larger ones start first."""
     size = case.n_sequences * (1.0 if case.domain == "traffic" else 2.0)
     arguments = {
         "case": case.to_dict(), "peers": peers, "seeds_of": seeds_of, "structure": structure,
+        "fresh": fresh,
     }  # fmt: skip
     return Task(case.key, diagnose_case, arguments, cost=size)
 
