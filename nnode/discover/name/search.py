@@ -125,14 +125,7 @@ def search(
     found, levels = Search(fit), levels or {}
     doubtful: Search | None = None  # as it was before an effect that a curve outdoes
     while True:
-        own = {effect.name for effect in effects_of(found.fit.system)}
-        left = [effect for effect in effects if effect.name not in own]
-        begun = len(found.steps)
-        within(begun / (begun + 2))  # of most searches, the last but one round finds nothing more
-        look = [trace for effect in left for trace in traces(engine, found.fit, effect)]
-        within((begun + 0.5) / (begun + 2))
-        found.screen = Screen(found.fit, engine.cluster, seed + len(found.steps), levels=levels)
-        found.scores = found.screen.scores(look)
+        screen = _screened(engine, found, effects, seed, levels, within)
         found.first = found.first or found.scores
         if len(found.steps) >= most:
             break
@@ -144,8 +137,10 @@ def search(
                 break
             doubtful = replace(found, steps=[*found.steps])
         elif doubtful is not None:
-            both = _candidate(step.chosen.score, step.chosen.fit, doubtful.fit, found.screen, 0.0)
-            if _outdone(engine, doubtful.fit, both, variables or []):
+            # in the filter of now
+            before = refine(engine, doubtful.fit.system)
+            both = _candidate(step.chosen.score, step.chosen.fit, before, screen, 0.0)
+            if _outdone(engine, before, both, variables or []):
                 break
             doubtful = None
         found.steps.append(step)
@@ -153,7 +148,30 @@ def search(
         if step.chosen.score.effect.consecutive:
             found.fit = moved(engine, found.fit, step.chosen.name)
         log.info("added %s", step.chosen.name)
-    return _pruned(engine, doubtful or found)
+    if doubtful is not None:  # the filter is that of a model with more effects
+        found = replace(doubtful, fit=settled(engine, doubtful.fit.system, rounds=1))
+        _screened(engine, found, effects, seed, levels, within)
+    return _pruned(engine, found)
+
+
+def _screened(
+    engine: Engine,
+    found: Search,
+    effects: list[type[Effect]],
+    seed: int,
+    levels: dict[str, np.ndarray],
+    within: Callable[[float], None],
+) -> Screen:
+    """Give all effects that a model lacks their scores."""
+    own = {effect.name for effect in effects_of(found.fit.system)}
+    begun = len(found.steps)
+    within(begun / (begun + 2))  # of most searches, the last but one round finds nothing more
+    left = [effect for effect in effects if effect.name not in own]
+    look = [trace for effect in left for trace in traces(engine, found.fit, effect)]
+    within((begun + 0.5) / (begun + 2))
+    found.screen = Screen(found.fit, engine.cluster, seed + begun, levels=levels)
+    found.scores = found.screen.scores(look)
+    return found.screen
 
 
 def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> Step | None:
