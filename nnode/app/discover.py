@@ -7,21 +7,21 @@ import shlex
 import signal
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.base_laws import candidates, law_options
+from nnode.app.base_laws import candidates
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
+from nnode.app.nearest_law import Job, diagnosed, unwatched
 from nnode.app.python.inputs import Table, data_of, model_options, table_options
 from nnode.app.python.report import Report
-from nnode.app.training import brief, set_threads
+from nnode.app.training import brief
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
@@ -29,8 +29,6 @@ from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
 from nnode.data.sequences import Sequences
 from nnode.discover.able import check_model
-from nnode.discover.compare.laws import Nearer, compare_laws, with_effects
-from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, inputs_of, read_inputs, with_faulty
 from nnode.discover.options import DiscoverOptions, check_options
@@ -48,13 +46,10 @@ from nnode.discover.report.files import (
     sentence,
     write_report,
 )
-from nnode.discover.result import Laws
 from nnode.errors import ConfigError
 from nnode.files import write_text
-from nnode.models import System, build_model
-from nnode.models.effects import CATALOGUE
+from nnode.models import build_model
 from nnode.models.effects.own import load_own
-from nnode.models.extend import effects_of
 from nnode.program import scripts, typed
 from nnode.progress import Stages
 
@@ -62,30 +57,6 @@ log = logging.getLogger(__name__)
 
 #: Folder of the diagnosis of the law that comes nearest, where another one was asked for.
 NEAREST = "nearest_law"
-
-
-@dataclass(frozen=True)
-class Job:
-    """What is diagnosed.
-
-    Attributes:
-        model, data: their options in plain types.
-        groups: the configuration groups that they come from.
-        system: the model, not calibrated.
-        inputs: the data.
-        options: checked.
-        laws: models to compare before, by name; none where nothing is to be compared.
-        seconds: that reading took.
-    """
-
-    model: dict[str, Any]
-    data: dict[str, Any]
-    groups: dict[str, str]
-    system: System
-    inputs: Inputs
-    options: DiscoverOptions
-    laws: dict[str, System]
-    seconds: float
 
 
 def discover(config: DictConfig, folder: Path) -> None:
@@ -105,7 +76,7 @@ def discover(config: DictConfig, folder: Path) -> None:
             data = cast(DataOptions, OmegaConf.to_object(config.data))
             read = partial(read_inputs, data, folder / "data")
             job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
-            done = _diagnosed(job, Stages)
+            done = diagnosed(job, Stages)
             with Stages("drawing", {"drawing": 5.0}) as stages:
                 stages.begin("drawing")
                 written = [_drawn(one, found, place) for one, found, place in _places(done, folder)]
@@ -120,7 +91,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         paths = [write() for write in reversed(written)][::-1]
     _print(done[0][1], paths[0], time.monotonic() - start)
     if len(done) > 1:
-        print(f"\nthe law that comes nearest, {done[1][0].model['name']}:")
+        print(f"\nthe law that comes nearest, {done[1][0].name}:")
         _print(done[1][1], paths[1], time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
@@ -169,7 +140,7 @@ def diagnose_table(
         return inputs_of(Sequences.of(data, with_faulty(told)), told)
 
     job = _job(own, told, plain_options(told), groups, chosen, read)
-    done = _diagnosed(job, _unwatched)
+    done = diagnosed(job, unwatched)
     if place is not None:
         for one, found, where in reversed(_places(done, place)):
             _drawn(one, found, where)()
@@ -202,89 +173,6 @@ def _job(
         plain_data = {**plain_data, "faults": Faults.drop.value}
     seconds = time.monotonic() - start
     return Job(model, plain_data, groups, system, inputs, options, laws, seconds)
-
-
-#: Shows the stages of a work by its name and their seconds.
-_Watch = Callable[[str, dict[str, float]], AbstractContextManager[Stages | None]]
-
-
-def _unwatched(name: str, stages: dict[str, float]) -> AbstractContextManager[None]:
-    return nullcontext()
-
-
-def _diagnosed(job: Job, watch: _Watch) -> list[tuple[Job, Found]]:
-    """The law that was asked for, then the one that comes nearest, where that is another one.
-
-    Laws are compared first as they are, then with what the nearest of them lacks: a strong effect
-    may bring another law to the front, which can imitate it.
-    """
-    set_threads(None, job.system.domain)
-    asked, nearest, laws, again = str(job.model["name"]), job, None, None
-    hints: dict[str, System] = {}
-    start = time.monotonic()
-    if job.laws:
-        laws, systems = _compared(job, job.laws, watch)
-        nearest = _with_law(job, laws.best or asked)
-    seconds = time.monotonic() - start
-    found = _diagnose(nearest, watch)
-    own = {effect.name for effect in effects_of(nearest.system)}
-    effects = [effect for effect in effects_of(found.searched) if effect.name not in own]
-    if laws is not None and laws.ranking and effects:
-        start = time.monotonic()
-        again, hints = _compared(job, with_effects(systems, effects), watch)
-        again.effects = [effect.name for effect in effects]
-        seconds += time.monotonic() - start
-        if again.best != nearest.model["name"]:
-            nearest = _with_law(job, again.best)
-            found = _diagnose(nearest, watch, hint=hints[again.best])
-    done = [(nearest, found)]
-    if nearest.model["name"] != asked:
-        nearer = Nearer(str(nearest.model["name"]), found.searched)
-        done.insert(0, (job, _diagnose(job, watch, nearer, hints.get(asked))))
-    first = done[0][1].diagnosis
-    first.laws, first.laws_again = laws, again
-    first.seconds = {"reading": job.seconds, "laws": round(seconds, 3), **first.seconds}
-    return done
-
-
-def _compared(job: Job, laws: dict[str, System], watch: _Watch) -> tuple[Laws, dict[str, System]]:
-    with watch("laws", {"comparing laws": 10.0}) as stages:
-        if stages is not None:
-            stages.begin("comparing laws")
-        return compare_laws(laws, job.inputs.sequences, job.options)
-
-
-def _diagnose(
-    job: Job, watch: _Watch, nearer: Nearer | None = None, hint: System | None = None
-) -> Found:
-    """Run the diagnosis, and add what only its caller knows."""
-    inputs, name = job.inputs, str(job.model["name"])
-    with watch(f"diagnosis of {name}", STAGES) as stages:
-        found = diagnose(
-            job.system, inputs.sequences, job.options, stages=stages, nearer=nearer, hint=hint
-        )
-    found.diagnosis.data_faults = inputs.data_faults
-    found.diagnosis.model = name
-    return found
-
-
-def _with_law(job: Job, name: str) -> Job:
-    """The same with another law."""
-    if name == job.model["name"]:
-        return job
-    system, options = job.laws[name], job.options
-    # effects that laws of its order know
-    known = {e.name for e in CATALOGUE.of(job.inputs.domain, system.order)}
-    effects = None if options.effects is None else [e for e in options.effects if e in known]
-    out = [e for e in options.exclude if e in known]
-    return replace(
-        job,
-        model=law_options(name, job.model),
-        groups={**job.groups, "model": name},
-        system=system,
-        options=replace(options, effects=effects, exclude=out),
-        laws={},
-    )
 
 
 def _places(done: list[tuple[Job, Found]], folder: Path) -> list[tuple[Job, Found, Path]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -14,13 +15,16 @@ import pandas as pd
 import pytest
 
 from nnode.app import discover as app
+from nnode.app import nearest_law
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions, TableOptions
+from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report import page
 from nnode.errors import ConfigError
+from nnode.models import System
 from tests.app.conftest import Script, composed
 from tests.app.forked import Forks
 from tests.discover import stand_in
@@ -29,12 +33,12 @@ from tests.discover.recorded import ALPHA, ZONE, corridor, lane
 #: The script with results made by hand.
 CODE = """
 import sys
-from nnode.app import discover
+from nnode.app import discover, nearest_law
 from nnode.app.cli.run import run
 from tests.discover import stand_in
 if __name__ == "__main__":
     sys.argv[0] = "scripts/discover.py"
-    discover.diagnose = stand_in.diagnose
+    nearest_law.diagnose = stand_in.diagnose
     run("discover", discover.discover)
 """
 
@@ -51,7 +55,7 @@ import runpy
 import shutil
 import sys
 from pathlib import Path
-from nnode.app import discover
+from nnode.app import discover, nearest_law
 from nnode.app.cli.run import run
 from tests.discover import stand_in
 
@@ -62,7 +66,7 @@ def script(name, *arguments, root="."):
 if __name__ == "__main__":
     folder, *overrides = sys.argv[1:]
     sys.argv = ["scripts/discover.py", *overrides]
-    discover.diagnose = stand_in.diagnose
+    nearest_law.diagnose = stand_in.diagnose
     run("discover", discover.discover)
     checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
     print("== evaluate")
@@ -230,7 +234,7 @@ def test_wrong_options_of_a_model_are_refused(model: dict[str, Any], message: st
 @pytest.fixture
 def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Results made by hand, and nothing that could be drawn."""
-    monkeypatch.setattr(app, "diagnose", stand_in.diagnose)
+    monkeypatch.setattr(nearest_law, "diagnose", stand_in.diagnose)
 
     def never(*_: object) -> None:
         pytest.fail("something was drawn")
@@ -256,7 +260,7 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
 
 @pytest.mark.usefixtures("by_hand")
 def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(app, "with_effects", lambda laws, effects: laws)
+    monkeypatch.setattr(nearest_law, "with_effects", lambda laws, effects: laws)
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     report = app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
@@ -289,6 +293,30 @@ def test_laws_are_compared_again_with_what_the_nearest_lacks(tmp_path: Path) -> 
     assert (first.best, first.effects) == ("idm", [])
     assert (again.best, again.effects) == ("lin", ["speed_zone"])
     assert again.ranking[1].behind > 0
+
+
+@pytest.mark.usefixtures("by_hand")
+def test_laws_are_compared_again_with_what_the_one_asked_for_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind a zone idm comes first, and imitates it well enough to need nothing; lin needs the
+    zone, and with it comes first."""
+
+    def diagnose(system: System, *arguments: Any, **how: Any) -> Found:
+        found = stand_in.diagnose(system, *arguments, **how)
+        return found if system.order == 1 else dataclasses.replace(found, searched=system)
+
+    monkeypatch.setattr(nearest_law, "diagnose", diagnose)
+    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    report = app.diagnose_table(
+        table, "traffic", model={"term": "lin"}, options=DiscoverOptions(compare=["idm"])
+    )
+    assert report.nearest is None
+    first, again = report.diagnosis.laws, report.diagnosis.laws_again
+    assert first is not None
+    assert again is not None
+    assert (first.best, first.effects) == ("idm", [])
+    assert (again.best, again.effects) == ("lin", ["speed_zone"])
 
 
 @pytest.mark.usefixtures("by_hand")

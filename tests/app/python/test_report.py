@@ -9,6 +9,7 @@ import pytest
 
 import nnode
 from nnode.app import discover as app
+from nnode.app import nearest_law
 from nnode.models.extend import effects_of
 from tests.app.following import table
 from tests.discover import stand_in
@@ -22,7 +23,7 @@ ALONE = app.DiscoverOptions(page=False, compare=[])
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> nnode.Report:
     """Of results made by hand."""
-    monkeypatch.setattr(app, "diagnose", stand_in.diagnose)
+    monkeypatch.setattr(nearest_law, "diagnose", stand_in.diagnose)
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     return nnode.diagnose(table, options=ALONE)
 
