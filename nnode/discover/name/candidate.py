@@ -10,7 +10,7 @@ import numpy as np
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
-from nnode.discover.statistics.score import Score, Screen, traces
+from nnode.discover.statistics.score import Score, Screen, minimal_of, traces
 from nnode.errors import SimulationError
 from nnode.models.effects import Effect
 from nnode.models.extend import extended, place_of
@@ -54,16 +54,20 @@ class Candidate:
         first, last = (float(own.get_parameter(name).detach()) for name in ("a", "b"))
         return first < last
 
-    def strength_excludes_neutral(self, cluster: np.ndarray) -> bool:
-        """Whether the interval of any of its strengths excludes the neutral value."""
-        intervals = self.fit.intervals(cluster)
+    def strength_excludes_neutral(self, cluster: np.ndarray, *, minimal: bool = False) -> bool:
+        """Whether the interval of any of its strengths excludes the neutral value; or, if asked,
+        all amounts that are taken for none."""
+        intervals, effect = self.fit.intervals(cluster), self.score.effect
         place = place_of(self.fit.system, self.name)
+        none = minimal_of(effect, len(effect.strengths)) * minimal
         known = [
-            (strength.neutral, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
-            for name, strength in self.score.effect.strengths.items()
+            (strength.neutral, less, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
+            for (name, strength), less in zip(effect.strengths.items(), none, strict=True)
             if f"terms.{place}.{name}" in self.fit.names
         ]
-        return not known or any(low > neutral or high < neutral for neutral, low, high in known)
+        return not known or any(
+            low > neutral + less or high < neutral - less for neutral, less, low, high in known
+        )
 
 
 def calibrated(

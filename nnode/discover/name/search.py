@@ -177,11 +177,12 @@ def _screened(
 def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> Step | None:
     scores, screen = found.scores, found.screen
     assert screen is not None
-    if not scores or min(score.p_value for score in scores) > alpha:
+    if not scores:
         return None
-    most = max(score.gain for score in scores)
+    scores = sorted(scores, key=lambda score: -score.gain)
+    shown = min(score.p_value for score in scores) <= alpha
     hinted = set() if hint is None else {effect.name for effect in effects_of(hint)}
-    tried = [score for score in scores if score.gain >= rules().rival * most][:RIVALS]
+    tried = [s for s in scores if s.gain >= rules().rival * scores[0].gain][:RIVALS]
     tried += [score for score in scores if score.effect.name in hinted and score not in tried]
     square = square_of(engine, found.fit.system)
     found.square = found.square or square
@@ -197,19 +198,25 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
             continue
         removed = (square - square_of(engine, fit.system)) / found.square
         candidates.append(_candidate(score, fit, found.fit, screen, removed))
+        # a strong effect is far from linear: held-out clusters may be sure of what no score shows
+        if not shown and len(candidates) == 1 and not _sure(candidates[0], screen, len(scores)):
+            return None
     candidates = _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
-    passing = [
+    good = [
         c for c in candidates
-        if c.score.p_value <= alpha
-        and c.removed >= rules().least
+        if c.removed >= rules().least
         and c.gain.gain > 0
         and c.there < rules().level
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]  # fmt: skip
+    passing = [c for c in good if c.score.p_value <= alpha]
+    passing = passing or [c for c in good if _sure(c, screen, len(scores))]
     if not passing:
         return None
     best = _simplest(passing, screen)
+    if best.score.p_value > alpha:
+        best.score = replace(best.score, p_value=best.there * len(scores))
     rivals = []
     for other in candidates:
         if other is best:
@@ -218,6 +225,14 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         if test.p_value > apart_at(best, other) and not _contains(other, best):
             rivals.append((other, test))
     return Step(best, rivals)
+
+
+def _sure(one: Candidate, screen: Screen, tried: int) -> bool:
+    """Whether held-out clusters lean the way of one of ``tried`` effects beyond all doubt, and it
+    is more than what is taken for none."""
+    label = screen.label(one.name)
+    lean = one.there * tried <= rules().sure
+    return lean and one.strength_excludes_neutral(label, minimal=True)
 
 
 def apart_at(one: Candidate, other: Candidate) -> float:

@@ -1,6 +1,8 @@
-"""A search that goes back keeps nothing of the filter of a model that it gave up."""
+"""What is added without a score that shows it, and what is given up again."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,16 +11,38 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name import search as searching
 from nnode.discover.name.search import search, settled
 from nnode.discover.residuals.engine import row_of
+from nnode.discover.rules import rules
+from nnode.discover.statistics.score import Score, Screen, Trace
 from nnode.models import build_model
 from nnode.models.effects import CATALOGUE
 from nnode.models.extend import effects_of
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 
+LIN = {
+    "term": "lin", "name": "lin", "leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("strength", "names"), [(0.5, ["relative_speed"]), (0.0, [])])
+def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
+    monkeypatch: pytest.MonkeyPatch, strength: float, names: list[str]
+) -> None:
+    scored = Screen.scores
+
+    def blind(screen: Screen, look: list[Trace]) -> list[Score]:
+        return [replace(score, p_value=1.0) for score in scored(screen, look)]
+
+    monkeypatch.setattr(Screen, "scores", blind)
+    engine = TrafficEngine(platoons(effect=relative_speed(strength), number=16))
+    fit = settled(engine, build_model(LIN))
+    found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
+    assert [step.chosen.name for step in found.steps] == names
+    assert all(step.chosen.score.p_value <= rules().sure for step in found.steps)
+
 
 def test_what_a_curve_outdoes_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    options = {"term": "lin", "name": "lin", "leader": "measured", "v0": V0, "L": LENGTH}
     engine = TrafficEngine(platoons(effect=relative_speed(0.5), number=16))
-    fit = settled(engine, build_model({**options, "L_min": 1.0}))
+    fit = settled(engine, build_model(LIN))
     asked: list[bool] = []
     monkeypatch.setattr(searching, "_outdone", lambda *_: asked.append(True) or True)
     found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
