@@ -48,10 +48,10 @@ exchange: setup
 
 # Which lines of the package the tests run; below 90 % it fails.
 coverage: setup
-	rm -rf runs/coverage && mkdir -p runs/coverage
-	$(BIN)/coverage run -m pytest -m "not slow and not tutorial"
+	rm -rf $(VENV)/coverage && mkdir -p $(VENV)/coverage
+	$(BIN)/coverage run -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 	$(BIN)/coverage combine --quiet
-	rm -f runs/coverage/data.*  # of processes that were killed while they wrote it
+	rm -f $(VENV)/coverage/data.*  # of processes that were killed while they wrote it
 	$(BIN)/coverage report
 
 # Runs every block of code of the tutorials.

@@ -14,11 +14,10 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.base_laws import candidates
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
-from nnode.app.nearest_law import Job, diagnosed, unwatched
+from nnode.app.nearest_law import Job, candidates, diagnosed, unwatched
 from nnode.app.python.inputs import Table, data_of, model_options, table_options
 from nnode.app.python.report import Report
 from nnode.app.training import brief

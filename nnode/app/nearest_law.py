@@ -3,13 +3,14 @@ the one that was asked for, and laws are compared again with what they lack."""
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
-from nnode.app.base_laws import law_options
+from nnode.app.python.inputs import MODELS, model_options
 from nnode.app.training import set_threads
 from nnode.discover.compare.laws import Nearer, compare_laws, with_effects
 from nnode.discover.diagnose import STAGES, diagnose
@@ -17,10 +18,22 @@ from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.result import Laws
-from nnode.models import System
+from nnode.errors import ConfigError
+from nnode.models import System, build_model
 from nnode.models.effects import CATALOGUE, Effect
 from nnode.models.extend import effects_of
+from nnode.models.system import Traffic
 from nnode.progress import Stages
+
+#: Laws that are compared where none are named; networks contain effects, and newell remembers step
+#: by step.
+LAWS = {
+    "traffic": ("lin", "log", "idm", "ovm", "fvdm", "gipps", "krauss", "helly"),
+    "crowd": ("sf", "esf", "gcfm", "ttc"),
+}
+
+#: Options that say what is simulated, not by which law.
+SHARED = ("desired", "neighbours")
 
 
 @dataclass(frozen=True)
@@ -58,6 +71,46 @@ Watch = Callable[[str, dict[str, float]], AbstractContextManager[Stages | None]]
 
 def unwatched(name: str, stages: dict[str, float]) -> AbstractContextManager[None]:
     return nullcontext()
+
+
+def candidates(
+    model: Mapping[str, Any], asked: System, options: DiscoverOptions
+) -> dict[str, System]:
+    """Models by name, the one that was asked for among them; vehicles drive behind measured
+    leaders, people want to go where the one that was asked for says. None where nothing is to be
+    compared.
+
+    Args:
+        model: options of the one that was asked for.
+
+    Raises:
+        ConfigError: an unknown name, or one of another domain.
+    """
+    names = LAWS[asked.domain] if options.compare is None else options.compare
+    found: dict[str, System] = {}
+    for one in names:
+        if one not in MODELS:
+            raise ConfigError(
+                f"discover.compare: there is no model {one}, expected some of "
+                f"{', '.join(LAWS[asked.domain])}, or another name as in conf/model"
+            )
+        found[one] = build_model(law_options(one, model), options.seed)
+        if found[one].domain != asked.domain:
+            raise ConfigError(
+                f"discover.compare: {one} is a {found[one].domain} model, the data and the model "
+                f"are of {asked.domain}; leave it out"
+            )
+    if found:
+        own = found[str(model["name"])] = copy.deepcopy(asked)
+        if isinstance(own, Traffic):
+            own.leader = "measured"
+    return found
+
+
+def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a model that is compared with another one."""
+    found = model_options(name, "measured")
+    return {**found, **{key: asked[key] for key in SHARED if key in asked and key in found}}
 
 
 def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, Found]]:

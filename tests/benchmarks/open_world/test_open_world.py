@@ -12,7 +12,7 @@ from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.answers import Answer
 from benchmarks.open_world.page import by_law, criteria, scene_criteria, share, write
 from benchmarks.truths.laws.motion import RANGES
-from nnode.app.base_laws import LAWS
+from nnode.app.nearest_law import LAWS
 from nnode.models.effects import CATALOGUE
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.truths.laws.case import LawCase, measured
-from nnode.app.base_laws import LAWS, candidates
+from nnode.app.nearest_law import LAWS, candidates
 from nnode.app.python.inputs import model_options, table_options
 from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
