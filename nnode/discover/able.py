@@ -8,8 +8,10 @@ from nnode.errors import ConfigError
 from nnode.laws.crowd import SMALLEST
 from nnode.laws.expression import symbols
 from nnode.models.build import add_effects
+from nnode.models.crowd import InteractionForce
 from nnode.models.crowd_formula import CrowdBase, crowd_of
 from nnode.models.effects import Effect, IndividualEffect
+from nnode.models.effects.crowd_force import ForceEffect
 from nnode.models.extend import effects_of
 from nnode.models.system import Crowd, System, Traffic
 
@@ -36,6 +38,8 @@ def not_offered(effect: type[Effect], system: System) -> str:
             f"with desired={system.desired} everybody has a preferred speed already, measured in "
             "the seconds before: one for all would mend its errors and be no effect"
         )
+    if issubclass(effect, ForceEffect) and system.find(InteractionForce) is None:
+        return "the law has no force between people of its own that it could change"
     if system.domain != "traffic" or system.order == 1:
         return ""
     try:
