@@ -148,6 +148,7 @@ def walks(number: int = 10, people: int = 4, seconds: float = 8.0) -> pd.DataFra
     return pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
 
 
+@pytest.mark.thorough  # their law is compiled
 def test_people_are_sampled(tmp_path: Path) -> None:
     table = walks()
     (tmp_path / "walls.csv").write_text("x1,y1,x2,y2\n-5,-3,30,-3\n")

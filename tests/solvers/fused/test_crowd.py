@@ -331,13 +331,9 @@ def in_groups(people: list[Sequence]) -> list[Sequence]:
     return [replace(item, group=names[: item.x.shape[1]]) for item in people]
 
 
+@pytest.mark.thorough  # many effects at once take long to compile
 @pytest.mark.parametrize(
-    ("base", "chosen"),
-    [
-        ("sf", ("sums", "force", "walls")),
-        pytest.param("nn", ("force",), marks=pytest.mark.thorough),
-    ],
-    ids=str,
+    ("base", "chosen"), [("sf", ("sums", "force", "walls")), ("nn", ("force",))], ids=str
 )
 def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> None:
     check(with_effects(base, *chosen), single(in_groups(people)), FusedSolver(DT, 2))
