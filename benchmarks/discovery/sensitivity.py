@@ -73,13 +73,14 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--domain", default="traffic", choices=["traffic", "crowd"])
     parser.add_argument("--sequences", type=int, default=40)
+    parser.add_argument("--every", type=int, default=1, help="takes each so many-th case only")
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     seed = given.first_seed if given.seeds_of is None else first_seed(given.seeds_of)
     hidden = [
         case
         for arm in ("single", "outside")
-        for case in cases(given.domain, arm, seeds=[seed], sizes=[given.sequences])
+        for case in cases(given.domain, arm, seeds=[seed], sizes=[given.sequences])[:: given.every]
     ]
     tasks = [
         Task(
