@@ -43,6 +43,7 @@ from typing import Any
 
 from nnode.errors import ConfigError
 from nnode.laws.expression import Expr, apply, below, const, substitute, symbol, symbols
+from nnode.laws.names import check_names
 from nnode.laws.parse import parse
 from nnode.laws.units import check, shown, unit_of
 
@@ -134,6 +135,10 @@ class CrowdRule:
     force: tuple[str, str] | None = None
     drive: bool = False
     order: int = 2
+
+    def __post_init__(self) -> None:
+        for kind in (*SEEN, _LARGEST, "where", "constants", "settings", "inputs"):
+            check_names(kind, getattr(self, kind))
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Container, Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -145,10 +146,11 @@ def _made(op: str, args: tuple[Expr, ...], value: Any = None) -> Expr:
 
 def _folded(op: str, number: Callable[..., float], *args: Expr) -> Expr:
     if all(a.op == "const" for a in args):
-        try:
-            return const(number(*(a.value for a in args)))
-        except (ValueError, OverflowError, ZeroDivisionError):
-            pass  # the number that it is stands in the formula, and says so when it is computed
+        with suppress(ValueError, OverflowError, ZeroDivisionError):
+            value = number(*(a.value for a in args))
+            if math.isfinite(value):
+                return const(value)
+        # what is no finite number stays an operation, and says so when it is computed
     return _made(op, args)
 
 

@@ -27,6 +27,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+from nnode.errors import ConfigError
 from nnode.laws.expression import (
     Expr,
     apply,
@@ -37,6 +38,7 @@ from nnode.laws.expression import (
     symbol,
     symbols,
 )
+from nnode.laws.names import check_names
 from nnode.laws.parse import parse
 from nnode.laws.units import check
 
@@ -52,6 +54,9 @@ _MADE = {
     "gap_1": symbol("x_2") - symbol("x_1"),
     "dv": symbol("v") - symbol("v_1"),
 }
+#: Most steps that delayed quantities are remembered for, all together: each one is a state of
+#: every vehicle. The longest reaction time of the package's laws, 3 s, has 300 steps of 0.01 s.
+REMEMBERED = 500
 #: Names that exist in laws of second order only.
 _SECOND = ("v", "v_1", "v_2", "dv")
 
@@ -84,6 +89,17 @@ class Rule:
     constants: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     remembered: int = 0
     inputs: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind in ("states", "delayed", "where", "constants", "inputs"):
+            check_names(kind, getattr(self, kind))
+        steps = len(self.delayed) * self.remembered
+        if not 0 <= steps <= REMEMBERED:
+            raise ConfigError(
+                f"remembered: {self.remembered} steps of {len(self.delayed)} delayed quantities "
+                f"are {steps} states of every vehicle, expected at most {REMEMBERED}; take a "
+                "larger step or a shorter delay"
+            )
 
 
 @dataclass(frozen=True, eq=False)

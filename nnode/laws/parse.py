@@ -12,10 +12,15 @@ import math
 from collections.abc import Callable, Mapping
 
 from nnode.errors import ConfigError
-from nnode.laws.expression import UNARY, Expr, apply, const, substitute, symbol
+from nnode.laws.expression import UNARY, Expr, apply, below, const, substitute, symbol
 
 #: Limits of a text's characters, of nested parts, and of exponents.
 LENGTH, DEPTH, EXPONENT = 2000, 60, 64
+#: Limit of the operations of a formula with all the parts that it names. The largest law of the
+#: package has 400. A part that is named with other quantities, as part(dx=...), is built anew, so
+#: that 30 short parts can ask for 10^9 operations. 10,000 are built in half a second; compiling
+#: 1,200 takes more than three minutes.
+OPERATIONS = 10_000
 #: Names of functions and their numbers of arguments.
 FUNCTIONS = {
     **{name: 1 for name in UNARY if name != "softplus_slope"},
@@ -75,7 +80,10 @@ def parse(
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         at = max(int(getattr(error, "offset", 1) or 1) - 1, 0)
         raise FormulaError(text.strip(), at, f"this cannot be read; {_LISTED}") from error
-    return _Reader(text.strip(), names, laws or {}).read(tree.body, 0)
+    reader = _Reader(text.strip(), names, laws or {})
+    found = reader.read(tree.body, 0)
+    reader.count(tree.body, found)
+    return found
 
 
 class _Reader:
@@ -83,6 +91,15 @@ class _Reader:
         self, text: str, names: Mapping[str, Expr] | None, laws: Mapping[str, Part]
     ) -> None:
         self.text, self.names, self.laws = text, names, laws
+        self.built = 0
+
+    def count(self, node: ast.AST, *parts: Expr) -> None:
+        """Add the operations of what is built, and refuse more than there may be."""
+        self.built += len(below(parts))
+        if self.built > OPERATIONS:
+            raise self.fail(
+                node, f"it has more than {OPERATIONS} operations with the parts that it names"
+            )
 
     def fail(self, node: ast.AST, problem: str) -> FormulaError:
         return FormulaError(self.text, getattr(node, "col_offset", 0), problem)
@@ -137,7 +154,9 @@ class _Reader:
                 return self.of_law(node, name, part, depth)
             if node.keywords or not node.args:
                 raise self.fail(node, f"{name} takes its inputs one after the other")
-            return part(*(self.read(a, depth + 1) for a in node.args))
+            made = part(*(self.read(a, depth + 1) for a in node.args))
+            self.count(node, made)
+            return made
         if name not in FUNCTIONS:
             raise self.fail(node, f"there is no function {name}; {_LISTED}")
         if node.keywords or len(node.args) != FUNCTIONS[name]:
@@ -162,4 +181,5 @@ class _Reader:
                 raise self.fail(node, f"{keyword.arg} is made of others and cannot be replaced")
             place = keyword.arg if target is None else target.value
             values[place] = self.read(keyword.value, depth + 1)
+        self.count(node, law)
         return substitute(law, values)

@@ -17,7 +17,8 @@ def number(value: float) -> str:
 
 
 def plain(node: Expr) -> str:
-    """As :func:`nnode.laws.parse.parse` reads it."""
+    """As :func:`nnode.laws.parse.parse` reads it; parts that are longer than it reads are
+    written ``(...)``."""
     return _written(node, _plain)
 
 
@@ -25,19 +26,25 @@ def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
     """For a page; ``names`` of symbols that are written otherwise."""
     names = names or {}
 
-    def one(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
-        return _latex(part, of, names)
+    def one(part: Expr, found: _Found) -> tuple[str, int]:
+        return _latex(part, found, names)
 
     return _written(node, one)
 
 
-_Writer = Callable[[Expr, list[tuple[str, int]]], tuple[str, int]]
+_Found = Mapping[Expr, tuple[str, int]]
+_Writer = Callable[[Expr, _Found], tuple[str, int]]
+
+#: Characters of a part that is written out: what can be read again. A part that is named often
+#: is written as often: without a bound, 40 parts that double have 10^12 characters.
+LONGEST = 2000
 
 
 def _written(node: Expr, writer: _Writer) -> str:
     found: dict[Expr, tuple[str, int]] = {}
     for part in below([node]):
-        found[part] = writer(part, [found[a] for a in part.args])
+        text, level = writer(part, found)
+        found[part] = (text, level) if len(text) <= LONGEST else ("(...)", _ATOM)
     return found[node][0]
 
 
@@ -46,7 +53,8 @@ def _in(text: tuple[str, int], least: int, brackets: str = "plain") -> str:
     return text[0] if text[1] >= least else f"{left}{text[0]}{right}"
 
 
-def _plain(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
+def _plain(part: Expr, found: _Found) -> tuple[str, int]:
+    of = [found[a] for a in part.args]
     match part.op:
         case "const":
             return number(part.value), _ATOM if part.value >= 0 else _SIGN
@@ -62,7 +70,10 @@ def _plain(part: Expr, of: list[tuple[str, int]]) -> tuple[str, int]:
             for i in (1, 0):
                 if part.args[i].op == "recip":
                     under = part.args[i].args[0]
-                    return f"{_in(of[1 - i], _PRODUCT)}/{_in((plain(under), _level(under)), 4)}", 2
+                    return (
+                        f"{_in(of[1 - i], _PRODUCT)}/{_in((found[under][0], _level(under)), 4)}",
+                        2,
+                    )
             return f"{_in(of[0], _PRODUCT)}*{_in(of[1], _PRODUCT + 1)}", _PRODUCT
         case "neg":
             return f"-{_in(of[0], _PRODUCT)}", _SIGN
@@ -78,7 +89,8 @@ def _level(node: Expr) -> int:
     return {"add": 1, "sub": 1, "mul": 2, "recip": 2, "neg": 3}.get(node.op, _ATOM)
 
 
-def _latex(part: Expr, of: list[tuple[str, int]], names: Mapping[str, str]) -> tuple[str, int]:
+def _latex(part: Expr, found: _Found, names: Mapping[str, str]) -> tuple[str, int]:
+    of = [found[a] for a in part.args]
     match part.op:
         case "const":
             return number(part.value), _ATOM if part.value >= 0 else _SIGN
@@ -93,7 +105,7 @@ def _latex(part: Expr, of: list[tuple[str, int]], names: Mapping[str, str]) -> t
                 return f"{{{_in(of[0], _ATOM, 'latex')}}}^{{2}}", _POWER
             for i in (1, 0):
                 if part.args[i].op == "recip":
-                    under = latex(part.args[i].args[0], names)
+                    under = found[part.args[i].args[0]][0]
                     return f"\\frac{{{of[1 - i][0]}}}{{{under}}}", _ATOM
             return f"{_in(of[0], _PRODUCT, 'latex')}\\,{_in(of[1], _PRODUCT, 'latex')}", _PRODUCT
         case "neg":

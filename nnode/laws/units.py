@@ -6,6 +6,8 @@ have.
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from fractions import Fraction
 from functools import cache
@@ -19,6 +21,38 @@ Dimension = tuple[Fraction, Fraction, Fraction]
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
 _BASE = ("[length]", "[time]", "[mass]")
 _NAMES = ("m", "s", "kg")
+
+# Pint computes the text of a quantity: a tower of powers such as 9**9**9 would never end. Only
+# names of units may be raised, once each, to one digit: the package's laws need m⁴ at most.
+#: Characters of a quantity or unit; the longest of the package's laws has 11.
+LONGEST = 100
+_DIGIT = r"[+-]?\d(?:\.\d{1,3})?"
+_POWER = rf"(?:\s*(?:\*\*|\^)\s*(?:{_DIGIT}|\(\s*{_DIGIT}\s*\))|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹])(?![\w.]|\s*\()"
+_TOKEN = re.compile(
+    rf"[A-Za-zµμΩΩÅ%°][A-Za-z0-9_µμ]*(?:{_POWER})?"  # a unit
+    r"|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])"  # a number
+    r"|\*(?!\s*\*)|[/·()\s]"
+)
+#: Words by which Pint raises as well.
+_POWER_WORDS = re.compile(r"squared|cubed|square|cubic|sq\b")
+_EXPECTED_UNIT = (
+    "expected one such as m/s² or kg/(m s), of names of units, *, / and powers of one digit"
+)
+#: Powers of units in the parts of a formula; beyond them they are no quantities of mechanics.
+_HIGHEST_POWER = 1000
+
+
+def _readable(text: str) -> bool:
+    """Whether Pint may compute a text: its size is bounded, and so is every power in it."""
+    if len(text) > LONGEST or _POWER_WORDS.search(text):
+        return False
+    place = len(text) - len(text.lstrip().removeprefix("-"))
+    while place < len(text):
+        token = _TOKEN.match(text, place)
+        if token is None:
+            return False
+        place = token.end()
+    return True
 
 
 @cache
@@ -37,10 +71,12 @@ def dimension(unit: str) -> Dimension | None:
     """
     if unit == "*":
         return None
+    if not _readable(unit):
+        raise ConfigError(f"{unit[:LONGEST]!r} is no unit; {_EXPECTED_UNIT}")
     try:
         found = _registry().Unit("dimensionless" if unit == "1" else unit).dimensionality
     except Exception as error:
-        raise ConfigError(f"{unit} is no unit; expected one such as m/s² or kg/(m s)") from error
+        raise ConfigError(f"{unit!r} is no unit; {_EXPECTED_UNIT}") from error
     if set(found) - set(_BASE):
         raise ConfigError(f"the unit {unit} is not made of metre, second and kilogram")
     return _powers(found)
@@ -53,11 +89,20 @@ def in_si(value: str) -> tuple[float, str]:
     Raises:
         ConfigError: it is no number with a unit.
     """
+    wrong = (
+        f"{value[:LONGEST]!r} is no quantity; expected a finite number and a unit, such as 30 m/s "
+        "or 1.2 m/s², with powers of one digit"
+    )
+    if not _readable(value):
+        raise ConfigError(wrong)
     try:
         found = _registry().Quantity(value)
-        return float(found.to_base_units().magnitude), shown(_powers(found.dimensionality))
+        size, unit = float(found.to_base_units().magnitude), _powers(found.dimensionality)
     except Exception as error:
-        raise ConfigError(f"{value!r} is no quantity; expected one such as 30 m/s") from error
+        raise ConfigError(wrong) from error
+    if not math.isfinite(size):
+        raise ConfigError(wrong)
+    return size, shown(unit)
 
 
 def _powers(found: Mapping[str, Any]) -> Dimension:
@@ -122,7 +167,13 @@ def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Di
             a, b = of
             assert a is not None
             assert b is not None
-            return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+            total = (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+            if max(map(abs, total)) > _HIGHEST_POWER:
+                raise ConfigError(
+                    f"{plain(part)} has a unit to a power above {_HIGHEST_POWER}; divide by a "
+                    "scale of the same unit first"
+                )
+            return total
         case "neg":
             return of[0]
         case "recip" | "sqrt":

@@ -14,6 +14,7 @@ from torch import Tensor
 from nnode.laws.crowd import CrowdLaw
 from nnode.laws.expression import Expr, const, substitute, symbol
 from nnode.laws.lane import UNITS, Lane, changed
+from nnode.laws.names import check_names
 from nnode.laws.steps import stepped
 from nnode.laws.tensors import Code, LaneRates, computed
 from nnode.models.scene import Scene
@@ -168,7 +169,12 @@ def own_values(terms: Sequence[Term], lane: Lane | CrowdLaw) -> dict[str, Tensor
 
 
 def owners(terms: Sequence[Term]) -> list[str]:
-    """The name of each term; of several of one name the second is numbered."""
+    """The name of each term; of several of one name the second is numbered.
+
+    Raises:
+        ConfigError: a name that cannot stand in a formula.
+    """
+    check_names("terms", [term.name for term in terms])
     seen: Counter[str] = Counter()
     found = []
     for term in terms:

@@ -9,7 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from nnode.errors import ConfigError
 from nnode.laws.expression import Expr, apply, symbol
+
+#: Most neurons of a layer. The paper's networks have 10; formulas write every neuron out.
+NEURONS = 1000
 
 
 class FeedForward(nn.Module):
@@ -34,6 +38,11 @@ class FeedForward(nn.Module):
         super().__init__()
         if len(sizes) < 2 or min(sizes) < 1:
             raise ValueError(f"a network needs at least two layers of one neuron, got {sizes}")
+        if max(sizes) > NEURONS:
+            raise ConfigError(
+                f"a network with {max(sizes)} neurons in a layer is too large, expected at most "
+                f"{NEURONS}"
+            )
         self.sizes = tuple(sizes)
         self.layers = nn.ModuleList(
             nn.Linear(n_in, n_out, dtype=torch.float64) for n_in, n_out in pairwise(sizes)

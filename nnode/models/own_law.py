@@ -15,6 +15,7 @@ from nnode.errors import ConfigError
 from nnode.laws.crowd import OTHERS, POINTS, SMALLEST, WALLS, CrowdRule
 from nnode.laws.expression import Expr, const, symbol
 from nnode.laws.lane import Lane, Rule, of_rule
+from nnode.laws.names import check_names
 from nnode.laws.parse import parse
 from nnode.laws.steps import METHODS
 from nnode.laws.units import in_si
@@ -42,6 +43,8 @@ _KEYS = (
     "source",
 )
 _CROWD_KEYS = ("parameters", "constants", "where", "rate", "source")
+#: Entries of both that are mappings.
+_MAPPINGS = ("parameters", "constants", "where", "delayed", "states")
 _SUMS = (OTHERS, POINTS, WALLS)
 #: A network beside a law, by its order: what is named is brought to the size of one, SI units.
 _BESIDE = {1: "NN(gap/20)", 2: "NN(gap/20, v/10, dv/2)"}
@@ -54,7 +57,7 @@ _PARAMETER = ("value", "low", "high")
 
 def _three(key: str, name: Any, given: Any) -> tuple[str, str, str]:
     """An entry of ``states`` or ``delayed``."""
-    if isinstance(given, str) or len(given) != 3:
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 3:
         wanted = {"states": "[unit, rate, start]", "delayed": "[formula, unit, delay]"}[key]
         raise ConfigError(f"model.law.{key}.{name}={given} must be {wanted}")
     first, second, third = map(str, given)
@@ -65,7 +68,8 @@ class _Own(Term):
     """What laws of one's own share."""
 
     def _declare(self, name: str, given: Any) -> None:
-        if not name.isidentifier() or "__" in name or hasattr(self, name):
+        check_names("model.law.parameters", [name])
+        if hasattr(self, name):
             raise ConfigError(f"model.law.parameters: {name} cannot be the name of a parameter")
         entry = given if isinstance(given, Mapping) else {"value": given}
         unknown = sorted(set(entry) - set(_PARAMETER))
@@ -138,6 +142,7 @@ class FormulaLaw(_Own, Law):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
+        check_names("model.name", [name])
         self.name, self.source = str(name), str(source)  # type: ignore[misc]
         self.network: FeedForward | None = None
         if not isinstance(rate, Mapping) or list(rate) not in (["x"], ["v"]):
@@ -275,6 +280,7 @@ class FormulaForce(_Own, CrowdBase):
         **sums: Mapping[str, str],
     ) -> None:
         super().__init__()
+        check_names("model.name", [name])
         self.name, self.source = str(name), str(source)  # type: ignore[misc]
         axes = ("x", "y") if set(rate) == {"x", "y"} else ("vx", "vy")
         if set(rate) != set(axes):
@@ -329,11 +335,7 @@ def law_from(name: str, description: Any, **network: Any) -> FormulaLaw | Formul
             "model.law needs parameters and rate, as in {parameters: {v0: 30 m/s, L: 5 m}, "
             "rate: {x: v0*(1 - L/gap)}}"
         )
-    if not name.isidentifier() or "__" in name:
-        raise ConfigError(
-            f"model.name={name!r} of a formula must be letters, digits and single underscores, as "
-            "my_law"
-        )
+    check_names("model.name", [name])
     rate = description["rate"]
     people = isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
     keys = (*_CROWD_KEYS, *_REDUCED) if people else _KEYS
@@ -343,6 +345,10 @@ def law_from(name: str, description: Any, **network: Any) -> FormulaLaw | Formul
             f"model.law has the unknown entries {', '.join(unknown)}; there are {', '.join(keys)}"
         )
     found = {str(key): value for key, value in description.items()}
+    for key in (*_MAPPINGS, *_REDUCED):
+        if not isinstance(found.get(key) or {}, Mapping):
+            raise ConfigError(f"model.law.{key} must be a mapping of names, as {{v0: 30 m/s}}")
+        check_names(f"model.law.{key}", found.get(key) or {})
     if people:
         return FormulaForce(name, **found)
     return FormulaLaw(name, **found, **network)

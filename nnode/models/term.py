@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Rule
+from nnode.laws.names import check_names
 from nnode.models.scene import Scene
 
 if TYPE_CHECKING:
@@ -101,7 +102,12 @@ class Term(nn.Module):
     def declare(
         self, name: str, value: float, *, unit: str, bounds: Interval | None = None
     ) -> None:
-        """Add a scalar parameter, in float64, with its unit and admissible set."""
+        """Add a scalar parameter, in float64, with its unit and admissible set.
+
+        Raises:
+            ConfigError: its name cannot stand in a formula.
+        """
+        check_names("parameters", [name])
         start = torch.tensor(float(value), dtype=torch.float64)
         self.register_parameter(name, nn.Parameter(start))
         self.scalars.append(name)

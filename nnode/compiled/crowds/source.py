@@ -30,6 +30,7 @@ from nnode.compiled.loops import Loop
 from nnode.laws.crowd import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdLaw
 from nnode.laws.differentiate import derivatives
 from nnode.laws.expression import Expr, apply, below, symbol, symbols
+from nnode.laws.names import check_symbols
 from nnode.laws.tensors import computed
 from nnode.laws.text import plain
 
@@ -158,8 +159,13 @@ class CrowdSource:
         return self.rows.index(row) * SIZE
 
     def text(self) -> str:
-        """The module's source."""
+        """The module's source.
+
+        Raises:
+            ConfigError: a name in the formulas that is no symbol.
+        """
         law = self.law
+        check_symbols([*self.rows, *self.uniform, *law.symbols])
         state = "v" if law.order == 2 else ""
         lines = [f"d{state}{a}/dt = {plain(r)}" for a, r in zip("xy", law.rate, strict=True)]
         for over, found in self.over.items():

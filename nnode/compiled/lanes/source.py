@@ -18,6 +18,7 @@ from nnode.compiled.lanes.templates import HEAD, SIMULATE
 from nnode.compiled.loops import Loop
 from nnode.laws.expression import Expr, apply, const, symbol, symbols
 from nnode.laws.lane import Lane
+from nnode.laws.names import check_symbols
 from nnode.laws.tensors import SAFE
 from nnode.laws.text import plain
 
@@ -145,7 +146,12 @@ class LaneSource:
         return every
 
     def text(self) -> str:
-        """The module's source."""
+        """The module's source.
+
+        Raises:
+            ConfigError: a name in the formulas that is no symbol.
+        """
+        check_symbols([*self.rows, *self.parameters, *self.lane.symbols])
         places = "".join(
             f"_{row} = np.uint64({i * self.stride})\n" for i, row in enumerate(self.rows)
         )
