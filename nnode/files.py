@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +16,9 @@ from nnode.errors import ConfigError, DataError, WriteError
 
 #: Ends the names of files that are being written; ``.NAME.PROCESS`` stands before it.
 PARTIAL = ".partial"
+
+#: Levels of lists and mappings in what a file holds; a configuration has fewer than 10.
+DEPTH = 100
 
 #: What the system answers where there is no room, or where nothing may be written.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
@@ -91,6 +95,35 @@ def write_json(path: Path, content: dict[str, Any], indent: int | None = 2) -> P
     """Write JSON; NaN and infinities are kept, as Python's own reader takes them."""
     text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=True)
     return write_text(path, text + "\n")
+
+
+def interpolation(content: Any, most: float = math.inf) -> str | None:
+    """The first text with ``${...}`` in nested lists and mappings; None where there is none.
+
+    The configuration replaces such a text by other values, among them variables of the
+    environment. What comes from a file of others must not contain it.
+
+    Args:
+        most: values that there may be; a list that contains itself has no end.
+
+    Raises:
+        ValueError: more values than that, or nested more than 100 deep.
+    """
+    waiting, number = [(content, 0)], 0
+    while waiting:
+        value, depth = waiting.pop()
+        number += 1
+        if number > most or depth > DEPTH:
+            raise ValueError(f"more than {most:g} values, or nested more than {DEPTH} deep")
+        if isinstance(value, str) and "${" in value:
+            return value
+        inner: Iterable[Any] = ()
+        if isinstance(value, Mapping):
+            inner = (part for item in value.items() for part in item)
+        elif isinstance(value, list | tuple | set):
+            inner = value
+        waiting += [(part, depth + 1) for part in inner]
+    return None
 
 
 def xarray() -> Any:

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 #: The installed program.
@@ -14,6 +15,9 @@ PROGRAM = "nnode"
 
 #: The installed commands: their files are read before they are imported, as that takes seconds.
 COMMANDS = Path(__file__).parent / "app" / "commands"
+
+#: Hydra's option for a folder of the user's own choices.
+_CONFIG_DIR = ("--config-dir", "-cd")
 
 #: Variable of the environment: the root of the checkout whose script runs.
 _ROOT = "NNODE_SCRIPTS"
@@ -63,6 +67,18 @@ def configuration() -> Path:
     if root is not None:
         return root / "conf"
     return installed if installed.is_dir() else package.parent / "conf"
+
+
+def choices(group: str) -> list[str]:
+    """Names that a group of the configuration has: those of the files ``conf/GROUP/NAME.yaml``."""
+    return sorted(path.stem for path in (configuration() / group).glob("*.yaml"))
+
+
+def own_choices(group: str) -> list[str]:
+    """The same of the user's own folder, which the command line names with ``--config-dir``."""
+    found = [after for word, after in pairwise(sys.argv) if word in _CONFIG_DIR]
+    found += [w.partition("=")[2] for w in sys.argv if w.startswith(f"{_CONFIG_DIR[0]}=")]
+    return sorted(path.stem for name in found for path in (Path(name) / group).glob("*.yaml"))
 
 
 def words(name: str, conf: Path) -> str:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nnode.errors import CheckpointError, NNodeError
-from nnode.files import disk_words, replacing
+from nnode.files import disk_words, interpolation, replacing
 from nnode.models import System, build_model
 from nnode.version import VERSION
 
@@ -103,7 +103,8 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     """Read a checkpoint with torch's safe loading: no code in it is executed.
 
     Raises:
-        CheckpointError: no such file, not a checkpoint, damaged, or of another format.
+        CheckpointError: no such file, not a checkpoint, damaged, of another format, or with
+            ``${...}`` in its configuration.
     """
     file = Path(path)
     if not file.is_file():
@@ -127,6 +128,20 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         raise CheckpointError(
             f"{file} is damaged: {', '.join(wrong)} hold(s) what no checkpoint has there; take "
             "another checkpoint"
+        )
+    try:
+        # every value takes a byte; lists that contain each other have more values than bytes
+        most = file.stat().st_size
+        found = interpolation([content["config"], content["manifest"].get("options")], most)
+    except ValueError as error:
+        raise CheckpointError(
+            f"{file} is damaged: its configuration has {error}; take another checkpoint"
+        ) from error
+    if found is not None:
+        raise CheckpointError(
+            f"{file} is refused: its configuration holds {found[:80]!r}, and ${{...}} stands for "
+            "values of this machine, such as its environment; no run writes that: take another "
+            "checkpoint"
         )
     return Checkpoint(**content)
 

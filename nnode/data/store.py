@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from nnode.data._arrow import open_writer, to_sequence, to_table
 from nnode.data.sequence import Sequence
 from nnode.errors import DataError
+from nnode.files import interpolation
 
 TABLE = "sequences.parquet"
 #: A store that replaces another one has the name that the other has not.
@@ -54,17 +55,24 @@ class Store:
         self.folder = Path(folder)
         content = _read_manifest(self.folder)
         try:
-            self.manifest: dict[str, Any] = content["manifest"]
+            self.manifest: dict[str, Any] = dict(content["manifest"])
             self.index: list[dict[str, Any]] = content["sequences"]
             self.dims = int(content["dims"])
             self._bytes = int(content["table"]["bytes"])
             self._path = self.folder / _TABLES[_TABLES.index(content["table"]["file"])]
             self._walls = [np.asarray(w, float).reshape(-1, 4) for w in content["walls"]]
+            found = interpolation(self.manifest.get("options"))
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"{self.folder / MANIFEST} is damaged ({type(error).__name__}: {error}); "
                 "prepare the data again"
             ) from error
+        if found is not None:
+            raise DataError(
+                f"{self.folder / MANIFEST} is refused: its options hold {found[:80]!r}, and "
+                "${...} stands for values of this machine, such as its environment; no "
+                "preparation writes that: prepare the data again"
+            )
         path = self._path
         size = path.stat().st_size if path.is_file() else None
         if size != self._bytes:
@@ -270,7 +278,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         raise DataError(f"{folder} holds no prepared data: expected {MANIFEST} and {TABLE} in it")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is damaged: {error}; prepare the data again") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path} is no manifest of {FORMAT!r}; name a folder of prepared data")

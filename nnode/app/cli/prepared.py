@@ -12,7 +12,7 @@ from nnode.app.cli.typed import written
 from nnode.data.prepare import NOT_PREPARATION, made_by, refuse_others
 from nnode.data.store import Store
 from nnode.errors import ConfigError
-from nnode.program import configuration
+from nnode.program import choices
 
 
 def prepared_group(overrides: list[str]) -> list[str]:
@@ -44,7 +44,7 @@ def with_prepared(config: DictConfig) -> DictConfig:
     store = _store(folder)
     choice, own = str(HydraConfig.get().runtime.choices["data"]), _group(store)
     # another one of nnode's; a choice of the user's own may be of the same reader
-    other = choice != own and _file(choice).is_file()
+    other = choice != own and choice in choices("data")
     if other or OmegaConf.get_type(config.data) is not made_by(store):
         raise ConfigError(
             f"data.prepared={store.folder} holds data={own}, chosen is data={choice}; leave out "
@@ -63,12 +63,9 @@ def _store(folder: str) -> Store:
     return Store(Path(folder).expanduser())
 
 
-def _file(group: str) -> Path:
-    return configuration() / "data" / f"{group}.yaml"
-
-
 def _group(store: Store) -> str:
     """The group of the folder's data set, that of its reader where the user made his own."""
     reader, name = made_by(store), str(store.manifest["options"].get("name"))
-    known = _file(name).is_file() and written("data", name)[0] is reader
+    # the name comes from the folder's manifest: a path in it would lead out of conf/
+    known = name in choices("data") and written("data", name)[0] is reader
     return name if known else str(reader().name)

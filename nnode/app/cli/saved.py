@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.errors import CheckpointError, ConfigError
 from nnode.models.field import FIELD
+from nnode.program import choices, own_choices
 
 GROUPS = ("model", "data", "optimizer", "solver")
 
@@ -60,13 +61,26 @@ def path_given(overrides: list[str], option: str) -> str | None:
 
 
 def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GROUPS) -> list[str]:
-    """Overrides that choose a checkpoint's groups where the user chooses none."""
+    """Overrides that choose a checkpoint's groups where the user chooses none.
+
+    Raises:
+        CheckpointError: a group's name for which there is no file ``conf/GROUP/NAME.yaml``. Hydra
+            would take any path for a name, and would run what a file that it finds there asks for.
+    """
     path = path_given(overrides, option)
     if path is None:
         return []
     saved = load_checkpoint(path).config.get("groups", {})
     given = {override.partition("=")[0] for override in overrides}
     chosen = [group for group in groups if group in saved.keys() - given]
+    for group in chosen:
+        known = choices(group)
+        if saved[group] not in [*known, *own_choices(group)]:
+            raise CheckpointError(
+                f"{path} was made with {group}={str(saved[group])[:80]!r}, and there is no such "
+                f"file in conf/{group}, which has {', '.join(known)}; give {group}=NAME yourself, "
+                f"or name the folder with the file {group}/NAME.yaml with --config-dir"
+            )
     _chosen.update(chosen)
     return [f"{group}={saved[group]}" for group in chosen]
 

@@ -15,7 +15,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, make_absolute, plain
-from nnode.program import configuration
+from nnode.errors import ConfigError
+from nnode.program import choices, configuration
 
 
 def shell_override(key: str, value: object) -> str:
@@ -69,9 +70,17 @@ def group_defaults(section: str, group: str, script: str | None = None) -> dict[
 
 
 def written(section: str, group: str) -> tuple[type, DictConfig]:
-    """A group's schema, and what its file has besides."""
+    """A group's schema, and what its file has besides.
+
+    Raises:
+        ConfigError: no such file.
+    """
     from nnode.config import SCHEMAS
 
+    if group not in choices(section):
+        raise ConfigError(
+            f"{section}={group} is unknown, expected one of {', '.join(choices(section))}"
+        )
     own = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
     return SCHEMAS[section, str(own.pop("defaults")[0])], own
 
