@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -82,6 +83,15 @@ def _shut(error: OSError) -> bool:
     """Whether it is a file that is there, but may not be read."""
     place = error.filename
     return isinstance(place, str) and os.path.isfile(place) and not os.access(place, os.R_OK)
+
+
+def file_name(text: str) -> str:
+    """A name of a model or a recording as the stem of a file's name in one folder.
+
+    Signs of paths and control characters become ``_``, and a name does not begin with a point.
+    Names are cut to 100 characters, so that there is room for what a file's name ends with.
+    """
+    return re.sub(r"^\.+|[^\w .,+~'=()-]", "_", text)[:100] or "_"
 
 
 def write_text(path: Path, text: str) -> Path:

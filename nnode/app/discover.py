@@ -237,12 +237,14 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     place = shlex.quote(str(folder / MODEL))
     # an installed package's own folder is no place for a user's files
     own = [] if scripts() else ["--config-dir conf"]
-    train = ["python scripts/train.py", *own, f"model={name}", f"data={group}"]
+    copy = shlex.quote(f"conf/model/{name}.yaml")
+    model, data = shell_override("model", name), shell_override("data", group)
+    train = ["python scripts/train.py", *own, model, data]
     options = changes("data", config["data"], group_defaults("data", group))
     lines = [
         f"python scripts/evaluate.py {checkpoint}",
         f"python scripts/plot_forces.py {checkpoint}",
-        "mkdir -p conf/model && " * bool(own) + f"cp {place} conf/model/{name}.yaml",
+        "mkdir -p conf/model && " * bool(own) + f"cp {place} {copy}",
         " ".join([*train, *options]),
     ]
     return [typed(line) for line in lines]

@@ -13,6 +13,7 @@ from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.errors import ConfigError, DownloadError
+from nnode.files import file_name
 from nnode.models import System
 from nnode.plots import (
     curve_table,
@@ -84,9 +85,12 @@ def _traffic(
 
 
 def _crowd(models: dict[str, System], extent: float | None, folder: Path) -> list[Path]:
-    written = []
+    written: list[Path] = []
     for label, model in models.items():
-        stem = label.replace(", ", "_").replace(" ", "")
+        # the label is of the checkpoint, whoever made it
+        stem = file_name(label.replace(", ", "_").replace(" ", ""))
+        while folder / f"{stem}_settings.png" in written:  # labels may differ in such signs alone
+            stem += "_"
         for component, axis in enumerate("xy"):
             path = folder / f"{stem}_force_{axis}.png"
             save(force_contours(model, component, extent=extent), path)

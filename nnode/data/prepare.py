@@ -52,6 +52,7 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import start_smoothed
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError, DataError
+from nnode.files import file_name
 from nnode.progress import Stages
 from nnode.version import VERSION
 
@@ -363,7 +364,7 @@ def _drawn(folder: Path, judged: Judged, draw: Draw | None) -> Iterator[None]:
             for recording in dict.fromkeys(s.recording for s in sequences):
                 own = [s for s in sequences if s.recording == recording]
                 if any(faults[s.name] for s in own):
-                    name = recording.replace(os.sep, "_") + ".png"
+                    name = f"{file_name(recording)}.png"
                     draw(own, faults, judged.domain, partial / name)
         yield
         shutil.rmtree(folder / PLOTS, ignore_errors=True)

@@ -34,7 +34,7 @@ def check_names(what: str, names: Iterable[object]) -> None:
         good = isinstance(name, str) and _NAME.fullmatch(name) and not keyword.iskeyword(name)
         if not good:
             raise ConfigError(
-                f"{what}: {str(name)[:_SHOWN]!r} cannot be the name of an entry; expected ASCII "
+                f"{what}: {str(name)[:_SHOWN]!r} cannot be a name; expected ASCII letters, "
                 "letters, digits and single underscores between them, beginning with a letter, and "
                 "no keyword of Python, as v0 or time_gap"
             )

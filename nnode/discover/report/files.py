@@ -234,7 +234,8 @@ def has_network(system: System) -> bool:
 
 def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
     """A model's options as a file for ``conf/model``."""
-    name, own = options["name"], "" if scripts() else "--config-dir conf "
+    # in a comment: a line break would end it
+    name, own = " ".join(str(options["name"]).split()), "" if scripts() else "--config-dir conf "
     lines = [
         f"# Made by {typed('python scripts/discover.py')}. "
         f"Copy it to conf/model/{name}.yaml, then: {own}model={name}",
