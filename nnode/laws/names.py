@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from nnode.errors import ConfigError
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*")
-#: Symbols are an owner's name and a name of its own, joined by two underscores.
-_SYMBOL = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:__?[A-Za-z0-9]+)*")
+#: Symbols are made of names, of their owners' names, and of numbers.
+_SYMBOL = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 #: Most entries of a kind, such as ``where``: the package's laws have 30 at most. A law with 100
 #: of each kind is built, or refused, within seconds.
 ENTRIES = 100
@@ -18,11 +18,13 @@ ENTRIES = 100
 _SHOWN = 80
 
 
-def check_names(what: str, names: Iterable[object]) -> None:
+def check_names(what: str, names: Iterable[object], *, in_code: bool = False) -> None:
     """Check that names can stand in formulas and in generated source.
 
     Args:
         what: the kind of the names, for the error.
+        in_code: whether they stand in Python code, where a name such as ``lambda_`` ends with an
+            underscore because it would be a keyword without it.
 
     Raises:
         ConfigError: too many names, a name with other characters, or a keyword of Python.
@@ -31,12 +33,12 @@ def check_names(what: str, names: Iterable[object]) -> None:
     if len(names) > ENTRIES:
         raise ConfigError(f"{what}: {len(names)} entries, expected at most {ENTRIES}")
     for name in names:
-        good = isinstance(name, str) and _NAME.fullmatch(name) and not keyword.iskeyword(name)
-        if not good:
+        text = name if isinstance(name, str) and not keyword.iskeyword(name) else ""
+        if not _NAME.fullmatch(text.removesuffix("_") if in_code else text):
             raise ConfigError(
                 f"{what}: {str(name)[:_SHOWN]!r} cannot be a name; expected ASCII letters, "
-                "letters, digits and single underscores between them, beginning with a letter, and "
-                "no keyword of Python, as v0 or time_gap"
+                "digits and single underscores between them, beginning with a letter, and no "
+                "keyword of Python, as v0 or time_gap"
             )
 
 

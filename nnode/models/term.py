@@ -107,7 +107,7 @@ class Term(nn.Module):
         Raises:
             ConfigError: its name cannot stand in a formula.
         """
-        check_names("parameters", [name])
+        check_names("parameters", [name], in_code=True)
         start = torch.tensor(float(value), dtype=torch.float64)
         self.register_parameter(name, nn.Parameter(start))
         self.scalars.append(name)

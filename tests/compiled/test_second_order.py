@@ -129,7 +129,7 @@ def test_effects_act_on_a_law_of_one_s_own(ragged: Any) -> None:
         ({"parameters": {"v0": "fast"}}, "no quantity"),
         ({"parameters": {"v0": {"low": "1 m/s"}}}, "expected a quantity"),
         ({"parameters": {"v0": {"value": "1 m/s", "low": "2 s"}}}, "same kind of unit"),
-        ({"parameters": {"a b": "1"}}, "cannot be the name"),
+        ({"parameters": {"a b": "1"}}, "cannot be a name"),
         ({"colour": "red"}, "unknown entries colour"),
     ],
 )
