@@ -70,8 +70,8 @@ class Store:
         if found is not None:
             raise DataError(
                 f"{self.folder / MANIFEST} is refused: its options hold {found[:80]!r}, and "
-                "${...} stands for values of this machine, such as its environment; no "
-                "preparation writes that: prepare the data again"
+                "${...} stands for values of this machine, such as its environment; prepare the "
+                "data again, from names without ${"
             )
         path = self._path
         size = path.stat().st_size if path.is_file() else None

@@ -125,6 +125,42 @@ def test_values_of_another_kind_are_refused(
         load_checkpoint(changed(saved, **values))
 
 
+@pytest.mark.parametrize("text", ["${oc.env:HOME}", "a/${oc.env:HOME}.csv", "${x:1}", "\\${a}"])
+def test_values_of_this_machine_are_no_part_of_a_checkpoint(saved: Path, text: str) -> None:
+    before = load_checkpoint(saved)
+    places: list[dict[str, object]] = [
+        {"config": {**before.config, "data": {"source": text}}},
+        {"config": {**before.config, "model": {"law": {"where": {"a": ["b", text]}}}}},
+        {"config": {**before.config, text: 1}},
+        {"manifest": {**before.manifest, "options": {"columns": {text: "x"}}}},
+    ]
+    content = torch.load(saved, weights_only=True)
+    for values in places:
+        torch.save({**content, **values}, saved)
+        with pytest.raises(CheckpointError, match="is refused: its configuration holds") as error:
+            load_checkpoint(saved)
+        assert "environment" in str(error.value)
+    # a name that nothing replaces
+    torch.save({**content, "split": {"train": [text]}}, saved)
+    assert load_checkpoint(saved).split == {"train": [text]}
+
+
+def test_a_configuration_without_an_end_is_refused(saved: Path) -> None:
+    config = load_checkpoint(saved).config
+    endless: list[object] = []
+    endless.append(endless)
+    doubled: list[object] = ["a"]
+    for _ in range(60):
+        doubled = [doubled, doubled]
+    deep: list[object] = []
+    for _ in range(200):
+        deep = [deep]
+    for value in (endless, doubled, deep):
+        changed(saved, config={**config, "data": {"columns": value}})
+        with pytest.raises(CheckpointError, match="is damaged: its configuration has more than"):
+            load_checkpoint(saved)
+
+
 def test_a_configuration_of_no_model_is_refused(saved: Path) -> None:
     config = load_checkpoint(saved).config
     with pytest.raises(CheckpointError, match=r"describes no model \(KeyError"):

@@ -333,3 +333,21 @@ def test_an_index_of_another_kind_is_damage(folder: Path, walls: object) -> None
     (folder / MANIFEST).write_text(json.dumps(content))
     with pytest.raises(DataError, match="the store is damaged"):
         Store(folder)[0]
+
+
+def test_values_of_this_machine_are_no_part_of_a_manifest(tmp_path: Path) -> None:
+    options = {"path": "a/${oc.env:HOME}.csv"}
+    for wrong in (options, {"columns": {"time": ["${oc.env:HOME}"]}}):
+        with pytest.raises(DataError, match="is refused: its options hold"):
+            write_store(tmp_path, [bare("a")], {"options": wrong})
+    # elsewhere it is a name as any other: nothing replaces it
+    kept = write_store(tmp_path, [bare("${a}")], {"options": {"path": "a.csv"}, "note": "${b}"})
+    assert kept.manifest["note"] == "${b}"
+    assert kept[0].name == "${a}"
+
+
+@pytest.mark.parametrize("text", ["[" * 10**5, '{"a":' * 10**5])
+def test_a_manifest_nested_without_end_is_damaged(tmp_path: Path, text: str) -> None:
+    (tmp_path / MANIFEST).write_text(text)
+    with pytest.raises(DataError, match="is damaged"):
+        Store(tmp_path)

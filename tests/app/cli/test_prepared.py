@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -124,3 +125,15 @@ def test_every_reader_has_a_group_of_its_usual_name() -> None:
     for reader in FORMATS:
         assert written("data", str(reader().name))[0] is reader
     assert {TableOptions, WalkwayOptions} <= set(FORMATS)
+
+
+@pytest.mark.parametrize("name", ["../" * 12 + "{}/evil", "{}/evil", "../data/table"])
+def test_a_manifest_names_no_file_outside_the_configuration(
+    table: Path, tmp_path: Path, name: str
+) -> None:
+    store = shutil.copytree(table, tmp_path / "store")
+    (store / "evil.yaml").write_text("defaults:\n- table_schema\ndomain: traffic\npath: x\n")
+    content = json.loads((store / "manifest.json").read_text())
+    content["manifest"]["options"]["name"] = name.format(str(store).lstrip("/"))
+    (store / "manifest.json").write_text(json.dumps(content))
+    assert prepared_group([f"data.prepared={store}"]) == ["data=table"]

@@ -1,0 +1,233 @@
+"""Run folders, checkpoints and prepared data of somebody else: a command that reads them runs
+nothing of theirs, sends nothing away, and writes into its own folder only."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
+from nnode.models import build_model
+from nnode.models.own_law import law_from
+
+pytestmark = pytest.mark.thorough
+
+Script = Callable[..., subprocess.CompletedProcess[str]]
+Made = Callable[..., Path]
+
+LAW = {
+    "parameters": {"v0": "30 m/s", "T": "1.2 s"},
+    "rate": {"v": "(v0*(1 - v*T/gap) - v)/T"},
+    "step": "euler",
+}
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """Three cars at one speed."""
+    rows = [
+        ("s", round(0.2 * k, 3), f"car{n}", 25.0 * n + 3.0 * k) for k in range(20) for n in range(3)
+    ]
+    path = tmp_path / "cars.csv"
+    pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"]).to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture
+def made(tmp_path: Path, table: Path) -> Made:
+    """A checkpoint with other options than those of an honest one."""
+
+    def make(law: dict[str, Any] = LAW, **sections: dict[str, Any]) -> Path:
+        config = {
+            "model": {
+                "name": "mine", "term": "formula", "effects": [], "leader": "measured", "law": law,
+                "network": None, "box": None, "desired": "last", "wall_spacing": 0.25,
+            },
+            "data": {"name": "table", "domain": "traffic", "path": str(table), "faults": "drop"},
+            "solver": {"name": "fused", "dt": None, "method": None, "threads": 1},
+            "optimizer": {"name": "gauss_newton"},
+            "trainer": {"dtype": "float64", "threads": None, "cost": "integral", "device": "cpu"},
+            "groups": {"model": "formula", "data": "table", "solver": "fused",
+                       "optimizer": "gauss_newton"},
+        }  # fmt: skip
+        config = {key: {**value, **sections.get(key, {})} for key, value in config.items()}
+        path = tmp_path / "theirs" / "checkpoints" / "best.pt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        weights = {"terms.0.v0": 30.0, "terms.0.T": 1.2}
+        model = {name: torch.tensor(value, dtype=torch.float64) for name, value in weights.items()}
+        save_checkpoint(
+            Checkpoint(config={**config, "seed": 0}, manifest={}, model=model, optimizer={},
+                       progress={"epoch": 1, "step": 1}), path,
+        )  # fmt: skip
+        return path
+
+    return make
+
+
+def evaluated(
+    started: Script, path: Path, folder: Path, **env: str
+) -> subprocess.CompletedProcess[str]:
+    words = (f"checkpoint={path}", "part=all", "replay=false", f"hydra.run.dir={folder}")
+    return started("evaluate", *words, **env)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("states", "a: {}"), ("states", "[{}]"), ("delayed", "[{}].b"), ("where", "a=[{}]")],
+)
+def test_a_name_in_a_law_is_no_code(
+    started: Script, made: Made, tmp_path: Path, kind: str, name: str
+) -> None:
+    entries = {"states": ["m/s", "0*v0/T", "0*v0"], "delayed": ["v", "m/s", "T"], "where": "gap"}
+    law = {**LAW, "remembered": 1, kind: {"good": entries[kind]}}
+    done = evaluated(started, made(law), tmp_path / "honest", NNODE_CACHE=str(tmp_path / "cache"))
+    assert done.returncode == 0, done.stderr
+    trap = tmp_path / "trap"
+    code = f'__import__("pathlib").Path("{trap}").touch()'
+    bad = made({**law, kind: {name.format(code): entries[kind]}})
+    done = evaluated(started, bad, tmp_path / "out", NNODE_CACHE=str(tmp_path / "cache"))
+    assert not trap.exists()
+    assert done.returncode == 2
+    assert "cannot be a name" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+class Trap:
+    """Unpickling this makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self.path,)
+
+
+def callbacks(folder: Path, trap: Path) -> str:
+    """A configuration that runs code at the start of a job."""
+    (folder / "data.bin").write_bytes(pickle.dumps(Trap(trap)))
+    return (
+        "hydra:\n  callbacks:\n    one:\n      _target_: pandas.read_pickle\n"
+        f"      filepath_or_buffer: {folder / 'data.bin'}\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("evaluate", "checkpoint={}"), ("export", "run={}"), ("simulate", "run={}"),
+        ("train", "resume={}"), ("plot_forces", "checkpoint={}"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("group", ["data", "solver"])
+def test_a_run_brings_no_configuration(
+    started: Script, made: Made, tmp_path: Path, command: str, option: str, group: str
+) -> None:
+    if (command, group) == ("plot_forces", "solver"):
+        pytest.skip("it has no such group")
+    trap, base = tmp_path / "trap", {"data": "table", "solver": "fused"}[group]
+    file = tmp_path / "theirs.yaml"
+    file.write_text(
+        f"# @package _global_\ndefaults: [/{group}/{base}@{group}]\n" + callbacks(tmp_path, trap)
+    )
+    up = "../" * 15 + str(file.with_suffix("")).lstrip("/")
+    path = made(groups={group: up})
+    done = started(command, option.format(path), f"hydra.run.dir={tmp_path / 'out'}")
+    assert not trap.exists()
+    assert done.returncode == 1
+    assert f"and there is no such file in conf/{group}" in done.stderr
+
+
+def test_nor_does_prepared_data(started: Script, table: Path, tmp_path: Path) -> None:
+    store, trap = tmp_path / "store", tmp_path / "trap"
+    words = ("data=table", f"data.path={table}", "data.domain=traffic")
+    done = started("prepare_data", *words, f"hydra.run.dir={store}")
+    assert done.returncode == 0, done.stderr
+    (store / "worse.yaml").write_text("# @package _global_\n" + callbacks(store, trap))
+    up = "../" * 15 + str(store).lstrip("/")
+    (store / "evil.yaml").write_text(
+        f"defaults:\n- table_schema\n- {up}/worse@_global_\n- _self_\ndomain: traffic\npath: x\n"
+    )
+    content = json.loads((store / "manifest.json").read_text())
+    content["manifest"]["options"]["name"] = f"{up}/evil"
+    (store / "manifest.json").write_text(json.dumps(content))
+    words = (f"data.prepared={store}", "data.split.heldout=0", "trainer.max_epochs=1")
+    done = started("train", "model=lin", *words, f"hydra.run.dir={tmp_path / 'out'}")
+    assert not trap.exists()
+    assert done.returncode == 0, done.stderr  # it is a table, whatever it is called
+
+
+@pytest.fixture
+def asked() -> Iterator[tuple[str, list[str]]]:
+    """The address of a server on this machine, and the paths that it was asked for."""
+    paths: list[str] = []
+
+    class Listener(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            paths.append(self.path)
+            self.send_error(404)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    server = HTTPServer(("127.0.0.1", 0), Listener)
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", paths
+    server.shutdown()
+
+
+def test_the_environment_stays_here(
+    started: Script, made: Made, tmp_path: Path, asked: tuple[str, list[str]]
+) -> None:
+    address, paths = asked
+    secret = {"MY_SECRET": "opensesame", "no_proxy": "127.0.0.1"}
+    away = {"name": "esimas", "domain": "traffic", "recording": "1-1_1", "min_vehicles": 3}
+    for data in (
+        {**away, "source": address + "/${oc.env:MY_SECRET}"},
+        {"path": str(tmp_path / "${oc.env:MY_SECRET}.csv")},
+        {"path": "${oc.decode:${oc.env:MY_SECRET}}"},
+    ):
+        path = made(data=data, groups={"data": data.get("name", "table")})
+        done = evaluated(started, path, tmp_path / "out", **secret)
+        assert done.returncode == 1
+        assert "is refused: its configuration holds" in done.stderr
+        assert "opensesame" not in done.stderr + done.stdout
+    assert paths == []
+
+
+def test_a_model_s_name_is_no_path(started: Script, made: Made, tmp_path: Path) -> None:
+    people = {
+        "name": "../../escaped", "term": "social_force", "effects": [], "tau": 0.5, "mass": 1.0,
+        "walls": False, "wall_spacing": 0.25, "desired": "last", "A": 1.0, "k": 1.0, "kappa": 1.0,
+        "r": 0.25, "B": 0.05, "opposing_wall_friction": False,
+    }  # fmt: skip
+    path = made(model=people)
+    content = torch.load(path, weights_only=True)
+    content["config"]["data"]["recording"] = "all"
+    content["model"] = dict(build_model(people, 0, torch.float64).state_dict())
+    torch.save(content, path)
+    out = tmp_path / "a" / "b" / "out"
+    both = path.with_name("again.pt")  # the second one's name has its recording behind it
+    content["config"]["data"]["recording"] = "/../../../recorded"
+    torch.save(content, both)
+    done = started("plot_forces", f"checkpoint=[{path},{both}]", f"hydra.run.dir={out}")
+    assert done.returncode == 0, done.stderr
+    found = [p for p in tmp_path.rglob("*") if "escaped" in p.name or "recorded" in p.name]
+    assert len(found) == 8
+    assert {p.parent for p in found} == {out}
+
+
+def test_the_traps_work(tmp_path: Path) -> None:
+    """What the tests above wait for does happen where it is allowed."""
+    pd.read_pickle(tmp_path / "data.bin") if callbacks(tmp_path, tmp_path / "trap") else None
+    assert (tmp_path / "trap").exists()
+    law_from("mine", LAW)
