@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from nnode.errors import ConfigError, DataError
+from nnode.files import csv_cell
 
 #: Whole numbers below this are exact as floating-point numbers.
 _EXACT = 2.0**53
@@ -163,7 +164,11 @@ class Table:
         whole = pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all()
         if whole and (cells.dropna().abs() < _EXACT).all():
             cells = cells.astype("Int64")
-        text = cells.astype("string").fillna("").str.strip()
+        text = cells.astype("string").fillna("")
+        marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
+        if marked.any():
+            text = text.where(~marked, text[marked].map(csv_cell))
+        text = text.str.strip()
         return np.asarray(text, dtype=object)
 
     def row(self, i: int) -> str:
