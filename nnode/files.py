@@ -113,9 +113,9 @@ def csv_text(frame: pd.DataFrame) -> str:
             safe.isetitem(place, Series(cells, frame.index, dtype=object).array)
     safe.columns = frame.columns.map(csv_safe)
     # pandas leaves a carriage return without quotes, and then reads two rows
-    returns = any("\r" in text for text in texts)
-    quoting = csv.QUOTE_NONNUMERIC if returns else csv.QUOTE_MINIMAL
-    return str(safe.to_csv(index=False, quoting=quoting))
+    if any("\r" in text for text in texts):
+        return safe.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC)
+    return safe.to_csv(index=False)
 
 
 def csv_safe(cell: Any) -> Any:
