@@ -5,9 +5,42 @@ Every message says what was expected, what was found, where (file, row, option) 
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
+#: Characters of a message, at most.
+LONGEST = 2000
+
+#: What a terminal obeys or cannot show: control characters other than line feed and tab, the marks
+#: that reverse the direction of writing, separators of lines, and halves of surrogate pairs.
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+
+
+def printable(text: str, limit: int = LONGEST) -> str:
+    """A text that holds parts of files, as it may be shown.
+
+    Control characters are written as escapes, such as ``\\x1b``. A longer text loses its middle:
+    a message begins with the place of an error and ends with what to do.
+    """
+    shown = _CONTROL.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
+    if len(shown) <= limit:
+        return shown
+    note = f" [... {len(shown)} characters in all ...] "
+    left = limit - len(note)
+    return shown[: left - left // 3] + note + shown[len(shown) - left // 3 :]
+
 
 class NNodeError(Exception):
-    """Root of every error that the package raises on purpose."""
+    """Root of every error that the package raises on purpose.
+
+    Texts are made printable, and are at most :data:`LONGEST` characters long: they may quote cells,
+    names of columns and other parts of files.
+    """
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*(printable(a) if isinstance(a, str) else a for a in args))
 
 
 class DataError(NNodeError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import json
 import math
@@ -11,9 +12,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nnode.errors import ConfigError, DataError, WriteError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Ends the names of files that are being written; ``.NAME.PROCESS`` stands before it.
 PARTIAL = ".partial"
@@ -26,6 +30,10 @@ _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, 
 
 #: What it answers where a file stands in place of a folder, or the other way round.
 _NO_FOLDER = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG}
+
+
+#: Texts that a spreadsheet takes for a formula, and those that were made safe already.
+_FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
 
 
 @contextmanager
@@ -99,6 +107,44 @@ def write_text(path: Path, text: str) -> Path:
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
+
+
+def csv_text(frame: pd.DataFrame) -> str:
+    """A data frame as CSV with full precision and without row numbers.
+
+    Spreadsheets run cells that begin with ``=``, ``+``, ``-`` or ``@``. An apostrophe is put before
+    such a text, and before such a name of a column; numbers, also those that are text, stay as they
+    are. :func:`csv_cell` takes the apostrophe away.
+    """
+    from pandas import Series
+
+    safe, texts = frame.copy(), [str(name) for name in frame.columns]
+    for place, kind in enumerate(frame.dtypes):
+        if kind.kind not in "biufcmM":  # numbers and times
+            cells = [csv_safe(cell) for cell in frame.iloc[:, place]]
+            texts += [cell for cell in cells if isinstance(cell, str)]
+            safe.isetitem(place, Series(cells, frame.index, dtype=object).array)
+    safe.columns = frame.columns.map(csv_safe)
+    # pandas leaves a carriage return without quotes, and then reads two rows
+    if any("\r" in text for text in texts):
+        return safe.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC)
+    return safe.to_csv(index=False)
+
+
+def csv_safe(cell: Any) -> Any:
+    """A cell that a spreadsheet does not take for a formula, see :func:`csv_text`."""
+    if not isinstance(cell, str) or not _FORMULA.match(cell):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
+
+
+def csv_cell(text: str) -> str:
+    """A cell's text as it was before :func:`csv_text`."""
+    return text[1:] if text[:1] == "'" and _FORMULA.match(text) else text
 
 
 def write_json(path: Path, content: dict[str, Any], indent: int | None = 2) -> Path:

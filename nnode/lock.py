@@ -38,7 +38,7 @@ _held: dict[tuple[int, Path], FileLock] = {}
 def take(folder: Path) -> None:
     """Take the folder, which is made where it is missing; a process may take it several times.
 
-    What a killed run left half written is removed: nobody is at work on it any more.
+    What a killed run left half written is removed, except below folders that other runs have taken.
 
     Raises:
         FolderInUseError: another process has it; says which.
@@ -71,9 +71,27 @@ def take(folder: Path) -> None:
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             words = f"process {os.getpid()} on {socket.gethostname()}, since {since}"
             (folder / LOCK).write_text(words)
-        for path in folder.rglob(f".*{PARTIAL}"):
-            if _REST.fullmatch(path.name):
-                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        _remove_rests(folder)
+
+
+def _remove_rests(folder: Path) -> None:
+    """Remove what killed runs left half written, but not below folders of other runs.
+
+    A folder with a lock file of its own belongs to another run. That run may be at work, and if it
+    was killed, the next run in its folder removes what it left.
+    """
+    for place, folders, files in os.walk(folder):
+        if LOCK in files and Path(place) != folder:
+            folders.clear()
+            continue
+        for name in [name for name in (*folders, *files) if _REST.fullmatch(name)]:
+            path = Path(place, name)
+            if name in folders and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+            if name in folders:
+                folders.remove(name)
 
 
 def give(folder: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from nnode.errors import FolderInUseError, WriteError
-from nnode.files import disk_words, write_text
+from nnode.files import disk_words, replacing, write_text
 from nnode.lock import LOCK, alone, give, take
 
 HOLD = """
@@ -65,6 +65,29 @@ def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
     with alone(tmp_path):
         assert not any(path.exists() for path in half)
         assert all(path.exists() for path in own)
+
+
+def test_what_a_live_run_in_a_folder_below_writes_is_kept(tmp_path: Path) -> None:
+    inner = tmp_path / "sweep" / "inner"
+    code = f"from pathlib import Path\nfrom nnode.lock import take\ntake(Path({str(tmp_path)!r}))"
+    (inner / "checkpoints").mkdir(parents=True)
+    beside = tmp_path / "sweep" / ".result.json.7.partial"
+    beside.write_text("of a killed run")
+    with alone(inner), replacing(inner / "checkpoints" / "last.pt") as temporary:
+        temporary.write_text("new")
+        subprocess.run([sys.executable, "-c", code], check=True)
+        assert not beside.exists()
+    assert (inner / "checkpoints" / "last.pt").read_text() == "new"
+
+
+def test_a_link_in_place_of_a_rest_is_removed_and_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "data").write_text("")
+    (tmp_path / "run" / ".a.1.partial").symlink_to(tmp_path / "else")
+    with alone(tmp_path / "run"):
+        assert not os.path.lexists(tmp_path / "run" / ".a.1.partial")
+    assert (tmp_path / "else" / "data").exists()
 
 
 def test_a_full_disk_is_told_in_words_and_other_errors_pass(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.check.findings import Finding
 from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
 from nnode.data.sequence import Domain
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, printable
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
 from nnode.program import typed
@@ -133,7 +133,7 @@ def summary(found: Examination, lines: list[str]) -> str:
         text += ["", "no reader takes the file as it is; in Python:", *found.source.convert]
     text += ["", "to read it:", "  python scripts/prepare_data.py " + " ".join(lines)]
     text += ["the same options go to python scripts/train.py and python scripts/discover.py"]
-    return "\n".join(text)
+    return "\n".join(printable(line) for line in text)
 
 
 def _units(found: Examination) -> str:

@@ -21,7 +21,7 @@ from nnode.calibrate.options import TrainerOptions
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.store import Store
-from nnode.files import write_json
+from nnode.files import csv_text, write_json, write_text
 from nnode.program import typed
 
 log = logging.getLogger(__name__)
@@ -97,7 +97,7 @@ def train(config: DictConfig, folder: Path) -> None:
     }
     if result.own is not None:
         paths["own parameters"] = folder / OWN
-        result.own.to_csv(folder / OWN, index=False)
+        write_text(folder / OWN, csv_text(result.own))
     write_json(folder / RESULT, result.plain({name: str(path) for name, path in paths.items()}))
     print(result.summary())
     for what, path in paths.items():

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from nnode.data.sequence import Domain, Sequence
@@ -36,6 +39,12 @@ UNUSABLE = frozenset({"gap_in_time", "non_finite", "duplicate"})
 
 #: Steps whose median displacement extrapolates a path; more than one, as steps are noisy.
 RECENT = 3
+
+#: Pairs of positions near each other that are looked at one by one; each takes 24 bytes.
+PAIRS = 10**7
+
+#: Positions that may be joined by distances within a path's reach where swaps are looked for.
+CROWDED = 2000
 
 
 @dataclass(frozen=True)
@@ -201,11 +210,13 @@ def _values(view: _View) -> Iterator[Fault]:
 
 def _duplicates(view: _View) -> Iterator[Fault]:
     s = view.sequence
-    for i in range(len(s.agents)):
-        again = [j for j in range(i + 1, len(s.agents)) if s.agents[j] == s.agents[i]]
-        if again and s.agents[i] not in s.agents[:i]:
-            text = f"identifier {s.agents[i]} is given to {len(again) + 1} agents"
-            yield view.fault("duplicate", (i, *again), None, text)
+    bearers: dict[str, list[int]] = {}
+    for i, name in enumerate(s.agents):
+        bearers.setdefault(name, []).append(i)
+    for name, agents in bearers.items():
+        if len(agents) > 1:
+            text = f"identifier {name} is given to {len(agents)} agents"
+            yield view.fault("duplicate", tuple(agents), None, text)
     same: dict[bytes, list[int]] = {}
     for i in range(s.n_agents):
         if not np.isnan(s.x[:, i]).any():
@@ -277,11 +288,51 @@ def _expected(sound: np.ndarray, k: int) -> np.ndarray:
 
 def _continuations(expected: np.ndarray, then: np.ndarray, reach: float) -> dict[int, int]:
     """Which agent's next position continues which agent's path, where it is not its own."""
-    cost = np.minimum(np.nan_to_num(cdist(expected, then), nan=reach), reach)
-    rows, columns = linear_sum_assignment(cost)
-    return {
-        int(i): int(j) for i, j in zip(rows, columns, strict=True) if i != j and cost[i, j] < reach
-    }
+    found: dict[int, int] = {}
+    for rows, columns in _groups(expected, then, reach):
+        cost = np.minimum(cdist(expected[rows], then[columns]), reach)
+        for a, b in zip(*linear_sum_assignment(cost), strict=True):
+            i, j = int(rows[a]), int(columns[b])
+            if i != j and cost[a, b] < reach:
+                found[i] = j
+    return dict(sorted(found.items()))
+
+
+def _groups(a: np.ndarray, b: np.ndarray, reach: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Numbers of points of ``a`` and ``b`` (N, D) that are joined by distances up to ``reach``.
+
+    Points of different groups are farther apart, so that each group is a problem of its own. Groups
+    of more than :data:`CROWDED` points are left out: paths cannot be told apart there.
+    """
+    known = [np.flatnonzero(np.isfinite(x).all(axis=1)) for x in (a, b)]
+    i, j = (own[k] for own, k in zip(known, _near(a[known[0]], b[known[1]], reach), strict=True))
+    n = len(a)
+    graph = coo_array((np.ones(len(i)), (i, n + j)), shape=(2 * n, 2 * n))
+    label = connected_components(graph, directed=False)[1]
+    members = np.argsort(label, kind="stable")
+    for group in np.split(members, np.flatnonzero(np.diff(label[members])) + 1):
+        if 1 < len(group) <= CROWDED:
+            yield group[group < n], group[group >= n] - n
+
+
+def _near(a: np.ndarray, b: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the points of ``a`` (N, D) and ``b`` (M, D) that are not farther than ``reach``.
+
+    Of more than :data:`PAIRS` pairs each point's two nearest stand for all, so that memory grows
+    with the number of points and not with its square.
+    """
+    if not len(a) or not len(b):
+        return np.empty(0, int), np.empty(0, int)
+    one, other = cKDTree(a), cKDTree(b)
+    # a little farther, because trees compare squares; the caller decides at the limit
+    reach *= 1 + 1e-9
+    if one.count_neighbors(other, reach) <= PAIRS:
+        found = one.sparse_distance_matrix(other, reach, output_type="ndarray")
+        return found["i"], found["j"]
+    _, j = other.query(a, k=2, distance_upper_bound=reach)
+    i = np.repeat(np.arange(len(a)), 2)
+    there = j.ravel() < len(b)
+    return i[there], j.ravel()[there]
 
 
 def _order(view: _View, found: list[Fault]) -> Iterator[Fault]:
@@ -302,15 +353,25 @@ def _order(view: _View, found: list[Fault]) -> Iterator[Fault]:
 
 def _overlaps(view: _View) -> Iterator[Fault]:
     x, limit = view.x, view.limits.spacing
-    close: dict[tuple[int, int], list[tuple[int, float]]] = {}
-    for k in range(len(x)):
-        distance = cdist(x[k], x[k])
-        for i, j in np.argwhere(np.triu(distance < limit, k=1)):
-            close.setdefault((int(i), int(j)), []).append((k, float(distance[i, j])))
-    for pair, samples in close.items():
-        least = min(distance for _, distance in samples)
+    time, agent = np.nonzero(np.isfinite(x).all(axis=2))
+    # times lie apart by more than the limit in a dimension of their own
+    points = np.column_stack([x[time, agent], 2 * limit * time])
+    i, j = _near(points, points, limit)
+    distance = np.sqrt(((x[time[i], agent[i]] - x[time[j], agent[j]]) ** 2).sum(axis=1))
+    first, second = np.minimum(agent[i], agent[j]), np.maximum(agent[i], agent[j])
+    rows = np.stack([first, second, time[i]], axis=1)
+    close = (first < second) & (distance < limit)
+    # each pair stands there twice
+    rows, index = np.unique(rows[close], axis=0, return_index=True)
+    distance = distance[close][index]
+    starts = np.flatnonzero(np.diff(rows[:, :2], axis=0, prepend=-1).any(axis=1))
+    for rank in np.argsort(rows[starts, 2], kind="stable"):
+        begin = starts[rank]
+        end = starts[rank + 1] if rank + 1 < len(starts) else len(rows)
+        pair = int(rows[begin, 0]), int(rows[begin, 1])
         text = (
-            f"{view.who(pair[0])} and {view.who(pair[1])} are down to {least:.2f} m apart at "
-            f"{len(samples)} of {len(x)} samples, less than {limit:g} m"
+            f"{view.who(pair[0])} and {view.who(pair[1])} are down to "
+            f"{distance[begin:end].min():.2f} m apart at {end - begin} of {len(x)} samples, less "
+            f"than {limit:g} m"
         )
-        yield view.fault("overlap", pair, samples[0][0], text)
+        yield view.fault("overlap", pair, int(rows[begin, 2]), text)

@@ -9,7 +9,7 @@ import pandas as pd
 
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.evaluate import Metrics
-from nnode.files import replacing
+from nnode.files import csv_text, write_text
 from nnode.models import System
 
 
@@ -57,6 +57,4 @@ def write_results(
 
 def write_csv(path: Path, table: pd.DataFrame) -> Path:
     """Write a table, with full precision and without row numbers."""
-    with replacing(path) as temporary:
-        table.to_csv(temporary, index=False)
-    return path
+    return write_text(path, csv_text(table))

@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import torch
 from pyarrow.csv import CSVWriter
 
@@ -19,7 +20,7 @@ from nnode.data._arrow import open_writer, schema, to_table
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.exchange.tables import write_csv
-from nnode.files import replacing, write_text
+from nnode.files import csv_safe, replacing, write_text
 
 #: Formats of trajectories, and of whom each can be.
 FORMATS = {
@@ -158,8 +159,18 @@ def write_table(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
         writer = CSVWriter(temporary, schema(dims)) if text else open_writer(temporary, dims)
         with writer:
             for s in sequences:
-                writer.write_table(to_table(_directed(s)))
+                table = to_table(_directed(s))
+                writer.write_table(_safe(table) if text else table)
     return path
+
+
+def _safe(table: pa.Table) -> pa.Table:
+    """The table with texts that a spreadsheet does not take for formulas."""
+    for i, field in enumerate(table.schema):
+        if pa.types.is_string(field.type) and table[i].null_count < table.num_rows:
+            cells = pa.array(map(csv_safe, table[i].to_pylist()), field.type)
+            table = table.set_column(i, field, cells)
+    return table
 
 
 def write_walls(path: Path, sequences: Iterable[Sequence]) -> tuple[Path | None, int]:

@@ -27,6 +27,12 @@ FIGURES = "figures"
 #: Pixels of a style sheet in an inch.
 _PIXELS = 96
 
+#: Code in Markdown: fenced lines, and spans within a paragraph.
+_CODE = re.compile(
+    r"(^```[^`\n]*\n.*?^```[ ]*$|(?<!`)(?P<ticks>`+)(?!`)(?:(?!\n\s*\n).)+?(?<!`)(?P=ticks)(?!`))",
+    re.M | re.S,
+)
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -181,49 +187,67 @@ def _facts(blocks: list[Block]) -> dict[str, str]:
 
 
 def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
-    parts = [f"# {title}"]
+    parts = [f"# {tables.markdown(title)}"]
     if subtitle:
-        parts.append(subtitle)
+        parts.append(_without_html(subtitle))
     for block in blocks:
         match block:
             case Heading(text, level):
-                parts.append(f"{'#' * level} {text}")
+                parts.append(f"{'#' * level} {tables.markdown(text)}")
             case Text(markdown):
-                parts.append(markdown.strip())
+                parts.append(_without_html(markdown))
             case TableBlock():
-                parts.append(f'<a id="table-{block.name}"></a>{block.caption.strip()}')
+                parts.append(f'<a id="table-{block.name}"></a>{_without_html(block.caption)}')
                 parts.append(_markdown_table(block))
                 parts.append(f"[{block.name}.csv]({block.name}.csv)")
             case FigureBlock():
-                alt = re.sub(r"\s+", " ", block.alt).replace("[", "(").replace("]", ")").strip()
+                alt = tables.markdown(block.alt.replace("[", "(").replace("]", ")")).strip()
                 parts.append(f"![{alt}]({FIGURES}/{block.name}.png)")
-                parts.append(f'<a id="figure-{block.name}"></a>{block.caption.strip()}')
+                parts.append(f'<a id="figure-{block.name}"></a>{_without_html(block.caption)}')
             case ReplayBlock():
                 place = f"Player (in {stem}.html)"  # sites of Markdown have no such page
-                parts.append(f'<a id="figure-{block.name}"></a>{place}: {block.caption.strip()}')
+                parts.append(
+                    f'<a id="figure-{block.name}"></a>{place}: {_without_html(block.caption)}'
+                )
     facts = _facts(blocks)
     if facts:
         parts.append("---")
-        parts.append("\n".join(f"- {name}: {fact}" for name, fact in facts.items()))
+        parts.append(
+            "\n".join(f"- {name}: {tables.markdown(fact)}" for name, fact in facts.items())
+        )
     return "\n\n".join(parts) + "\n"
 
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [_piped(tables.one_name(name)) for name in block.frame.columns]
-    labels = [_piped(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]]
+    names = [tables.markdown(tables.one_name(name)) for name in block.frame.columns]
+    labels = [
+        tables.markdown(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]
+    ]
     sides = ["---:" if cell.right else "---" for cell in grid.head[-1][len(labels) :]]
     lines = [labels + names, ["---"] * len(labels) + sides]
     for row, cells in grid.rows:
         lines.append(
-            [_piped(cell.text) for cell in row]
-            + [f"**{_piped(c.text)}**" if c.bold else _piped(c.text) for c in cells]
+            [tables.markdown(cell.text) for cell in row]
+            + [
+                f"**{tables.markdown(c.text)}**" if c.bold else tables.markdown(c.text)
+                for c in cells
+            ]
         )
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _piped(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+def _without_html(markdown: str) -> str:
+    """The text of a block without HTML and images, as the page in HTML shows it."""
+    parts, end = [], 0
+    for code in _CODE.finditer(markdown.strip()):
+        parts += [_plain(markdown.strip()[end : code.start()]), code.group()]
+        end = code.end()
+    return "".join([*parts, _plain(markdown.strip()[end:])])
+
+
+def _plain(text: str) -> str:
+    return text.replace("<", "&lt;").replace("![", "\\![")
 
 
 def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -11,6 +12,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+
+from nnode.errors import printable
+from nnode.files import csv_text
+
+#: What Markdown could take for a link, an image, code, emphasis, HTML or the end of a cell.
+_MARKS = re.compile(r"[\\`*\[!|]|(?<!\w)_|_(?!\w)")
+_ENTITY = re.compile(r"&(?=#?\w+;)")
 
 #: Digits after the point where nothing else is asked for.
 DIGITS = 2
@@ -37,6 +45,12 @@ class Grid:
 
     head: list[list[Cell]]
     rows: list[tuple[list[Cell], list[Cell]]]
+
+
+def markdown(text: str) -> str:
+    """A text, such as a name from a file, as Markdown that shows it as it is, in one line."""
+    line = _ENTITY.sub("&amp;", re.sub(r"\s+", " ", printable(text)))
+    return _MARKS.sub(r"\\\g<0>", line).replace("<", "&lt;")
 
 
 def number(value: Any, digits: int = DIGITS) -> str:
@@ -150,7 +164,7 @@ def csv(frame: pd.DataFrame) -> str:
     body = frame.reset_index(drop=True)
     body.columns = pd.Index([one_name(name) for name in frame.columns])
     whole = pd.concat([labels.reset_index(drop=True), body], axis=1)
-    return str(whole.to_csv(index=False))
+    return csv_text(whole)
 
 
 def one_name(name: Any) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -166,6 +167,21 @@ def test_traffic_s_table_is_read_as_it_was(tmp_path: Path, ending: str) -> None:
     (back,) = read_table(path, TableOptions(domain="traffic", path=str(path)))
     np.testing.assert_array_equal(back.x, s.x)
     np.testing.assert_array_equal(back.length, s.length)
+
+
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
+def test_names_that_look_like_formulas_are_read_as_they_were(tmp_path: Path, ending: str) -> None:
+    s = walk(
+        agents=("=1+1", "'@x", "-7"), name="run/+a", kind=("-k", "", "=k"), group=("@", "", "")
+    )
+    path = write_table(tmp_path / f"walk.{ending}", [s], 2)
+    if ending == "csv":
+        cells = pd.read_csv(path, dtype=str)
+        assert list(cells["agent"][:3]) == ["'=1+1", "''@x", "-7"]
+        assert not cells["sequence"].str.match(r"[=+\-@]").any()
+    (back,) = read_table(path, TableOptions(domain="crowd", path=str(path)))
+    assert (back.agents, back.kind, back.group) == (s.agents, s.kind, s.group)
+    assert back.name == s.name
 
 
 @pytest.mark.parametrize("ending", ["parquet", "csv"])

@@ -12,8 +12,10 @@ from urllib.parse import unquote
 import numpy as np
 import pandas as pd
 import pytest
+from markdown_it import MarkdownIt
 
 from nnode.errors import ConfigError
+from nnode.files import csv_cell, csv_text
 from nnode.pages.page import (
     Block,
     FigureBlock,
@@ -23,7 +25,7 @@ from nnode.pages.page import (
     Text,
     write_page,
 )
-from nnode.pages.tables import number
+from nnode.pages.tables import markdown, number
 from nnode.plots.style import dress, new_figure
 
 #: Elements that have no end.
@@ -265,3 +267,86 @@ def test_pages_that_cannot_be_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="page cannot be written to"):
         write_page([Text("t")], tmp_path / "file", title="T")
+
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    "![x](https://example.org/x.png)",
+    "[x](https://example.org)",
+    "a|b",
+    "`<b>`",
+    "*a* _b_ **c**",
+    "&lt;i&gt; \\<i>",
+    "a\n\n# b\x1b[31m",
+)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_text_from_files_is_no_markup_in_markdown(tmp_path: Path, name: str) -> None:
+    frame = pd.DataFrame({name: [name]}, index=pd.Index([name], name=name))
+    page = [Heading(name), TableBlock("t", frame, f"Of {markdown(name)}."), Provenance({"a": name})]
+    write_page(page, tmp_path, title=name, subtitle=f"S {markdown(name)}", stem="page")
+    text = (tmp_path / "page.md").read_text()
+    assert "\x1b" not in text
+    html = MarkdownIt("commonmark", {"xhtmlOut": False}).enable("table").render(text)
+    shown = Reader(html)
+    tags = {tag for tag, _ in shown.elements}
+    assert tags <= {
+        "h1",
+        "h2",
+        "p",
+        "a",
+        "table",
+        "thead",
+        "tbody",
+        "tr",
+        "th",
+        "td",
+        "hr",
+        "ul",
+        "li",
+    }
+    assert shown.all("href") == ["t.csv"]
+    plain = re.sub(r"\s+", " ", name).replace("\x1b", r"\x1b")
+    assert [cell.strip() for row in shown.tables[0] for cell in row] == [plain] * 4
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "<script>alert(1)</script>",
+        "`a` <img src=x> `b`",
+        "`` ` `` <img src=x>",
+        "` a\n\n<img src=x> `",
+        "```sh\nls\n```\n<img src=x>",
+        "```\nnever ended <img src=x>",
+        "![x](https://example.org/x.png)",
+    ],
+)
+def test_paragraphs_hold_no_html_and_no_images(tmp_path: Path, words: str) -> None:
+    write_page([Text(words)], tmp_path, title="a", stem="page")
+    html = MarkdownIt("commonmark", {"xhtmlOut": False}).render((tmp_path / "page.md").read_text())
+    assert not {tag for tag, _ in Reader(html).elements} & {"script", "img"}
+
+
+def test_code_stays_as_it_is(tmp_path: Path) -> None:
+    words = "If `a < b` then a < b.\n\n```python\nif a < b: pass\n```"
+    write_page([Text(words)], tmp_path, title="a", stem="page")
+    text = (tmp_path / "page.md").read_text()
+    assert "If `a < b` then a &lt; b." in text
+    assert "if a < b: pass" in text
+
+
+def test_spreadsheets_find_no_formulas(tmp_path: Path) -> None:
+    cells = ["=1+1", "+a", "-a", "@a", "\ta", "\ra", "'=a", "-1.5", "+3e2", "plain", "", None, -2]
+    frame = pd.DataFrame({"=name": cells, "x": np.arange(-6.0, 7)})
+    text = csv_text(frame)
+    found = pd.read_csv(io.StringIO(text), keep_default_na=False, dtype=str)
+    assert list(found) == ["'=name", "x"]
+    assert list(found["'=name"]) == [
+        "'=1+1", "'+a", "'-a", "'@a", "'\ta", "'\ra", "''=a", "-1.5", "+3e2", "plain", "", "", "-2",
+    ]  # fmt: skip
+    assert [float(x) for x in found["x"]] == list(frame["x"])
+    kept = [cell for cell in cells if isinstance(cell, str)]
+    assert [csv_cell(cell) for cell in found["'=name"][: len(kept)]] == kept
+    assert (TableBlock("t", frame, "").csv()) == text

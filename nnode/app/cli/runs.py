@@ -6,6 +6,7 @@ Runs of a sweep may be other processes, on other machines: only the files that t
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 from pathlib import Path
@@ -17,8 +18,8 @@ from omegaconf import DictConfig
 
 from nnode.calibrate.distributed import World
 from nnode.calibrate.interrupt import Interrupted
-from nnode.errors import ConfigError, NNodeError
-from nnode.files import PARTIAL, disk_words
+from nnode.errors import ConfigError, NNodeError, printable
+from nnode.files import PARTIAL, csv_text, disk_words, write_text
 from nnode.lock import give, take
 
 #: What a run came to, or why it failed; in its folder.
@@ -50,6 +51,13 @@ class Runs(Callback):
         if World().first:
             _table(folder)
         give(folder)
+
+
+class LogFormatter(logging.Formatter):
+    """Lines of the log: they may quote names from files."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return printable(super().formatMessage(record))
 
 
 def end(error: NNodeError) -> NoReturn:
@@ -107,6 +115,6 @@ def _table(folder: Path) -> None:
         return
     rows = [{"run": run, **result.pop("summary", result)} for run, result in results.items()]
     table = pd.DataFrame(rows)
-    table.to_csv(folder / "sweep.csv", index=False)
+    write_text(folder / "sweep.csv", csv_text(table))
     print(f"{len(rows)} runs", table.to_string(index=False, float_format="{:.5g}".format), sep="\n")
     print(f"table: {folder / 'sweep.csv'}")

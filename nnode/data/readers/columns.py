@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from nnode.errors import ConfigError, DataError
+from nnode.files import csv_cell
 
 #: Whole numbers below this are exact as floating-point numbers.
 _EXACT = 2.0**53
@@ -70,10 +72,25 @@ class Table:
         self._take(frame)
 
     def _take(self, frame: pd.DataFrame) -> None:
-        self.frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
+        self.frame = frame
+        self.rename([str(name).strip() for name in frame.columns])
         self.frame = self.frame.dropna(how="all")
         if self.frame.empty:
             raise DataError(f"{self.path} has no rows below its columns {self._listing()}")
+
+    def rename(self, names: list[str]) -> None:
+        """Give the columns other names.
+
+        Raises:
+            DataError: two columns of one name.
+        """
+        twice = [name for name, number in Counter(names).items() if number > 1]
+        if twice:
+            raise DataError(
+                f"{self.path} has {names.count(twice[0])} columns {twice[0]!r}; give every column "
+                "a name of its own"
+            )
+        self.frame = self.frame.set_axis(names, axis=1)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -128,14 +145,14 @@ class Table:
             DataError: a cell without a finite number; names the row.
         """
         cells = self.frame[column]
-        values = np.array(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
+        values = _floats(cells)
         bad = ~np.isfinite(values)
         if empty:
             bad &= ~cells.isna().to_numpy()
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             cell = cells.iloc[i]
-            shown = "nothing" if pd.isna(cell) else repr(str(cell))
+            shown = "nothing" if cells.isna().iloc[i] else _quoted(cell)
             more = f" (and {bad.sum() - 1} more rows)" if bad.sum() > 1 else ""
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} holds {shown}{more}; expected a "
@@ -163,7 +180,18 @@ class Table:
         whole = pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all()
         if whole and (cells.dropna().abs() < _EXACT).all():
             cells = cells.astype("Int64")
-        text = cells.astype("string").fillna("").str.strip()
+        try:
+            text = cells.astype("string").fillna("")
+        except (TypeError, ValueError):  # bytes that are no text, or lists in cells
+            i = next(i for i, cell in enumerate(cells) if not absent[i] and _no_text(cell))
+            raise DataError(
+                f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells.iloc[i])}; "
+                "expected a name or number"
+            ) from None
+        marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
+        if marked.any():
+            text = text.where(~marked, text[marked].map(csv_cell))
+        text = text.str.strip()
         return np.asarray(text, dtype=object)
 
     def row(self, i: int) -> str:
@@ -186,6 +214,39 @@ class Table:
         if mapped:
             return text + f"; set data.columns.{key}={example}"
         return text + f"; rename the column that holds it to {key!r}"
+
+
+def _floats(cells: pd.Series) -> np.ndarray:
+    """Cells as float64, NaN where they hold no real number."""
+    if cells.dtype.kind == "c":
+        return np.full(len(cells), np.nan)
+    try:
+        return np.array(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):  # such as whole numbers beyond float64
+        return np.array([_float(cell) for cell in cells])
+
+
+def _float(cell: Any) -> float:
+    try:
+        return float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return np.nan
+
+
+def _no_text(cell: Any) -> bool:
+    try:
+        pd.Series([cell], dtype=object).astype("string")
+    except (TypeError, ValueError):
+        return True
+    return False
+
+
+def _quoted(cell: Any) -> str:
+    """A cell for messages; whole numbers of thousands of digits cannot be written."""
+    try:
+        return repr(str(cell))
+    except ValueError:
+        return "a number that is too large"
 
 
 def opened(source: Path | str | Table) -> Table:

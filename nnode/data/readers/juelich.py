@@ -28,6 +28,8 @@ UNITS = {"cm": 0.01, "m": 1.0}
 
 #: A table of frames and people may hold so many cells, or so many times its rows.
 _FRAMES, _SPARSE = 10**8, 1000
+#: From the first frame to the last there may be so many, or ten times those with somebody in them.
+_PAUSES = 10**5
 
 #: Frames per second beyond which a file is in error.
 FASTEST = 1e6
@@ -222,7 +224,8 @@ def _check_dense(path: Path, table: pd.DataFrame) -> None:
     """Refuse a stray frame number before a table of all frames is made for it."""
     frame = table["frame"]
     span = int(frame.max()) - int(frame.min()) + 1
-    if span * table["id"].nunique() > max(_FRAMES, _SPARSE * len(table)):
+    stray = span > max(_PAUSES, 10 * frame.nunique())
+    if stray or span * table["id"].nunique() > max(_FRAMES, _SPARSE * len(table)):
         raise DataError(
             f"{path}: {len(table)} rows stand in frames {frame.min()} to {frame.max()}; expected "
             "consecutive frame numbers: look for one that is wrong, or cut the file"

@@ -122,7 +122,7 @@ def _table(path: Path) -> Table:
         how["usecols"] = lambda name: _KNOWN.get(name.strip().lower()) in (*_NEEDED, *_USED)
     # the portal has written 6042842.1 as "6,042,842.1" at times
     table = Table(path, names, thousands=",", **how)
-    table.frame.columns = [_KNOWN.get(name.lower(), name) for name in table.frame.columns]
+    table.rename([_KNOWN.get(name.lower(), name) for name in table.frame.columns])
     return table
 
 

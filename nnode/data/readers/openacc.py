@@ -36,6 +36,12 @@ HEAD = ("Date", "Vehicle_order", "Number_of_vehicles", "ACC", "Distance_setting"
 #: Times of a run, with those that no row stands for.
 MOST_TIMES = 10**6
 
+#: Places in a platoon; its vehicles are tens.
+MOST_VEHICLES = 1000
+
+#: Times and places of a run may be so many, or so many times the rows that stand there.
+_CELLS, _SPARSE = 10**7, 10
+
 _FLAT = ("run", "position", "t", "v", "gap")
 
 
@@ -155,7 +161,7 @@ def _published_run(name: str, path: Path) -> Run:
 def _flat_runs(path: Path) -> Iterator[Run]:
     table = Table(path)
     names = table.choose(_FLAT, ("make", "acc", "setting"))
-    run, position = table.names("run"), table.numbers("position").astype(int)
+    run, position = table.names("run"), _positions(table)
     time, v, gap = (
         table.numbers("t"),
         table.numbers("v", empty=True),
@@ -168,14 +174,15 @@ def _flat_runs(path: Path) -> Iterator[Run]:
         order, i = np.unique(position[own], return_inverse=True)
         # a vehicle without a row has its place in the platoon all the same
         shape = (len(times), int(order[-1]))
+        _check_size(path, shape, len(own))
         place_of = order[i] - 1
         wide = {w: np.full(shape, np.nan) for w in ("v", "gap")}
         count = np.zeros(shape, int)
         np.add.at(count, (k, place_of), 1)
-        if order[0] < 1 or count.max() > 1:
+        if count.max() > 1:
             raise DataError(
-                f"{path}: run {name} has a position below 1, or two rows of one position at one "
-                "time; expected one row per vehicle and time, positions counted from 1"
+                f"{path}: run {name} has two rows of one position at one time; expected one row "
+                "per vehicle and time"
             )
         wide["v"][k, place_of], wide["gap"][k, place_of] = v[own], gap[own]
         make = [str(p + 1) for p in range(shape[1])]
@@ -187,6 +194,28 @@ def _flat_runs(path: Path) -> Iterator[Run]:
         nowhere = np.full((*shape, 2), np.nan)
         start, dt, (sv, sg, sp) = _gridded(path, times, wide["v"], wide["gap"], nowhere)
         yield Run(str(name), path, start, dt, sv, sg, sp, tuple(make), acc, setting or "none")
+
+
+def _positions(table: Table) -> np.ndarray:
+    """Places in the platoon, counted from 1."""
+    found = table.numbers("position")
+    odd = np.flatnonzero(~((found >= 1) & (found <= MOST_VEHICLES) & (found % 1 == 0)))
+    if odd.size:
+        i = int(odd[0])
+        raise DataError(
+            f"{table.path}, {table.row(i)}: position is {found[i]:g}; expected the place in the "
+            f"platoon, a whole number from 1 to {MOST_VEHICLES}"
+        )
+    return found.astype(int)
+
+
+def _check_size(path: Path, shape: tuple[int, int], rows: int) -> None:
+    """Refuse a time or a position that is wrong before a table is made for it."""
+    if shape[0] * shape[1] > max(_CELLS, _SPARSE * rows):
+        raise DataError(
+            f"{path}: {rows} rows stand at {shape[0]} equally spaced times of {shape[1]} vehicles; "
+            "look for a time or a position that is wrong, or cut the file"
+        )
 
 
 def _gridded(
@@ -212,6 +241,7 @@ def _gridded(
             f"{path}: the time {time[i]:g} s is no whole number of steps of {dt:g} s from the "
             f"first, {time[0]:g} s"
         )
+    _check_size(path, (int(k[-1]) + 1, columns[0].shape[1]), columns[0].size)
     full = [np.full((k[-1] + 1, *c.shape[1:]), np.nan) for c in columns]
     for wide, column in zip(full, columns, strict=True):
         wide[k] = column

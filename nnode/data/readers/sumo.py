@@ -116,6 +116,10 @@ class _Content:
                 f"{self.path}, line {error.lineno}: no whole XML document "
                 f"({expat.ErrorString(error.code)}); the simulation may still have been writing it"
             ) from error
+        except (LookupError, ValueError) as error:  # an encoding that is unknown or of many bytes
+            raise DataError(
+                f"{self.path}, line {self.parser.CurrentLineNumber}: {error}; write it in UTF-8"
+            ) from error
         except (OSError, EOFError, zlib.error) as error:
             raise DataError(f"{self.path} cannot be read: {error}") from error
         if not self.time:

@@ -28,6 +28,7 @@ from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
 from nnode.models import System
 from nnode.pages.page import FigureBlock
 from nnode.pages.replay import ReplayBlock
+from nnode.pages.tables import markdown
 from nnode.plots.quality import faults_figure
 
 #: Faulty sequences and variables that are drawn.
@@ -187,7 +188,7 @@ def _paths(
     s = every[0].sequence
     simulated = pair(*every[0].simulated.values())
     errors = ", ".join(f"{one.title} {amount(rmse(s, one.x), 2)} m" for one in simulated)
-    name = f"the sealed sequence {s.name}"
+    name, plain = (f"the sealed sequence {n}" for n in (markdown(s.name), s.name))
     unknown = "".join(
         f" Its agents' numbers are not known, so that {effect} does not act here."
         for effect in individual(found.extended)
@@ -199,12 +200,12 @@ def _paths(
             "trajectories",
             trajectories(s, simulated),
             f"Measured and simulated paths of {name}, on which nothing was calibrated.{unknown}",
-            f"Paths of {name}; root mean square error: {errors}.",
+            f"Paths of {plain}; root mean square error: {errors}.",
         ),
         FigureBlock(
             "moments",
             film_strip(s, simulated),
             f"Moments of {name}: open marks are measured, filled ones simulated, lines join them.",
-            f"Moments of {name}; root mean square error: {errors}.",
+            f"Moments of {plain}; root mean square error: {errors}.",
         ),
     ]

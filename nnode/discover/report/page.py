@@ -28,6 +28,7 @@ from nnode.discover.report.files import (
 from nnode.discover.result import Diagnosis
 from nnode.machine import how_made
 from nnode.pages.page import Block, Heading, Provenance, Text, write_page
+from nnode.pages.tables import markdown
 
 TENSORBOARD = "tensorboard"
 
@@ -114,7 +115,11 @@ def _laws(d: Diagnosis) -> list[Block]:
         f" Costs are those of {last.clusters} open clusters that calibrations left out in turn."
     )
     if d.laws.refused:
-        words += " Not compared: " + "; ".join(f"{k}: {v}" for k, v in d.laws.refused.items()) + "."
+        words += (
+            " Not compared: "
+            + "; ".join(f"{markdown(k)}: {markdown(v)}" for k, v in d.laws.refused.items())
+            + "."
+        )
     names = ("laws", "laws_again")
     return [
         Heading("Which base law"),
@@ -126,7 +131,7 @@ def _laws(d: Diagnosis) -> list[Block]:
 def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
     if d.notes:
-        blocks.append(Text("\n".join(f"- {note}" for note in d.notes)))
+        blocks.append(Text("\n".join(f"- {markdown(note)}" for note in d.notes)))
     if has_network(found.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
