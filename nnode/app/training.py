@@ -189,7 +189,7 @@ def trainer_of(
     free_speed = None
     if model.domain == "traffic" and world.first:
         free_speed = best_common_speed(
-            stream(straight_loader(store, parts.train, data.loader.batch_size))
+            stream(straight_loader(store, parts.train, data.loader.batch_size)), model
         )
     names = [entry["name"] for entry in store.index]
     return Trainer(

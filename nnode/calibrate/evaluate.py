@@ -40,6 +40,9 @@ class FreeFlow(FollowTheLeader):
 class Metrics:
     """Errors of one model on one set of sequences.
 
+    The distances leave out agents that the model is given as they were measured, as a leader with
+    ``model.leader=measured``.
+
     Attributes:
         J: mean cost of a sequence, m² s (or m² with the ``sum`` convention).
         rmse: root mean squared distance over all samples after the first, m.
@@ -89,13 +92,14 @@ def evaluate(
         costs.update({name: float(cost) for name, cost in names})
         error = squared_error(trajectory, batch)
         _check_finite(error, batch)
+        free = batch.agent if trajectory.given is None else batch.agent & ~trajectory.given
         for k in range(1, batch.n_samples):
-            total[k] = total.get(k, 0.0) + float(error[k].sum())
-            number[k] = number.get(k, 0) + int(batch.valid[k].sum())
+            total[k] = total.get(k, 0.0) + float((error[k] * free).sum())
+            number[k] = number.get(k, 0) + int((batch.valid[k] & free).sum())
         last = batch.valid.sum(0) - 1
         distance = error.gather(0, last.clamp(min=0)[None])[0].sqrt()
-        final += float((distance * batch.agent).sum())
-        agents += int(batch.agent.sum())
+        final += float((distance * free).sum())
+        agents += int(free.sum())
         if batch.x.shape[-1] == 1:
             for kind in FOLLOWING:
                 if kind is not Convention.speed or trajectory.v is not None:
@@ -141,18 +145,23 @@ def _times(batch: Batch) -> Tensor:
     return batch.dt * number
 
 
-def best_common_speed(batches: Iterable[Batch]) -> float:
+def best_common_speed(batches: Iterable[Batch], system: System | None = None) -> float:
     """The one speed (m/s) that fits all vehicles best, in closed form.
 
     It is the calibrated v0 of a model without interaction:
     sum t (x(t) - x(0)) / sum t² over all measured samples.
+
+    Args:
+        system: vehicles that this model is given as they were measured are left out.
     """
     above = below = 0.0
     for batch in batches:
         t = _times(batch)[:, None, None]
         way = (batch.x - batch.x[:1])[..., 0]
-        above += float((t * way * batch.valid).sum())
-        below += float((t.square() * batch.valid).sum())
+        given = None if system is None else system.given(batch)
+        counts = batch.valid if given is None else batch.valid & ~given
+        above += float((t * way * counts).sum())
+        below += float((t.square() * counts).sum())
     return above / below
 
 
@@ -163,7 +172,7 @@ def constant_velocity(system: System) -> Simulate:
         t = _times(batch)
         x = batch.x[:1] + t[:, None, None, None] * batch.v[:1]
         state = torch.cat([x, batch.v[:1].expand_as(x)][: system.order], -1)
-        return Trajectory(*system.observe(state, batch))
+        return Trajectory(*system.observe(state, batch), system.given(batch))
 
     return simulate
 

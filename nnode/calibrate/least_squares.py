@@ -72,7 +72,7 @@ def trajectory_residuals(cost: EnsembleCost, weights: np.ndarray | None = None) 
                 away = cost.solver(system, batch).x[1:][seen] - measured
         except SimulationError:
             return None
-        return (away * factor).flatten()
+        return (away * factor).flatten().to(batch.dtype)  # it decides the size of differences
 
     return residuals
 

@@ -16,6 +16,9 @@ Domain = Literal["traffic", "crowd"]
 
 #: Distance (m) between the padding vehicles that stand in front of a shorter platoon.
 PADDING_GAP = 1e5
+#: Fields of a batch that are positions. They stay in float64: numbers of float32 are 0.5 m apart
+#: at 7,000 km, where the coordinates of maps lie.
+_POSITIONS = ("x", "destination", "walls")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,8 +164,8 @@ class Batch:
 
     Attributes:
         dt: sampling interval in s, the same for all sequences of a batch.
-        x: ``(K, B, N, D)`` measured positions, m. Padding vehicles stand PADDING_GAP apart
-            in front of the leader, so that every gap stays finite; padding people stand
+        x: ``(K, B, N, D)`` measured positions, m, in float64. Padding vehicles stand PADDING_GAP
+            apart in front of the leader, so that every gap stays finite; padding people stand
             still, far away from everyone.
         v: ``(K, B, N, D)`` measured velocities, m/s; 0 in the padding.
         valid: ``(K, B, N)`` True where a sample was measured.
@@ -196,20 +199,58 @@ class Batch:
         """K, the number of samples of the longest sequence."""
         return int(self.x.shape[0])
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision of simulations; positions are in float64 in any case."""
+        return self.v.dtype
+
     def __len__(self) -> int:
         return int(self.x.shape[1])
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Batch:
-        """A copy on ``device`` with floating-point tensors in ``dtype``."""
+        """A copy on ``device`` for simulations in ``dtype``.
+
+        Floating-point tensors are in ``dtype``, apart from positions, which stay in float64. A
+        solver takes them relative to an origin of each sequence, see :meth:`relative_to`.
+        """
         moved = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
-                value = value.to(device, dtype if value.is_floating_point() else None)
+                kind = dtype if value.is_floating_point() else None
+                if kind is not None and field.name in _POSITIONS:
+                    kind = torch.float64
+                value = value.to(device, kind)
             moved[field.name] = value
         return Batch(**moved)
+
+    def origins(self) -> Tensor:
+        """``(B, D)`` m: of each sequence the middle of the measured positions, in whole metres.
+
+        Whole metres are subtracted from float64 without rounding, so that a sequence which is
+        moved by whole metres is the same problem.
+        """
+        measured, most = self.valid[..., None], torch.finfo(self.x.dtype).max
+        low = self.x.detach().masked_fill(~measured, most).amin((0, 2))
+        high = self.x.detach().masked_fill(~measured, -most).amax((0, 2))
+        return ((low + high) / 2).round()
+
+    def relative_to(self, origin: Tensor | None) -> Batch:
+        """A copy with positions in the precision of simulations.
+
+        Args:
+            origin: ``(B, D)`` m, subtracted from all positions before they are rounded; None: 0.
+        """
+        moved = {name: getattr(self, name) for name in _POSITIONS}
+        if origin is not None:
+            moved["x"] = self.x - origin[:, None]
+            moved["destination"] = self.destination - origin[:, None]
+            # the segments of walls have two ends; lanes have none, whatever their D is
+            ends = origin.repeat(1, 4 // origin.shape[1])
+            moved["walls"] = self.walls - ends[:, None]
+        return replace(self, **{name: value.to(self.dtype) for name, value in moved.items()})
 
     def select(self, places: list[int]) -> Batch:
         """The sequences at some places, padded as before."""

@@ -142,7 +142,8 @@ class Sequences:
         """How near these trajectories are to measured ones: minus the root mean square distance, m.
 
         Over all agents and all samples after the first, where a simulation starts: the RMSE that
-        ``nnode evaluate`` prints, so that higher is better and 0 the best.
+        ``nnode evaluate`` prints, so that higher is better and 0 the best. Leaders are left out
+        where the model was given their measured paths (``manifest["led"]``).
 
         Args:
             measured: sequences, or a table, with the same sequences and agents.
@@ -159,7 +160,8 @@ class Sequences:
                     f"sequence {other.name} is not among the simulated ones, or has other agents "
                     "or times; score what was predicted from the same table"
                 )
-            away = ((mine.x - other.x)[1:] ** 2).sum(-1)
+            free = slice(-1) if self.manifest.get("led") else slice(None)
+            away = ((mine.x - other.x)[1:, free] ** 2).sum(-1)
             total, number = total + float(away.sum()), number + away.size
         return -float(np.sqrt(total / max(number, 1)))
 

@@ -42,6 +42,7 @@ from functools import cached_property
 from typing import Any
 
 from nnode.errors import ConfigError
+from nnode.laws.differentiate import shift_slopes
 from nnode.laws.expression import Expr, apply, below, const, substitute, symbol, symbols
 from nnode.laws.names import check_names
 from nnode.laws.parse import parse
@@ -196,6 +197,12 @@ class CrowdLaw:
     def symbols(self) -> frozenset[str]:
         """Names in its formulas."""
         return frozenset(symbols(self.outputs))
+
+    @cached_property
+    def names_places(self) -> bool:
+        """Whether its formulas depend on positions other than by differences of them."""
+        slopes = [s for axis in "xy" for s in shift_slopes(self.outputs, {axis, f"goal_{axis}"})]
+        return not all(slope.is_number(0) for slope in slopes)
 
     @cached_property
     def is_formula(self) -> bool:

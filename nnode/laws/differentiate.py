@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from nnode.laws.expression import Expr, apply, below, const, reciprocal
 
@@ -86,3 +86,24 @@ def derivatives(node: Expr, names: list[str]) -> dict[str, Expr]:
     found = pull({node: _ONE}, lambda part: False)
     known = {part.value: bar for part, bar in found.items() if not bar.is_number(0)}
     return {name: known[name] for name in names if name in known}
+
+
+def shift_slopes(outputs: Sequence[Expr], moved: Collection[str]) -> list[Expr]:
+    """Forward mode: derivatives of formulas by an amount that is added to several symbols at once.
+
+    What depends on differences of these symbols alone has the number 0.
+    """
+    found: dict[Expr, Expr] = {}
+    for node in below(outputs):
+        if node.op == "symbol":
+            found[node] = _ONE if node.value in moved else _ZERO
+        elif all(found[part].is_number(0) for part in node.args):
+            found[node] = _ZERO
+        elif node.op == "call":  # code, whose slope is not known
+            found[node] = node
+        else:
+            total = _ZERO
+            for part, slope in zip(node.args, slopes(node), strict=True):
+                total = total + _weighted(found[part], slope)
+            found[node] = total
+    return [found[node] for node in outputs]

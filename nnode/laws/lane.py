@@ -28,6 +28,7 @@ from functools import cached_property
 from typing import Any
 
 from nnode.errors import ConfigError
+from nnode.laws.differentiate import shift_slopes
 from nnode.laws.expression import (
     Expr,
     apply,
@@ -144,6 +145,22 @@ class Lane:
         """Names in the rates."""
         every = [*self.rates.values(), self.leader, *self.leads.values(), *self.starts.values()]
         return frozenset(symbols(every))
+
+    @cached_property
+    def names_places(self) -> bool:
+        """Whether a flat formula depends on positions other than by differences of them.
+
+        Added states that start at a position, as what is remembered of the vehicle ahead, are
+        positions themselves.
+        """
+        positions = {"x", "x_1", "x_2"}
+        begun = dict(
+            zip(self.starts, shift_slopes([*self.starts.values()], positions), strict=True)
+        )
+        positions |= {f"{s}{j}" for s in begun if begun[s].is_number(1) for j in ("", "_1", "_2")}
+        every = shift_slopes([*self.rates.values(), self.leader, *self.leads.values()], positions)
+        known = all(slope.is_number(0) or slope.is_number(1) for slope in begun.values())
+        return not known or not all(slope.is_number(0) for slope in every)
 
     @cached_property
     def ahead(self) -> list[tuple[str, int]]:

@@ -14,6 +14,7 @@ from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.laws.crowd import CrowdRule
 from nnode.laws.lane import Lane
+from nnode.models.crowd_formula import crowd_of
 from nnode.models.formula import Law, begins, lane_of, rates_of, starts_of
 from nnode.models.scene import DESIRED, Scene, wanted
 from nnode.models.term import Interval, State, Term, physical_parameters, short_names
@@ -53,6 +54,12 @@ class System(nn.Module):
         for accelerations of vehicles and otherwise Euler's; see :mod:`nnode.laws.steps`."""
         return "euler"
 
+    @property
+    def names_places(self) -> bool:
+        """Whether rates depend on where the origin of positions lies, as with a speed zone; also
+        where this is not known, since a term is code."""
+        return True
+
     def scene(self, batch: Batch) -> Scene:
         """The fixed surroundings of a batch.
 
@@ -89,6 +96,10 @@ class System(nn.Module):
         if self.order == 1:
             return y[..., : self.dim], None
         return y[..., : self.dim], y[..., self.dim : 2 * self.dim]
+
+    def given(self, batch: Batch) -> Tensor | None:
+        """``(B, N)`` True for agents that follow their measured paths; None: there is none."""
+        return None
 
     def _terms(self) -> list[Term]:
         return cast(list[Term], list(self.terms))
@@ -171,6 +182,11 @@ class Traffic(System):
         """The model's formula; None where a term is code without one."""
         return lane_of(self._terms())
 
+    @property
+    def names_places(self) -> bool:
+        lane = self.lane
+        return lane is None or lane.names_places
+
     def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
         lane, terms = self.lane, self._terms()
         if lane is None:  # what is code and remembers nothing does not matter at the start
@@ -224,11 +240,17 @@ class Traffic(System):
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
         x, v = y[..., :1], y[..., 1:2] if self.order > 1 else None
-        if self.leader == "constant":
+        given = self.given(batch)
+        if given is None:
             return x, v
-        number = batch.agent.sum(1)
-        lead = (torch.arange(y.shape[2], device=y.device) == (number - 1)[:, None])[..., None]
+        lead = given[..., None]
         return torch.where(lead, batch.x, x), None if v is None else torch.where(lead, batch.v, v)
+
+    def given(self, batch: Batch) -> Tensor | None:
+        if self.leader == "constant":
+            return None
+        index = torch.arange(batch.agent.shape[1], device=batch.agent.device)
+        return index == (batch.agent.sum(1) - 1)[:, None]
 
 
 class Crowd(System):
@@ -261,6 +283,11 @@ class Crowd(System):
         if neighbours not in ("simulated", "measured"):
             raise ValueError(f"neighbours={neighbours} is unknown, expected simulated or measured")
         self.neighbours = neighbours
+
+    @property
+    def names_places(self) -> bool:
+        law = crowd_of(self._terms())
+        return law is None or law.names_places
 
     def scene(self, batch: Batch) -> Scene:
         return wanted(super().scene(batch), batch, self.desired)

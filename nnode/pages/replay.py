@@ -57,10 +57,12 @@ class Scene:
         sequence: as measured.
         simulated: ``(K, N, D)`` m by title, in the order of :data:`COLOURS`. Where it is no number
             nothing is shown.
+        led: whether the leader follows its measured path; the error that is shown leaves it out.
     """
 
     sequence: Sequence
     simulated: dict[str, np.ndarray]
+    led: bool = False
 
 
 @dataclass
@@ -148,6 +150,8 @@ def _scene(scene: Scene) -> dict[str, Any]:
         "measured": packed(s.x[keep]),
         "simulated": [{"title": t, "x": packed(x[keep])} for t, x in scene.simulated.items()],
     }
+    if scene.led:
+        found["led"] = 1
     if s.length is not None and _lengths(s):
         found["length"] = [round(float(one), 2) if np.isfinite(one) else CAR for one in s.length]
     if s.walls is not None and len(s.walls):

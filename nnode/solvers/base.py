@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
@@ -21,15 +22,19 @@ _CROWD_STEP = 0.0625
 
 @dataclass
 class Trajectory:
-    """A simulation at the sampling times of its batch.
+    """A simulation at the sampling times of its batch, in float64.
 
     Attributes:
-        x: ``(K, B, N, D)`` m.
+        x: ``(K, B, N, D)`` m, in the coordinates of the batch.
         v: ``(K, B, N, D)`` m/s in second-order models, else None.
+        given: ``(B, N)`` True for agents that follow their measured paths, as a leader with
+            ``model.leader=measured``: their error is 0 by construction, and errors of the model
+            leave them out. None: there is none.
     """
 
     x: Tensor
     v: Tensor | None
+    given: Tensor | None = None
 
 
 class Solver(Protocol):
@@ -37,6 +42,37 @@ class Solver(Protocol):
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         """Simulate from the first measured state, at the batch's sampling times."""
+
+
+def simulated_batch(system: System, batch: Batch) -> tuple[Batch, Tensor | None]:
+    """What a solver computes with: the batch, all of it in the precision of simulations.
+
+    Simulations in float64 take positions as they are. Others take them relative to an origin of
+    each sequence, since what float32 rounds grows with the distance from the origin. Where the
+    model's formula names places themselves, as a speed zone does, they stay as they are too.
+
+    Returns:
+        The batch and the origins ``(B, D)``, m; None: positions are as they are.
+    """
+    if batch.dtype == batch.x.dtype:
+        return batch, None
+    origin = None if system.names_places else batch.origins()
+    return batch.relative_to(origin), origin
+
+
+def observed(system: System, y: Tensor, batch: Batch, origin: Tensor | None) -> Trajectory:
+    """The trajectory of simulated states, in the coordinates of the batch.
+
+    Args:
+        y: ``(..., B, N, M)`` states, positions first.
+        batch: as it was measured, before :func:`simulated_batch`.
+        origin: ``(B, D)`` m, of the states; None: 0.
+    """
+    y = y.to(batch.x.dtype)
+    if origin is not None:
+        dim = origin.shape[1]
+        y = torch.cat([y[..., :dim] + origin[:, None], y[..., dim:]], -1)
+    return Trajectory(*system.observe(y, batch), system.given(batch))
 
 
 def substeps(sampling: float, dt: float | None, system: System) -> int:

@@ -14,7 +14,13 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.laws.steps import METHODS, STAGES
 from nnode.models.system import System
-from nnode.solvers.base import Trajectory, check_finite, substeps
+from nnode.solvers.base import (
+    Trajectory,
+    check_finite,
+    observed,
+    simulated_batch,
+    substeps,
+)
 from nnode.solvers.rates import Rates
 
 FIXED_STEP = tuple(
@@ -99,8 +105,9 @@ class TorchdiffeqSolver:
         """The same, states that are no finite numbers among them."""
         n = substeps(batch.dt, self.dt, system)
         method = self.method or system.step
-        rates = Rates(system, batch, n, method if method in METHODS else "euler")
-        y0 = system.initial(batch, batch.dt / n)
+        near, origin = simulated_batch(system, batch)
+        rates = Rates(system, near, n, method if method in METHODS else "euler")
+        y0 = system.initial(near, batch.dt / n)
         t = n * torch.arange(batch.n_samples, dtype=y0.dtype, device=y0.device)
         method = STAGES.get(method, method)
         options = {"grid_constructor": whole_steps} if method in FIXED_STEP else {}
@@ -115,4 +122,4 @@ class TorchdiffeqSolver:
             y = odeint_adjoint(rates, y0, t, adjoint_params=trained, **kwargs)
         else:
             y = odeint(rates, y0, t, **kwargs)
-        return Trajectory(*system.observe(y, batch))
+        return observed(system, y, batch, origin)

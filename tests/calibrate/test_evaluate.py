@@ -222,4 +222,45 @@ def test_baselines_follow_the_model_s_precision() -> None:
     model = Traffic([Linear()]).to(torch.float32)
     batch = collate([steady(2, [12.5] * 2, 4)]).to(dtype=torch.float32)
     for simulate in baselines(model, TorchdiffeqSolver("euler", dt=0.02), 12.5).values():
-        assert simulate(batch).x.dtype == torch.float32
+        assert simulate(batch).x.dtype == torch.float64  # positions, whatever the precision
+
+
+def test_a_leader_that_follows_its_measured_path_is_left_out() -> None:
+    batch = collate([traffic("a", [[0, 10], [5, 16], [9, 21]]), traffic("c", [[0, 8], [4, 12]])])
+    model = Traffic([Linear(20.0, 5.0)], leader="measured")
+
+    def late(given: bool) -> Trajectory:
+        x = batch.x.clone()
+        x[1:, :, 0] -= 3.0
+        return Trajectory(x, None, model.given(batch) if given else None)
+
+    free, every = (evaluate(lambda _, g=g: late(g), [batch]) for g in (True, False))  # type: ignore[misc]
+    assert free.rmse == pytest.approx(3.0)
+    assert every.rmse == pytest.approx(3.0 / 2**0.5)
+    assert free.final_displacement == pytest.approx(3.0)
+    assert [row["rmse"] for row in free.horizons] == pytest.approx([3.0, 3.0])
+    assert [row["n"] for row in free.horizons] == [2, 1]
+    # what is minimised, and what is of followers anyway, is the same
+    assert free.J == every.J
+    assert free.objectives == every.objectives
+
+
+@pytest.mark.parametrize("leader", ["constant", "measured"])
+def test_errors_of_followers_by_hand(leader: str) -> None:
+    batch = collate([steady(3, [12.0, 15.0, 9.0], 8)])
+    model, solver = Traffic([Linear(14.0, 5.0)], leader=leader), TorchdiffeqSolver("euler", dt=0.02)
+    for simulate in (lambda b: solver(model, b), *baselines(model, solver, 12.0).values()):
+        away = (simulate(batch).x - batch.x)[1:, 0, :, 0].detach()
+        own = away[:, :-1] if leader == "measured" else away
+        metrics = evaluate(simulate, [batch])
+        assert metrics.rmse == pytest.approx(float(own.square().mean().sqrt()), rel=1e-12)
+        assert metrics.horizons[-1]["n"] == own.shape[1]
+
+
+def test_the_common_speed_is_that_of_vehicles_that_are_simulated() -> None:
+    time = 0.5 * np.arange(5)[:, None]
+    batch = collate([traffic("a", (time * [8.0, 12.0, 30.0] + [0.0, 50.0, 100.0]).tolist())])
+    assert best_common_speed([batch]) == pytest.approx(50 / 3)
+    assert best_common_speed([batch], Traffic([Linear()])) == pytest.approx(50 / 3)
+    led = Traffic([Linear()], leader="measured")
+    assert best_common_speed([batch], led) == pytest.approx(10.0)

@@ -132,7 +132,8 @@ def test_collate_keeps_unknown_lengths_unknown() -> None:
 
 def test_batch_moves_to_another_precision() -> None:
     batch = collate([platoon("a", 3, 2)]).to(dtype=torch.float32)
-    assert batch.x.dtype == batch.start.dtype == torch.float32
+    assert batch.dtype == batch.v.dtype == batch.start.dtype == torch.float32
+    assert batch.x.dtype == batch.destination.dtype == batch.walls.dtype == torch.float64
     assert batch.valid.dtype == torch.bool
     assert batch.names == ("a",)
 

@@ -111,7 +111,6 @@ def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[n
         single = TorchdiffeqSolver("euler", dt=0.01)(
             model.to(torch.float32), collate(items).to(dtype=torch.float32)
         ).x
-        assert single.dtype == torch.float32
         # rounding of one step, 6e-8 of the position, over at most 240 steps
         torch.testing.assert_close(single.double(), double, rtol=6e-8 * 240, atol=1e-5)
         assert not torch.equal(single.double(), double)

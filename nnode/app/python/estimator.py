@@ -142,13 +142,14 @@ class Calibrator:
         with threads_given_back():
             set_threads(None, model.domain)
             items = simulated(lambda b: solver(model, b), given, size=_TOGETHER, dtype=dtype)
-            return Sequences(items, {"simulated": self.result_.name})
+            led = getattr(model, "leader", "constant") == "measured"
+            return Sequences(items, {"simulated": self.result_.name, "led": led})
 
     def score(self, X: Any, y: object = None) -> float:
         """Minus the root mean square distance (m) of simulated from measured positions.
 
-        Over all agents and samples after the first, as ``nnode evaluate`` prints it; higher is
-        better. A leader that drives as it was measured counts, without error.
+        Over all simulated agents and samples after the first, as ``nnode evaluate`` prints it;
+        higher is better. A leader that drives as it was measured is left out.
         """
         given = Sequences.of(X)
         return self.predict(given).score(given)

@@ -23,7 +23,7 @@ from nnode.compiled import lanes
 from nnode.errors import ConfigError, SimulationError
 from nnode.models.system import System, Traffic
 from nnode.models.term import Interval
-from nnode.solvers.base import substeps
+from nnode.solvers.base import simulated_batch, substeps
 
 #: Share of the cost below which a fall is rounding.
 _ROUNDING = 1e-14
@@ -181,11 +181,12 @@ class TangentCost(Problem):
         batch, solver = self.batch, self.solver
         n = substeps(batch.dt, solver.dt, self.system)
         each = torch.from_numpy(np.atleast_2d(rows))
+        near, origin = simulated_batch(self.system, batch)
         y, dy = lanes.tangents(
-            self.system, self.lane, batch, n, names, solver.threads, each, solver.method,
+            self.system, self.lane, near, n, names, solver.threads, each, solver.method,
             given=self.names,
         )  # fmt: skip
-        x = y[..., 0]
+        x = y[..., 0] if origin is None else y[..., 0].double() + origin
         if self.system.leader == "measured":
             lead = torch.arange(x.shape[-1]) == (batch.agent.sum(1) - 1)[:, None]
             x = torch.where(lead, batch.x[..., 0], x)

@@ -186,8 +186,8 @@ def _paths(
     if not every:
         return []
     s = every[0].sequence
-    simulated = pair(*every[0].simulated.values())
-    errors = ", ".join(f"{one.title} {amount(rmse(s, one.x), 2)} m" for one in simulated)
+    simulated = pair(*every[0].simulated.values(), led=every[0].led)
+    errors = ", ".join(f"{one.title} {amount(rmse(s, one), 2)} m" for one in simulated)
     name, plain = (f"the sealed sequence {n}" for n in (markdown(s.name), s.name))
     unknown = "".join(
         f" Its agents' numbers are not known, so that {effect} does not act here."

@@ -279,7 +279,7 @@ def checkpoint_of(
     model = rebuilt(config["model"], found.extended)
     speed = None
     if model.domain == "traffic":
-        speed = best_common_speed([collate([sequences[i] for i in found.open])])
+        speed = best_common_speed([collate([sequences[i] for i in found.open])], model)
     used = {*found.open, *found.sealed}
     dropped = [i for i in range(len(sequences)) if i not in used]
     parts = {"train": found.open, "heldout": found.sealed, "dropped": dropped}

@@ -55,7 +55,7 @@ def scenes(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Scene
     for i, s in enumerate(chosen):
         there = {name: x for name, each in paths.items() if (x := each[i]) is not None}
         if len(there) == len(paths):
-            every.append(Scene(s, there))
+            every.append(Scene(s, there, getattr(found.base, "leader", "") == "measured"))
     return every
 
 

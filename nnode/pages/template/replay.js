@@ -41,10 +41,11 @@ class Replay {
     const [a, b] = [track[k], track[Math.min(k + 1, track.length - 1)]];
     return place === k ? a : a + (place - k) * (b - a);
   }
-  // a simulation's distance from the measurement, m, root mean square over those who are there
+  // a simulation's distance from the measurement, m, root mean square over those who are there;
+  // a leader that follows its measured path is left out
   away(x, time) {
     let sum = 0, count = 0;
-    for (let i = 0; i < this.scene.number; i++) {
+    for (let i = 0; i < this.scene.number - (this.scene.led ?? 0); i++) {
       let square = 0;
       for (let d = 0; d < this.scene.dims; d++) {
         const j = i * this.scene.dims + d;

@@ -19,7 +19,13 @@ from nnode.laws.steps import METHODS
 from nnode.models.formula import rule_of
 from nnode.models.system import System
 from nnode.models.term import Term
-from nnode.solvers.base import Trajectory, check_finite, substeps
+from nnode.solvers.base import (
+    Trajectory,
+    check_finite,
+    observed,
+    simulated_batch,
+    substeps,
+)
 from nnode.solvers.ode import TorchdiffeqSolver
 
 log = logging.getLogger(__name__)
@@ -96,8 +102,9 @@ class FusedSolver:
         n = self._substeps(system, batch)
         lane = lanes.supports(system, batch)
         if lane is not None:
-            y = lanes.simulate(system, lane, batch, n, self.threads, method=self.method)[:, 0]
-            found = Trajectory(*system.observe(y, batch))
+            near, origin = simulated_batch(system, batch)
+            y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
+            found = observed(system, y, batch, origin)
         else:
             found = self._other(system, batch, n)
         return check_finite(found, batch)
@@ -125,8 +132,9 @@ class FusedSolver:
         stacked = _stack(system, parameters)
         lane = lanes.supports(system, batch)
         if lane is not None:
-            y = lanes.simulate(system, lane, batch, n, self.threads, stacked, self.method)
-            runs = [system.observe(y[:, r], batch)[0] for r in range(y.shape[1])]
+            near, origin = simulated_batch(system, batch)
+            y = lanes.simulate(system, lane, near, n, self.threads, stacked, self.method)
+            runs = [observed(system, y[:, r], batch, origin).x for r in range(y.shape[1])]
             return Trajectory(torch.stack(runs, 1), None)
         found = []
         for r in range(len(next(iter(stacked.values())))):
@@ -150,10 +158,11 @@ class FusedSolver:
     def _other(self, system: System, batch: Batch, n: int) -> Trajectory:
         law = crowds.supports(system, batch)
         if law is not None:
-            found = crowds.simulate(
-                system, law, batch, n, self.threads, self.cutoff, self.cutoff_error
+            near, origin = simulated_batch(system, batch)
+            x, v = crowds.simulate(
+                system, law, near, n, self.threads, self.cutoff, self.cutoff_error
             )
-            return Trajectory(*found)
+            return observed(system, x if v is None else torch.cat([x, v], -1), batch, origin)
         # the relaxation alone is a baseline, and cheap
         if not self.uncompiled and not crowds.without_partners(system):
             self.uncompiled = _reason(system)

@@ -68,7 +68,12 @@ def test_trajectories_and_moments_of_a_platoon() -> None:
     s = platoon()
     late = s.x - 0.5 * s.time[:, None, None]
     both = pair(late, s.x)
-    assert rmse(s, late) == pytest.approx(float(np.sqrt(np.mean((0.5 * s.time) ** 2))))
+    away = float(np.sqrt(np.mean((0.5 * s.time[1:]) ** 2)))
+    assert rmse(s, both[0]) == pytest.approx(away)
+    led = late.copy()
+    led[:, -1] = s.x[:, -1]  # a leader that follows its measured path has no error
+    assert rmse(s, pair(led, led=True)[0]) == pytest.approx(away)
+    assert rmse(s, pair(led)[0]) == pytest.approx(np.sqrt(2 / 3) * away)
     assert len(trajectories(s, both).axes) == 4
     assert len(trajectories(s, pair(late, None)).axes) == 2
     strip = film_strip(s, both)

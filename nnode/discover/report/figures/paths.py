@@ -30,22 +30,29 @@ class Simulated:
         title: of its panel.
         x: ``(K, N, D)`` m.
         style: colour and marker.
+        led: whether the leader follows its measured path.
     """
 
     title: str
     x: np.ndarray
     style: dict[str, Any]
+    led: bool = False
 
 
-def pair(before: np.ndarray, after: np.ndarray | None = None) -> list[Simulated]:
+def pair(
+    before: np.ndarray, after: np.ndarray | None = None, *, led: bool = False
+) -> list[Simulated]:
     """The two simulations as they are drawn; one where nothing was added to the model."""
-    found = [Simulated("as it was given", before, BEFORE)]
-    return found if after is None else [*found, Simulated("with the effects", after, AFTER)]
+    found = [Simulated("as it was given", before, BEFORE, led)]
+    return found if after is None else [*found, Simulated("with the effects", after, AFTER, led)]
 
 
-def rmse(sequence: Sequence, x: np.ndarray) -> float:
-    """Root mean square distance of a simulation from the measurement, m."""
-    return float(np.sqrt(((x - sequence.x) ** 2).sum(-1).mean()))
+def rmse(sequence: Sequence, simulated: Simulated) -> float:
+    """Root mean square distance of a simulation from the measurement, m, over all samples after
+    the first, and without a leader that follows its measured path: as ``nnode evaluate`` does."""
+    free = slice(-1) if simulated.led else slice(None)
+    away = (simulated.x - sequence.x)[1:, free]
+    return float(np.sqrt((away**2).sum(-1).mean()))
 
 
 def trajectories(sequence: Sequence, simulated: list[Simulated]) -> Figure:
@@ -69,7 +76,7 @@ def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
         top.plot(s.time, one.x[..., 0], color=colour, linewidth=0.9)
         below.axhline(0, color=GREY, linewidth=0.8)
         below.plot(s.time, (one.x - s.x)[..., 0], color=colour, linewidth=0.9)
-        dress(top, y="position (m)", title=f"{one.title}: {rmse(s, one.x):.2g} m rms")
+        dress(top, y="position (m)", title=f"{one.title}: {rmse(s, one):.2g} m rms")
         dress(below, x="clock time (s)", y="simulated −\nmeasured (m)")
         for ax in (top, below):
             ax.label_outer()
@@ -90,7 +97,7 @@ def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
         ax.plot(*s.x[-1].T, linestyle="", markersize=4, **_MEASURED)
         ax.plot(*one.x[-1].T, linestyle="", markersize=4, **one.style)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        dress(ax, x="x (m)", y="y (m)", title=f"{one.title}: {rmse(s, one.x):.2g} m rms")
+        dress(ax, x="x (m)", y="y (m)", title=f"{one.title}: {rmse(s, one):.2g} m rms")
         ax.label_outer()
     figure.legend(handles=_handles(simulated, True), **_LEGEND)
     return figure
