@@ -148,9 +148,9 @@ def _folded(op: str, number: Callable[..., float], *args: Expr) -> Expr:
     if all(a.op == "const" for a in args):
         with suppress(ValueError, OverflowError, ZeroDivisionError):
             value = number(*(a.value for a in args))
-            if math.isfinite(value):
+            if math.isfinite(value) or not all(math.isfinite(a.value) for a in args):
                 return const(value)
-        # what is no finite number stays an operation, and says so when it is computed
+        # An overflow of finite numbers stays an operation, and says so when it is computed.
     return _made(op, args)
 
 
