@@ -247,7 +247,8 @@ def seen_options(source: pd.DataFrame | str | Path | None) -> DataOptions:
     if source is None:
         raise ConfigError("there is no table: give one, or name a data set, as in data='esimas'")
     names = columns(source)
-    if {"x_follower", "x_leader"} <= names:
+    spaced = {"time", "spacing", "v_follower", "v_leader"} <= names and "x" not in names
+    if {"x_follower", "x_leader"} <= names or spaced:
         return PairOptions(path="")
     if "vehicle" in names and "sequence" not in names:
         return VehicleTableOptions(path="")

@@ -50,6 +50,7 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> list[Se
     rows = _rows(table, options)
     order = np.lexsort((rows.time, rows.vehicle.astype(str)))
     step = np.diff(rows.time[order])[rows.vehicle[order][1:] == rows.vehicle[order][:-1]]
+    step = step[step > 0]
     if step.size:
         check_interval(float(np.median(step)), f"{table.path}: rows of a vehicle")
     return cut_vehicles({table.path.stem: rows}, options)

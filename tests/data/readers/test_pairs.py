@@ -89,7 +89,9 @@ def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> 
     assert len(found) == 10
     assert {s.name for s in found} == {f"pairs/{p}_{k:03d}" for p in (1, 3) for k in range(5)}
     assert {s.n_samples for s in found} == {11}
-    assert all(s.agents == () and s.length is not None and s.length[1] == 4.5 for s in found)
+    assert all(s.length is not None and s.length[1] == 4.5 for s in found)
+    # vehicles without a name are called after their pair, so that its windows are one cluster
+    assert {s.agents for s in found} == {(f"{p} follower", f"{p} leader") for p in (1, 3)}
 
 
 def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
