@@ -189,6 +189,116 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
     assert (s.name, s.agents, s.kind) == ("1/run-1-veh-16-pair-7", ("16", "6"), ("HV", "CAV"))
 
 
+def spaced(pair: object, spacing: float = 20.0, k: int = 51, **more: object) -> pd.DataFrame:
+    """A follower at 10 m/s behind a leader whose speed falls evenly from 12 to 9 m/s."""
+    t = 0.1 * np.arange(k)
+    v = 12.0 - 0.6 * t
+    gap = spacing + (12.0 * t - 0.3 * t**2) - 10.0 * t
+    own = {"pair": pair, "time": t, "spacing": gap, "v_follower": 10.0, "v_leader": v}
+    return pd.DataFrame({**own, **more})
+
+
+def test_positions_follow_from_spacing_and_speeds(tmp_path: Path) -> None:
+    table = spaced(1)
+    (s,) = read(save(tmp_path / "p.csv", table))
+    assert s.length is not None
+    assert s.v is not None
+    # the trapezium rule is exact for a speed that changes evenly
+    np.testing.assert_allclose(s.x[:, 1, 0], 12.0 * s.time - 0.3 * s.time**2, atol=1e-9)
+    gap = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
+    np.testing.assert_allclose(gap, table.spacing, atol=1e-9)
+    np.testing.assert_allclose(np.diff(s.x[:, 0, 0]), 1.0, atol=1e-9)
+    np.testing.assert_array_equal(s.v[:, :, 0], table[["v_follower", "v_leader"]])
+    assert s.length[1] == 5.0
+    assert np.isnan(s.length[0])
+
+    # the length of a leader changes where fronts are, and no gap
+    (longer,) = read(save(tmp_path / "q.csv", spaced(1, leader_length=12.0)))
+    assert longer.length is not None
+    assert longer.length[1] == 12.0
+    np.testing.assert_allclose(longer.x[:, 0] - s.x[:, 0], -7.0)
+    (unknown,) = read(save(tmp_path / "p.csv", spaced(1)), length=None)
+    assert unknown.length is None
+    np.testing.assert_allclose(unknown.x[:, 1, 0] - unknown.x[:, 0, 0], table.spacing)
+
+
+def test_speeds_and_spacings_have_their_units(tmp_path: Path) -> None:
+    table = spaced(1)
+    feet = table.assign(
+        spacing=table.spacing / FOOT, v_leader=table.v_leader * 3.6, v_follower=36.0
+    )
+    (s,) = read(save(tmp_path / "p.csv", feet), position_unit="ft", speed_unit="km/h")
+    (si,) = read(save(tmp_path / "q.csv", table))
+    np.testing.assert_allclose(s.x, si.x, atol=1e-9)
+
+
+def test_without_positions_the_spacing_needs_both_speeds(tmp_path: Path) -> None:
+    for missing in ("spacing", "v_follower", "v_leader"):
+        path = save(tmp_path / "p.csv", spaced(1).drop(columns=missing))
+        with pytest.raises(DataError, match="spacing, v_follower and v_leader are needed"):
+            read(path)
+    path = save(tmp_path / "p.csv", spaced(1).assign(spacing=[np.nan] + [20.0] * 50))
+    with pytest.raises(DataError, match="line 2: column 'spacing' holds nothing"):
+        read(path)
+
+
+def test_anonymous_pairs_are_a_cluster_each(tmp_path: Path) -> None:
+    parts = [spaced(i, 20.0 + i) for i in range(12)]
+    found = read(save(tmp_path / "p.csv", *parts), window=1.0)
+    assert len(found) == 60
+    label = clusters(index_of(found))
+    assert label.max() + 1 == 12
+    # windows of one pair are one
+    names = np.array([s.name.partition("_")[0] for s in found])
+    assert all(len(set(label[names == name])) == 1 for name in names)
+
+
+def test_pairs_that_name_one_vehicle_share_that_one(tmp_path: Path) -> None:
+    parts = [spaced(i, follower=i // 2) for i in range(6)]
+    found = read(save(tmp_path / "p.csv", *parts))
+    assert clusters(index_of(found)).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    holed = spaced(3).drop(index=range(5, 51, 5))
+    parts = [spaced(1), spaced(2, k=4), holed, spaced(4, spacing=0.2, leader_length=0.5)]
+    path = save(tmp_path / "p.csv", *parts)
+    store = prepare(PairOptions(path=str(path), min_samples=10), tmp_path / "store")
+    left = {entry["name"]: entry["why"] for entry in store.manifest["left_out"]}
+    assert left == {
+        "pairs/2": "fewer than data.min_samples=10 times",
+        "pairs/3": "no data.min_samples=10 times without a gap",
+    }
+    assert [entry["sequence"] for entry in store.manifest["dropped"]] == ["pairs/4"]
+    assert store.manifest["counts"] == {"read": 2, "kept": 1, "dropped": 1}
+    said = " ".join(record.getMessage() for record in caplog.records)
+    assert "2 records are left out" in said
+    assert "1 of 2 sequences are left out for their faults: overlap in 1" in said
+
+    store = prepare(PairOptions(path=str(path), window=4.0), tmp_path / "store")
+    assert store.manifest["left_out"] == [
+        {"name": "pairs/2", "why": "no data.window=4 s without a gap"},
+        {"name": "pairs/3", "why": "no data.window=4 s without a gap"},
+    ]
+
+
+@pytest.mark.parametrize("length", [0.0, -4.5])
+@pytest.mark.parametrize("column", ["leader_length", "follower_length"])
+def test_lengths_are_positive(tmp_path: Path, column: str, length: float) -> None:
+    path = save(tmp_path / "p.csv", drive(**{column: length}).drop(columns="spacing"))
+    with pytest.raises(DataError, match=f"line 2: column '{column}' holds .*expected a positive"):
+        read(path)
+
+
+def test_a_spacing_of_fronts_is_refused(tmp_path: Path) -> None:
+    table = drive()
+    path = save(tmp_path / "p.csv", table.assign(spacing=table.x_leader - table.x_follower))
+    with pytest.raises(DataError, match=r"leader's length, is 0.00 m; .*data\.columns\.spacing"):
+        read(path)
+    (s,) = read(path, columns={"spacing": None})
+    assert s.length is None
+
+
 def test_without_the_folder_it_is_said_where_it_is_published(tmp_path: Path) -> None:
     options = configured("tgsim", "tgsim", tmp_path)
     with pytest.raises(DataError, match=r"github.com/usdot-fhwa-stol/.* at commit bd31e5189d9a"):
