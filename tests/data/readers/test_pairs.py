@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from omegaconf import OmegaConf
+from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.clusters import clusters, index_of
 from nnode.data.options import Gaps, PairOptions, SplitMode, SplitOptions
 from nnode.data.prepare import prepare
+from nnode.data.quality import find_faults
 from nnode.data.readers.pairs import pair_files, read_pairs
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
@@ -360,6 +362,61 @@ def test_pairs_of_tgsim(real_data: Path) -> None:
     # the spacings were made with vehicles of 5 m
     assert all(s.length is not None and abs(s.length[1] - 5.0) < 1e-9 for s in found)
     assert clusters(index_of(found)).max() + 1 == len({s.recording for s in found}) == 10
+
+
+EVENTS = {"pair": "event", "v_follower": "speed", "v_leader": "leader_speed"}
+WAYMO = {"time": "t", "pair": "event", "run": "split"}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("file", "columns", "number"),
+    [("ngsim_events/events.parquet", EVENTS, 201), ("waymo_pairs/hv_av_2.parquet", WAYMO, 89)],
+)
+def test_published_pairs_without_positions(
+    real_data: Path, file: str, columns: dict[str, str], number: int
+) -> None:
+    found = read(real_data / file, columns=columns)
+    table = pd.read_parquet(real_data / file)
+    assert len(found) == clusters(index_of(found)).max() + 1 == number
+    assert sum(s.n_samples for s in found) == len(table)
+    names = [columns["pair"], *(["split"] if "split" in table else [])]
+    rows = {"/".join(map(str, key[::-1])): own for key, own in table.groupby(names, sort=False)}
+    for s in found:
+        assert s.length is not None
+        assert s.v is not None
+        own = rows[s.name.removeprefix("pairs/")]
+        np.testing.assert_allclose(s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0, own.spacing, atol=1e-9)
+        np.testing.assert_array_equal(s.v[:, 1, 0], own[columns.get("v_leader", "v_leader")])
+        # the follower's position, of which only the spacing is measured, has its measured speed
+        moved = cumulative_trapezoid(s.v[:, 0, 0], s.time, initial=0.0)
+        assert np.abs(s.x[:, 0, 0] - s.x[0, 0, 0] - moved).max() < 2.0
+        assert find_faults(s, "traffic") == []
+
+
+@pytest.mark.real
+def test_a_published_idm_gives_the_published_error_of_spacings(real_data: Path) -> None:
+    """Parameters of Wen, Jian & He 2023; speeds by Euler's method, paths by the trapezium rule."""
+    a, b, v0, s0, headway = 1.08200092, 0.37833643, 29.72641382, 4.98069566, 1.4551363
+    squares = total = 0.0
+    for s in read(real_data / "waymo_pairs" / "hv_av_2.parquet", columns=WAYMO):
+        if s.split != "test":
+            continue
+        assert s.length is not None
+        assert s.v is not None
+        spacing = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
+        (follower, leader), v = s.v[:, :, 0].T, s.v[0, 0, 0]
+        rear = spacing + cumulative_trapezoid(follower, s.time, initial=0.0)
+        place, gaps = 0.0, [spacing[0]]
+        for k in range(s.n_samples - 1):
+            wanted = s0 + v * headway + v * (v - leader[k]) / (2 * np.sqrt(a * b))
+            then = v + 0.1 * a * (1 - (v / v0) ** 4 - (wanted / gaps[-1]) ** 2)
+            place += 0.1 * (v + then) / 2
+            v = then
+            gaps.append(rear[k + 1] - place)
+        squares += float(((spacing - np.array(gaps)) ** 2).sum())
+        total += float((spacing**2).sum())
+    assert np.sqrt(squares / total) == pytest.approx(0.2782, abs=5e-5)
 
 
 def _gap_error(s: Sequence, p: dict[str, float], dt: float = 0.1) -> float:
