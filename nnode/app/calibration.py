@@ -107,6 +107,11 @@ class Calibration:
                 + ", ".join(f"{k} {v:.4g}" for k, v in self.pooling["second_half"].items())
                 + f" {unit}; another sequence gets the pool's parameters"
             )
+        if self.clusters == 1:
+            lines.append(
+                "no intervals: the training sequences are one cluster, of those that share agents "
+                "or are near in time; intervals need at least two"
+            )
         short = short_names(map(str, self.parameters.index))
         rows = _rows(self.parameters).items()
         return "\n".join([*lines, *(f"{short[name]} = {_words(row)}" for name, row in rows)])

@@ -154,7 +154,7 @@ class VehicleTableOptions(LaneOptions):
     position_unit: str = "m"  # m | ft | cm | km
     length_unit: str | None = None  # null: the unit of the positions
     speed_unit: str = "m/s"  # m/s | km/h | ft/s | mph
-    time_unit: str = "s"  # s | ms | frame
+    time_unit: str = "s"  # s | ms | us | ns | frame; dates and durations need none
     frame_rate: float | None = None  # 1/s, with time_unit=frame
     direction: int = 1  # -1 where positions fall as vehicles drive on
 
@@ -164,7 +164,8 @@ class PairOptions(DataOptions):
     """Pairs of a follower and its leader: one row per pair and time, in one file or many.
 
     ``columns`` names the tables' columns by what they mean: ``time``, ``x_follower``,
-    ``x_leader``, and where they exist ``pair``, ``v_follower``, ``v_leader``, ``leader_length``,
+    ``x_leader`` (or, in their place, ``spacing`` and both speeds), and where they exist ``pair``,
+    ``v_follower``, ``v_leader``, ``leader_length``,
     ``follower_length``, ``spacing`` (bumper to bumper), ``follower``, ``leader`` (identifiers),
     ``run``, ``lane``, ``split`` (train, test), ``leader_kind``, ``follower_kind``. A column that
     bears the name of its meaning need not be listed; null leaves an optional one out.
@@ -185,6 +186,9 @@ class PairOptions(DataOptions):
     constant: dict[str, str] = field(default_factory=dict)  # {meaning: its value in every row}
     position_unit: Any = "m"  # m | ft | cm | km, or by pattern of the file's name {"*.csv": ft}
     speed_unit: Any = "m/s"  # m/s | km/h | ft/s | mph, or by pattern of the file's name
+    time_unit: str = "s"  # s | ms | us | ns; dates and durations need none
+    # m, of leaders where the table has neither positions nor lengths; the gap does not depend on it
+    length: float | None = 5.0
     kinds: Any = field(default_factory=dict)  # {class code: name}
     lane: Any = None  # a lane or a list of lanes; null takes every lane
     dt: float | None = None  # s, grid to interpolate to; null: the times as they are
@@ -277,6 +281,7 @@ class TableOptions(DataOptions):
 
     name: str = "table"
     path: str = MISSING  # the table; relative to data.source where that is given
+    time_unit: str = "s"  # s | ms | us | ns; dates and durations need none
     walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left
     # {name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}, m: destinations on exit lines,
     # in place of the columns dest_x, dest_y

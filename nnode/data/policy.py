@@ -84,6 +84,33 @@ def apply_policy(
     return kept, dropped
 
 
+def without(
+    read: list[Sequence], dropped: list[dict[str, Any]], left_out: list[dict[str, str]]
+) -> list[str]:
+    """Sentences that say how much is not used, and why.
+
+    Args:
+        read: all sequences.
+        dropped: see :func:`apply_policy`.
+        left_out: see :class:`nnode.data.readers.recordings.Reading`.
+    """
+    told = []
+    if left_out:
+        why = Counter(entry["why"] for entry in left_out)
+        listed = "; ".join(f"{text} in {n}" for text, n in why.most_common(LISTED))
+        told.append(
+            f"{len(left_out)} records are left out, there is no sequence of them: {listed} "
+            f"(first {left_out[0]['name']})"
+        )
+    if dropped:
+        kinds = Counter(kind for d in dropped for kind in {r["kind"] for r in d["reasons"]})
+        listed = ", ".join(f"{kind} in {n}" for kind, n in kinds.most_common())
+        told.append(
+            f"{len(dropped)} of {len(read)} sequences are left out for their faults: {listed}"
+        )
+    return told
+
+
 def _counts(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> str:
     counts = _by_kind(sequences, faults)
     return ", ".join(f"{kind} in {n}" for kind, n in counts.items()) or "no sequence at all"

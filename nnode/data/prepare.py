@@ -34,7 +34,7 @@ from nnode.data.options import (
     VehicleTableOptions,
     WalkwayOptions,
 )
-from nnode.data.policy import apply_policy, by_recording, drop_absent
+from nnode.data.policy import apply_policy, by_recording, drop_absent, without
 from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.columns import Table
 from nnode.data.readers.esimas import esimas_files, read_esimas
@@ -44,11 +44,12 @@ from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.openacc import openacc_files, read_openacc
 from nnode.data.readers.pairs import pair_files, read_pairs
+from nnode.data.readers.recordings import Reading
 from nnode.data.readers.sumo import read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
 from nnode.data.readers.vehicles import read_vehicles, vehicle_files
-from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequence import Domain, Sequence, check_interval
 from nnode.data.smooth import start_smoothed
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError, DataError
@@ -120,8 +121,8 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
     Returns:
         The store. Its manifest tells the source files and their SHA-256, all options, the
         package's version, the sampling interval (s), how many sequences were read, kept and
-        dropped (in all and by recording), every fault that was found, and every sequence and
-        agent that was dropped and why.
+        dropped (in all and by recording), every fault that was found, every sequence and agent
+        that was dropped and why, and every record of which there is no sequence.
 
     Raises:
         ConfigError: options that contradict each other or the data.
@@ -176,6 +177,7 @@ def judge(
         NNodeError: see :func:`prepare`.
     """
     domain = _domain(options, read)
+    _plausible(options, read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
     faults = {}
     for number, s in enumerate(sequences):
@@ -183,6 +185,9 @@ def judge(
         if stages is not None:
             stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
+    left_out = read.left_out if isinstance(read, Reading) else []
+    for text in without(read, dropped, left_out):
+        log.warning("%s", text)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on
     agents, notes = identify(sequences, domain, options.agents)
@@ -205,6 +210,7 @@ def judge(
         "recordings": by_recording(read, kept, faults),
         "dropped": dropped,
         "dropped_agents": absent,
+        "left_out": left_out,
         "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
     }
     return Judged(domain, sequences, faults, kept, manifest)
@@ -332,6 +338,15 @@ def _domain(options: DataOptions, sequences: list[Sequence]) -> Domain:
                 f"{s.name} has {s.x.shape[2]}"
             )
     return cast(Domain, options.domain)
+
+
+def _plausible(options: DataOptions, sequences: list[Sequence]) -> None:
+    """Refuse times that are no seconds, before their steps count as faults."""
+    steps = [s.dt for s in sequences if np.isfinite(s.dt)]
+    if steps:
+        # readers of published formats know the unit of their times
+        remedy = "" if hasattr(options, "time_unit") else "its times must be in seconds"
+        check_interval(float(np.median(steps)), f"data={options.name}", remedy)
 
 
 def _interval(sequences: list[Sequence]) -> float:

@@ -27,7 +27,8 @@ KINDS: dict[str, str] = {
     "jump": "a displacement between two samples that exceeds the greatest possible speed",
     "backward": "a vehicle that goes backwards by more than the position error",
     "overtaking": "vehicles of one lane that are not in the order of their positions",
-    "overlap": "two agents at one place: fronts of two cars, or centres of two people",
+    "overlap": "two agents at one place: two cars by their fronts, or a front and the length of "
+    "the car ahead; centres of two people",
     "duplicate": "two agents with one identifier or with the same positions throughout",
     "gap_in_time": "unequal time steps, or an agent without a position at some times",
     "non_finite": "a position that is infinite or has only one coordinate",
@@ -125,7 +126,7 @@ def find_faults(sequence: Sequence, domain: Domain) -> list[Fault]:
     found = [*_short(view), *_times(view), *_values(view), *_duplicates(view)]
     if sequence.n_samples and sequence.n_agents:
         found += [*_zero_rows(view), *_displacements(view)]
-        found += _order(view, found) if domain == "traffic" else []
+        found += [*_order(view, found), *_bumpers(view)] if domain == "traffic" else []
         found += _overlaps(view)
     return sorted(found, key=lambda f: -np.inf if f.time is None else f.time)
 
@@ -349,6 +350,24 @@ def _order(view: _View, found: list[Fault]) -> Iterator[Fault]:
             f"its leader, at {len(k)} of {len(view.x)} samples"
         )
         yield view.fault("overtaking", (i, i + 1), int(k[0]), text)
+
+
+def _bumpers(view: _View) -> Iterator[Fault]:
+    """Vehicles whose front is in the vehicle ahead, by more than the error of one position."""
+    if view.sequence.length is None:
+        return
+    limits = view.limits
+    gap, length = np.diff(view.x[:, :, 0], axis=1), view.sequence.length[1:]
+    # fronts that are nearer, or in the wrong order, are another fault
+    inside = (gap >= limits.spacing) & (length - gap > limits.noise)
+    for i in map(int, np.flatnonzero(inside.any(axis=0))):
+        k = np.flatnonzero(inside[:, i])
+        text = (
+            f"the front of {view.who(i)} is {gap[k, i].min():.2f} m behind that of "
+            f"{view.who(i + 1)}, which is {length[i]:.2f} m long, at {len(k)} of {len(view.x)} "
+            "samples"
+        )
+        yield view.fault("overlap", (i, i + 1), int(k[0]), text)
 
 
 def _overlaps(view: _View) -> Iterator[Fault]:

@@ -14,11 +14,46 @@ from nnode.errors import DataError
 
 Domain = Literal["traffic", "crowd"]
 
+#: Seconds by unit of time.
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+#: s; a sampling interval is at least the first and below the second. Cameras, radar and satellite
+#: navigation take up to some hundred samples in a second. In ten seconds a car at 20 m/s drives
+#: 200 m and a person walks 13 m, past everything that either reacts to. Times in milliseconds of
+#: a recording with at most 100 samples in a second lie beyond the range, as do those in
+#: microseconds, nanoseconds, and, below it, days.
+SHORTEST, LONGEST = 1e-3, 10.0
+
 #: Distance (m) between the padding vehicles that stand in front of a shorter platoon.
 PADDING_GAP = 1e5
 #: Fields of a batch that are positions. They stay in float64: numbers of float32 are 0.5 m apart
 #: at 7,000 km, where the coordinates of maps lie.
 _POSITIONS = ("x", "destination", "walls")
+
+
+def check_interval(dt: float, whose: str, remedy: str = "") -> None:
+    """Refuse a sampling interval that no recording of vehicles or people has.
+
+    Args:
+        dt: s; NaN, of a single sample, is not judged.
+        whose: what is sampled, which begins the message.
+        remedy: how times in another unit are read; empty: with ``data.time_unit``.
+
+    Raises:
+        DataError: with the range, and the unit that the times probably have.
+    """
+    if not dt < SHORTEST and not dt >= LONGEST:  # NaN is not compared
+        return
+    unit = next((u for u, s in TIME_UNITS.items() if 0.01 <= dt * s <= 2), None)
+    advice = remedy or f"give times in seconds, or their unit by data.time_unit={unit or 'UNIT'}"
+    if unit and remedy:
+        advice += f" (in {unit}, the interval would be {dt * TIME_UNITS[unit]:g} s)"
+    elif not unit:
+        advice += f" ({', '.join(TIME_UNITS)})"
+    raise DataError(
+        f"{whose}: samples are {dt:g} s apart; expected at least {SHORTEST:g} s, the finest that "
+        f"recordings have, and less than {LONGEST:g} s, in which an agent passes everything that "
+        f"it reacts to; {advice}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +120,11 @@ class Sequence:
                 if value.shape != shape:
                     raise DataError(
                         f"sequence {self.name}: {field} must be {shape}, got {value.shape}"
+                    )
+                if field == "length" and (value <= 0).any():
+                    raise DataError(
+                        f"sequence {self.name}: a length is {value[value <= 0][0]:g} m, expected "
+                        "a positive number, or NaN where it is not known"
                     )
                 object.__setattr__(self, field, value)
         for field in ("agents", "kind", "group"):
@@ -269,12 +309,14 @@ def collate(sequences: Iterable[Sequence]) -> Batch:
     """Pad sequences to one :class:`Batch` (float64, CPU).
 
     Raises:
-        DataError: no sequence, or sampling intervals or dimensions that differ.
+        DataError: no sequence, sampling intervals or dimensions that differ, or an interval that
+            no recording has.
     """
     items = list(sequences)
     if not items:
         raise DataError("a batch needs at least one sequence, got none")
     first = items[0]
+    check_interval(first.dt, f"sequence {first.name}", "give its times in seconds")
     for item in items[1:]:
         if not np.isclose(item.dt, first.dt, rtol=1e-6):
             raise DataError(

@@ -28,7 +28,7 @@ from nnode.data.prepare import FORMATS, judge
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import table_path
 from nnode.data.readers.table import TABLE, WALLS
-from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequence import Domain, Sequence, check_interval
 from nnode.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ class Sequences:
             :func:`nnode.data.clusters.index_of`.
 
     Raises:
-        DataError: no sequence, two of one name, or lanes beside crowds.
+        DataError: no sequence, two of one name, lanes beside crowds, or a sampling interval that
+            no recording has.
     """
 
     def __init__(self, items: Iterable[Sequence], manifest: Mapping[str, Any] | None = None):
@@ -74,6 +75,8 @@ class Sequences:
         twice = sorted({name for name in names if names.count(name) > 1}) if names else []
         if twice:
             raise DataError(f"two sequences are named {twice[0]}; names must be unique")
+        for item in self._items:
+            check_interval(item.dt, f"sequence {item.name}", "give its times in seconds")
         if len({item.x.shape[2] for item in self._items}) > 1:
             raise DataError("sequences of lanes and of crowds cannot stand in one list")
         self.index = index_of(self._items)
@@ -249,7 +252,8 @@ def seen_options(source: pd.DataFrame | str | Path | None) -> DataOptions:
     if source is None:
         raise ConfigError("there is no table: give one, or name a data set, as in data='esimas'")
     names = columns(source)
-    if {"x_follower", "x_leader"} <= names:
+    spaced = {"time", "spacing", "v_follower", "v_leader"} <= names and "x" not in names
+    if {"x_follower", "x_leader"} <= names or spaced:
         return PairOptions(path="")
     if "vehicle" in names and "sequence" not in names:
         return VehicleTableOptions(path="")

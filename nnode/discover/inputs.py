@@ -11,6 +11,7 @@ from nnode.data.dataset import Source
 from nnode.data.options import DataOptions, Faults
 from nnode.data.prepare import open_data
 from nnode.data.quality import Fault
+from nnode.data.readers.recordings import natural
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.result import DataFault
 from nnode.errors import DataError
@@ -82,7 +83,8 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
         faults.setdefault(fault.sequence, []).append(fault)
         who = entry.get("names") or [str(i) for i in fault.agents]
         reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
-    everything = list(store)
+    # in one order, whatever that of a list: divisions into folds go by it
+    everything = sorted(store, key=lambda s: natural(s.name))
     sound = [s for s in everything if s.name not in faults]
     read = store.manifest.get("counts", {}).get("read", len(everything))
     _check_enough(sound, faults, read, options)

@@ -19,6 +19,10 @@ from nnode.models.system import System
 DEFAULT_STEP = {("traffic", 1): 0.002, ("traffic", 2): 0.1}
 _CROWD_STEP = 0.0625
 
+#: Steps in a sampling interval, at most: of 1 s they would be microseconds, in which no vehicle
+#: and no person changes its speed by more than 1e-5 m/s.
+MOST_STEPS = 10**6
+
 
 @dataclass
 class Trajectory:
@@ -84,7 +88,8 @@ def substeps(sampling: float, dt: float | None, system: System) -> int:
             the default of the model's domain and order.
 
     Raises:
-        ConfigError: ``dt`` is not positive or does not divide the sampling interval.
+        ConfigError: ``dt`` is not positive, does not divide the sampling interval, or there are
+            more than :data:`MOST_STEPS`.
         DataError: there is no sampling interval, as in a single sample.
     """
     if not (math.isfinite(sampling) and sampling > 0):
@@ -92,16 +97,18 @@ def substeps(sampling: float, dt: float | None, system: System) -> int:
             f"the sampling interval of the data is {sampling:g} s, expected a positive number; "
             "a sequence needs at least two samples at rising times"
         )
-    if dt is None:
-        return max(
-            1,
-            math.ceil(
-                sampling / DEFAULT_STEP.get((system.domain, system.order), _CROWD_STEP) - 1e-6
-            ),
-        )
-    if not (math.isfinite(dt) and dt > 0):
+    if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise ConfigError(f"solver.dt={dt} must be a positive number of seconds")
-    ratio = sampling / dt
+    usual = DEFAULT_STEP.get((system.domain, system.order), _CROWD_STEP)
+    ratio = sampling / (dt or usual)
+    if ratio > MOST_STEPS * (1 + 1e-6):
+        raise ConfigError(
+            f"steps of {dt or usual:g} s (solver.dt) are {ratio:.3g} in the sampling interval of "
+            f"{sampling:g} s, expected at most {MOST_STEPS:.0e}; take a larger solver.dt, or "
+            "solver.dt=null, and check that the times of the data are in seconds"
+        )
+    if dt is None:
+        return max(1, math.ceil(ratio - 1e-6))
     number = round(ratio)
     # sampling intervals come from recorded times, which carry rounding errors
     if number < 1 or abs(ratio - number) > 1e-6 * max(1.0, ratio):

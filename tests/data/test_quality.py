@@ -134,6 +134,22 @@ def test_overtaking() -> None:
     assert fault.time == pytest.approx(s.time[5])
 
 
+@pytest.mark.parametrize(
+    ("length", "expected"), [(29.0, []), (30.4, []), (30.6, ["overlap"]), (100.0, ["overlap"])]
+)
+def test_a_front_within_the_vehicle_ahead_is_an_overlap(length: float, expected: list[str]) -> None:
+    """Fronts are 30 m apart; 0.5 m is the error of a position that is no fault."""
+    s = replace(platoon(), length=np.array([4.0, np.nan, length]))
+    assert kinds(s) == expected
+    # behind the first vehicle there is nobody, whatever its length
+    assert kinds(replace(s, length=s.length[::-1])) == []
+    if expected:
+        (fault,) = find_faults(s, "traffic")
+        assert fault.agents == (1, 2)
+        assert "30.00 m behind" in fault.detail
+        assert f"{length:.2f} m long, at 8 of 8 samples" in fault.detail
+
+
 def test_overlap_of_cars() -> None:
     s = platoon(n=2)
     near = changed(s, (slice(3, 5), 0), s.x[3:5, 1] - 1.5)

@@ -108,6 +108,13 @@ def test_a_step_must_be_positive(dt: float) -> None:
         substeps(0.2, dt, LANE)
 
 
+@pytest.mark.parametrize(("sampling", "dt"), [(0.2, 1e-7), (2e8, 0.1), (2e8, None)])
+def test_more_than_a_million_steps_are_refused(sampling: float, dt: float | None) -> None:
+    with pytest.raises(ConfigError, match=r"expected at most 1e\+06; take a larger solver\.dt"):
+        substeps(sampling, dt, LANE)
+    assert substeps(0.1, 1e-7, LANE) == 10**6
+
+
 @pytest.mark.parametrize("dt", [0.03, 0.3, 0.19, 0.2001, 1e3])
 def test_a_step_that_does_not_divide_is_refused_with_ones_that_do(dt: float) -> None:
     with pytest.raises(ConfigError, match="does not divide") as caught:

@@ -59,8 +59,9 @@ def intervals(cost: TangentCost, row: np.ndarray, cluster: np.ndarray) -> dict[s
             "at_bound": "low" if low[i] else "high" if high[i] else None,
             "identified": bool(known and 2 * wide < scale),
         }
-    apart = np.outer(spread, spread)
-    apart = np.where((apart > 0) & np.isfinite(apart), apart, np.nan)
+    # of a single cluster, spreads are infinite
+    finite = np.where((spread > 0) & np.isfinite(spread), spread, np.nan)
+    apart = np.outer(finite, finite)
     table = covariance / apart
     correlation = {
         cost.names[i].replace("__", "."): {

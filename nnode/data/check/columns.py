@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -41,7 +41,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "v_leader": ("vleader", "vleaderreal", "vl", "leaderv", "vlead", "leaderspeed"),
     "leader_length": ("leaderlength", "lengthleader", "lleader"),
     "spacing": ("spacing", "gap", "spaceheadway", "ivs"),
-    "pair": ("pair", "pairid"),
+    "pair": ("pair", "pairid", "event", "eventid"),
     "follower": ("follower", "followerid", "following"),
     "leader": ("leader", "leaderid", "preceding", "precedingid"),
     "split": ("split",),
@@ -90,6 +90,28 @@ def plain(name: str) -> tuple[str, str]:
     if found and found.start() > 0:
         unit, name = UNITS[found[1].lower()], name[: found.start()]
     return re.sub(r"[^a-z0-9]", "", name.lower()), unit
+
+
+def in_seconds(raw: Raw) -> Raw:
+    """Dates, clock times and durations in columns that are named like times, as the readers take
+    them: seconds after the first.
+
+    Raises:
+        DataError: a cell of them that is none; names the row.
+    """
+    table = raw.table
+    if table is None or not raw.named:
+        return raw
+    held = {}
+    for column in map(str, table.frame.columns):
+        cells = table.frame[column]
+        if plain(column)[0] not in NAMES["time"] or pd.api.types.is_numeric_dtype(cells):
+            continue
+        if cells.dtype.kind in "mM" or cells.astype("string").str.contains(r"\d[-:]\d").any():
+            held[column] = table.times(column)[1]
+    if held:
+        table.frame = table.frame.assign(**held)
+    return replace(raw, dated=tuple(held))
 
 
 def numbers(frame: pd.DataFrame, column: str) -> np.ndarray:

@@ -7,14 +7,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from nnode.data.check import findings as find
-from nnode.data.check.columns import Meaning, meanings, numbers
+from nnode.data.check.columns import Meaning, in_seconds, meanings, numbers
 from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.scale import Medians, Scale, medians, scales
-from nnode.data.check.source import Source, native_source, source_of
-from nnode.data.check.tracks import Tracks, tracks_from, tracks_of
+from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
+from nnode.data.check.tracks import LAG, Tracks, tracks_from, tracks_of
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import Fault, find_faults
 from nnode.data.sequence import Domain, Sequence
@@ -29,7 +30,7 @@ FAIR = 0.05
 
 #: Columns whose names tell a unit.
 _TELL: dict[str, tuple[str, ...]] = {
-    "position": ("x", "x_follower"), "time": (), "speed": ("speed", "vx", "v_follower"),
+    "position": ("x", "x_follower", "spacing"), "time": (), "speed": ("speed", "vx", "v_follower"),
 }  # fmt: skip
 #: Formats whose records are cut: where one begins or ends, nobody comes or goes.
 _CUT = ("esimas", "openacc", "astazero")
@@ -93,6 +94,7 @@ def examine(path: Path, domain: Domain | None = None, rate: float | None = None)
     raw = read_raw(path)
     if raw.native:
         return _native(raw)
+    raw = in_seconds(raw)
     found = meanings(raw)
     native = native_source(raw, found)
     if native is not None:
@@ -117,7 +119,8 @@ def _table(
 ) -> Examination:
     table = raw.table
     assert table is not None
-    pairs = {"x_follower", "x_leader"} <= set(found)
+    found = _of_pairs(raw, found)
+    pairs = are_pairs(found)
     clock = next((m for m in ("time", "frame") if m in found), None)
     lacking = [] if clock else ["a time or a frame"]
     lacking += [] if pairs or "x" in found else ["a position x"]
@@ -150,6 +153,8 @@ def _table(
         units["position"] = raw.unit
     if clock == "frame":
         units["time"] = "frame"
+    if found[clock].column in raw.dated:
+        units["time"] = "s"
     rate = rate or raw.rate
     known = {d: medians(tracks, d) for d in _domains(found, tracks, domain)}
     frames = clock == "frame" or bool((tracks.time % 1 == 0).all())
@@ -165,6 +170,8 @@ def _table(
         m: found[m].column for m in ("agent", clock, "x", "y", "x_follower", "x_leader")
         if m in found
     }  # fmt: skip
+    if is_spaced(found):
+        needed |= {m: found[m].column for m in ("spacing", "v_follower", "v_leader")}
     examined.findings += find.cells(table, needed)
     examined.findings += find.rows(table, files[: len(table)], time[: len(table)])
     examined.findings += _unsure(every, rate)
@@ -237,7 +244,10 @@ def _places(raw: Raw, found: Mapping[str, Meaning], pairs: bool) -> _Places:
         return numbers(frame, found[meaning].column) if meaning in found else None
 
     if pairs:
-        both = [numbers(frame, found[m].column) for m in ("x_follower", "x_leader")]
+        if is_spaced(found):
+            both = _integrated(raw, found)
+        else:
+            both = [numbers(frame, found[m].column) for m in ("x_follower", "x_leader")]
         x = np.concatenate(both)[:, None]
         own, other = cells("v_follower"), cells("v_leader")
         speed = None if own is None or other is None else np.abs(np.concatenate([own, other]))
@@ -258,6 +268,51 @@ def _places(raw: Raw, found: Mapping[str, Meaning], pairs: bool) -> _Places:
     if lane is None and len(axes) == 1:
         lane = _parts(raw, found)
     return x, None if speed is None else np.abs(speed), cells("length"), lane
+
+
+def _of_pairs(raw: Raw, found: dict[str, Meaning]) -> dict[str, Meaning]:
+    """Meanings with those that columns have only beside a leader's."""
+    assert raw.table is not None
+    if {"spacing", "v_leader", "speed"} <= set(found) and "v_follower" not in found:
+        changed = {"v_follower" if m == "speed" else m: one for m, one in found.items()}
+        found = changed if is_spaced(changed) else found
+    if are_pairs(found) and {"pair", "split"} <= set(found) and "recording" not in found:
+        both = [raw.table.names(found[m].column, empty=True) for m in ("pair", "split")]
+        names = set(zip(*both, strict=True))
+        if len({pair for pair, _ in names}) < len(names):  # counted anew on either side
+            found = {**found, "recording": found["split"]}
+    return found
+
+
+def _integrated(raw: Raw, found: Mapping[str, Meaning]) -> list[np.ndarray]:
+    """Positions of followers and leaders in the unit of the spacing, by the reader's rule.
+
+    What distance a unit of speed times time is follows from how spacings change with the speeds:
+    the ratio of root mean squares of both changes.
+    """
+    assert raw.table is not None
+    clock = found["time" if "time" in found else "frame"].column
+    columns = (clock, *(found[m].column for m in ("spacing", "v_follower", "v_leader")))
+    time, spacing, follower, leader = (numbers(raw.table.frame, c) for c in columns)
+    pair = pd.factorize(_agents(raw, found, True)[: len(time)])[0]
+    order = np.lexsort((time, pair))
+    same = np.diff(pair[order]) == 0
+
+    def gone(v: np.ndarray) -> np.ndarray:
+        step = np.diff(time[order]) * (v[order][1:] + v[order][:-1]) / 2
+        return np.concatenate([[0.0], np.nancumsum(np.where(same, step, 0.0))])
+
+    relative, lag = gone(leader - follower), LAG
+    whole = pair[order][lag:] == pair[order][:-lag]
+    change = (spacing[order][lag:] - spacing[order][:-lag])[whole]
+    said = (relative[lag:] - relative[:-lag])[whole]
+    known = np.isfinite(change)
+    unit = float(np.sqrt((change[known] ** 2).sum() / max((said[known] ** 2).sum(), 1e-300)))
+    if not (known.any() and 0 < unit < 1e6):
+        unit = 1.0
+    x = np.empty(len(time))
+    x[order] = unit * gone(leader)
+    return [x - spacing, x]
 
 
 def _parts(raw: Raw, found: Mapping[str, Meaning]) -> np.ndarray | None:
@@ -294,7 +349,7 @@ def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -
     found.findings += find.time_scale(found.known, found.scale, rate)
     found.findings += find.extremes(tracks, domain)
     found.findings += find.direction(tracks, domain)
-    whole = found.raw.native not in _CUT and "x_follower" not in found.meanings
+    whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
     found.findings += find.coming_and_going(tracks, domain, whole)
     found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
     found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain))}

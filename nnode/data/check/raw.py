@@ -40,6 +40,7 @@ class Raw:
         decimal: the sign between whole and broken part of numbers.
         rate: frames per second that a comment tells.
         unit: of positions that a comment tells, ``cm`` or ``m``.
+        dated: columns of dates, clock times or durations; in ``table`` these are seconds.
     """
 
     path: Path
@@ -50,6 +51,7 @@ class Raw:
     decimal: str = "."
     rate: float | None = None
     unit: str | None = None
+    dated: tuple[str, ...] = ()
 
 
 def read_raw(path: Path) -> Raw:

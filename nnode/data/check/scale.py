@@ -19,10 +19,8 @@ from scipy.spatial import cKDTree
 from nnode.data.check.gait import sway
 from nnode.data.check.tracks import Moves, Tracks
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
-from nnode.data.sequence import Domain
+from nnode.data.sequence import TIME_UNITS, Domain
 
-#: Seconds by unit of time; frames last as long as their rate tells.
-TIME_UNITS = {"s": 1.0, "ms": 1e-3}
 #: Frame rates of cameras and of published files, 1/s, the usual ones first: they win ties.
 RATES = (25.0, 30.0, 10.0, 16.0, 15.0, 50.0, 60.0, 20.0, 24.0, 29.97, 12.5, 5.0, 2.5)
 
@@ -83,7 +81,7 @@ AGREE = Range(0.995, 1.005, 0.025, "two measurements of one motion")
 #: What units are expected at all, without a name that tells: most data are in SI units.
 _BEFORE = {
     "m": 1.0, "cm": 0.1, "ft": 0.03, "km": 0.01,
-    "s": 1.0, "ms": 0.1, "frame": 0.3,
+    "s": 1.0, "ms": 0.1, "us": 0.01, "ns": 0.1, "frame": 0.3,
     "m/s": 1.0, "km/h": 0.2, "ft/s": 0.03, "mph": 0.03,
 }  # fmt: skip
 #: The same for two coordinates that are of vehicles, though nothing names a vehicle or a lane.

@@ -62,6 +62,18 @@ def native_source(raw: Raw, found: Mapping[str, Meaning]) -> str | None:
     return None
 
 
+def are_pairs(found: Mapping[str, Meaning]) -> bool:
+    """Whether rows are of a follower and its leader, with or without positions."""
+    return {"x_follower", "x_leader"} <= set(found) or is_spaced(found)
+
+
+def is_spaced(found: Mapping[str, Meaning]) -> bool:
+    """Whether rows are of pairs whose positions follow from spacing and speeds."""
+    return {"spacing", "v_follower", "v_leader"} <= set(found) and not (
+        {"x", "x_follower", "x_leader"} & set(found)
+    )
+
+
 def source_of(
     raw: Raw,
     found: Mapping[str, Meaning] | None = None,
@@ -91,7 +103,7 @@ def source_of(
     assert found is not None
     assert scale is not None
     assert tracks is not None
-    if {"x_follower", "x_leader"} <= set(found):
+    if are_pairs(found):
         return _pairs(raw, found, scale, path)
     if scale.domain == "crowd":
         return _people(raw, found, scale, tracks, path)
@@ -112,7 +124,8 @@ def _plain(raw: Raw) -> bool:
 
 
 def _si(scale: Scale) -> bool:
-    return (scale.position, scale.time, scale.rate) == ("m", "s", None)
+    """Whether a tidy table is in these units; that of its times can be told."""
+    return scale.position == "m" and scale.rate is None
 
 
 def _people(
@@ -121,7 +134,7 @@ def _people(
     columns = {meaning: one.column for meaning, one in found.items()}
     exact = all(columns.get(name) == name for name in (*_TABLE, "y"))
     if exact and _si(scale) and _plain(raw):
-        return Source("table", TableOptions(domain="crowd", path=path))
+        return Source("table", TableOptions(domain="crowd", path=path, time_unit=scale.time))
     rate = float(f"{1 / tracks.dt:.9g}")
     steps = max(2, round(rate))
     own: dict[str, Any] = {"t_seq": float(f"{steps / rate:.9g}")} if rate != round(rate) else {}
@@ -168,7 +181,7 @@ def _to_people(
 
 def _read(raw: Raw) -> list[str]:
     if not raw.separator:
-        return [f"t = pd.read_parquet({str(raw.path.absolute())!r})"]
+        return [f"t = pd.read_parquet({str(raw.path.absolute())!r})", *_seconds(raw)]
     how = [repr(str(raw.path.absolute()))]
     if raw.separator != ",":
         how.append("sep=r'\\s+'" if raw.separator == " " else f"sep={raw.separator!r}")
@@ -177,7 +190,17 @@ def _read(raw: Raw) -> list[str]:
     if not raw.named and raw.table is not None:
         names = [str(name) for name in raw.table.frame.columns]
         how.append(f"comment='#', names={names!r}")
-    return [f"t = pd.read_csv({', '.join(how)})"]
+    return [f"t = pd.read_csv({', '.join(how)})", *_seconds(raw)]
+
+
+def _seconds(raw: Raw) -> list[str]:
+    """Lines that make seconds of dates, clock times and durations."""
+    if not raw.dated:
+        return []
+    return [
+        "from nnode.data.readers.columns import Table",
+        *(f"t[{name!r}] = Table(t).times({name!r})[1]" for name in raw.dated),
+    ]  # fmt: skip
 
 
 def _vehicles(
@@ -186,7 +209,7 @@ def _vehicles(
     columns = {meaning: one.column for meaning, one in found.items()}
     exact = all(columns.get(name) == name for name in _TABLE) and "y" not in columns
     if exact and _si(scale) and _plain(raw):
-        return Source("table", TableOptions(domain="traffic", path=path))
+        return Source("table", TableOptions(domain="traffic", path=path, time_unit=scale.time))
     clock = "time" if "time" in columns else "frame"
     meant = {"vehicle": "agent", "time": clock} | {
         name: name for name in ("x", "lane", "speed", "length", "kind")
@@ -230,8 +253,8 @@ def _pairs(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> S
     own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
     if "v_follower" in columns:
         own["speed_unit"] = scale.speed
-    if scale.time == "s" and _plain(raw) and "time" in columns:
-        return Source("pairs", PairOptions(path=path, **own))
+    if scale.rate is None and _plain(raw) and "time" in columns:
+        return Source("pairs", PairOptions(path=path, time_unit=scale.time, **own))
     made = str(raw.path.with_name(f"{raw.path.stem}_pairs.csv").absolute())
     clock = columns.get("time", columns.get("frame", ""))
     named["time"] = "time"

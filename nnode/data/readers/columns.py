@@ -16,6 +16,11 @@ from nnode.files import csv_cell
 
 #: Whole numbers below this are exact as floating-point numbers.
 _EXACT = 2.0**53
+#: s; times beyond this (three years) count from a calendar's origin. Float64 resolves them to
+#: 1e-8 s and less, which is a relative error of 1e-6 in intervals of 0.02 s.
+EPOCH = 1e8
+#: Whole numbers below this are 64 bits long.
+_WHOLE = 2.0**63
 
 
 class Table:
@@ -145,6 +150,10 @@ class Table:
             DataError: a cell without a finite number; names the row.
         """
         cells = self.frame[column]
+        if cells.dtype.kind in "mM":
+            raise DataError(
+                f"{self.path}: column {column!r} holds dates or durations; expected numbers"
+            )
         values = _floats(cells)
         bad = ~np.isfinite(values)
         if empty:
@@ -159,6 +168,89 @@ class Table:
                 "finite number"
             )
         return values
+
+    def positive(self, column: str) -> np.ndarray:
+        """The column as ``(rows,)`` float64 above 0; empty cells, of what is unknown, are NaN.
+
+        Raises:
+            DataError: a cell with another value; names the row.
+        """
+        values = self.numbers(column, empty=True)
+        wrong = np.flatnonzero(values <= 0)
+        if wrong.size:
+            raise DataError(
+                f"{self.path}, {self.row(int(wrong[0]))}: column {column!r} holds "
+                f"{values[wrong[0]]:g}; expected a positive number, or an empty cell where it is "
+                "not known"
+            )
+        return values
+
+    def instants(self, column: str) -> np.ndarray | None:
+        """Dates, clock times or durations as ``(rows,)`` whole nanoseconds; None of numbers.
+
+        Dates and times of day in a text are those of ISO 8601 (``2020-01-31 08:00:00.2``,
+        ``08:00:00.2``). Dates without a time zone are taken as of one.
+
+        Raises:
+            DataError: a cell that is none of them, in a column without a number; names the row.
+        """
+        cells = self.frame[column]
+        if cells.dtype.kind not in "mM":
+            if np.isfinite(np.array(pd.to_numeric(cells, errors="coerce"), dtype=float)).any():
+                return None
+            cells = cells.astype("string")
+        try:
+            found = self._instants(cells).dt.as_unit("ns")
+        except (ValueError, OverflowError) as error:  # beyond the years that nanoseconds count
+            raise DataError(
+                f"{self.path}: column {column!r} holds no dates of our time: {error}"
+            ) from error
+        known = found.notna().to_numpy()
+        if not known.all():
+            i = int(np.flatnonzero(~known)[0])
+            shown = "nothing" if cells.isna().iloc[i] else repr(str(cells.iloc[i])[:40])
+            raise DataError(
+                f"{self.path}, {self.row(i)}: column {column!r} holds {shown}; expected seconds, "
+                "or dates (2020-01-31 08:00:00.2), clock times (08:00:00.2) or durations in all "
+                "rows"
+            )
+        return np.asarray(found.astype("int64"))
+
+    @staticmethod
+    def _instants(cells: pd.Series) -> pd.Series:
+        """Dates, else clock times and durations, as far as cells hold such."""
+        if cells.dtype.kind == "m":
+            return cells
+        dates = pd.to_datetime(cells, utc=True, format="ISO8601", errors="coerce")
+        if dates.notna().any():
+            return dates
+        # a text without a colon would count as nanoseconds
+        clock = cells.where(cells.str.contains(":").fillna(False).astype(bool))
+        return pd.to_timedelta(clock, errors="coerce")
+
+    def times(self, column: str, unit: float = 1.0) -> tuple[int, np.ndarray]:
+        """The column as times: an origin, and ``(rows,)`` seconds after it.
+
+        Args:
+            column: name in the table; of numbers, dates, clock times or durations.
+            unit: s, of numbers.
+
+        Returns:
+            The origin in ns: of numbers see 0 or, of times since 1970, the first of them; otherwise
+            the first one.
+
+        Raises:
+            DataError: a cell without such; names the row.
+        """
+        found = self.instants(column)
+        if found is not None:
+            first = int(found.min())
+            return first, (found - first) / 1e9
+        values = self.numbers(column)
+        whole = pd.api.types.is_integer_dtype(self.frame[column])
+        if whole and np.abs(values).max() < _WHOLE:
+            return _since_first(self.frame[column].to_numpy(dtype=np.int64), unit)
+        return _since_first(values, unit)
 
     def names(self, column: str, *, empty: bool = False) -> np.ndarray:
         """The column as ``(rows,)`` text; whole numbers are written without a decimal point.
@@ -247,6 +339,23 @@ def _quoted(cell: Any) -> str:
         return repr(str(cell))
     except ValueError:
         return "a number that is too large"
+
+
+def _since_first(values: np.ndarray, unit: float) -> tuple[int, np.ndarray]:
+    """Numbers of a unit of time as seconds after an origin.
+
+    Args:
+        values: ``(rows,)``, whole or floating-point.
+        unit: s.
+
+    Returns:
+        The origin in ns, and ``(rows,)`` s after it. It is 0, and for times since 1970 (beyond
+        :data:`EPOCH`) the first of them, as their differences would be rounded otherwise.
+    """
+    first = values.min()
+    if first * unit < EPOCH:
+        return 0, values * unit
+    return round(int(first) * (unit * 1e9)), (values - int(first)) * unit
 
 
 def opened(source: Path | str | Table) -> Table:

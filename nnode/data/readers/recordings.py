@@ -10,7 +10,30 @@ from pathlib import Path
 
 from nnode.data import download
 from nnode.data.options import DataOptions
+from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
+
+
+class Reading(list[Sequence]):
+    """Sequences of a reader that tells what it left out.
+
+    Attributes:
+        left_out: ``name`` and ``why`` of each record of which there is no sequence.
+    """
+
+    def __init__(
+        self, sequences: Iterable[Sequence] = (), left_out: Iterable[dict[str, str]] = ()
+    ) -> None:
+        super().__init__(sequences)
+        self.left_out = list(left_out)
+
+
+def natural(name: str) -> tuple[list[tuple[int, str]], str]:
+    """A key that sorts names as they are counted: ``s2`` before ``s10``."""
+    parts = re.split(r"(\d+)", name)
+    parts[1::2] = [digits.lstrip("0") for digits in parts[1::2]]
+    # a number of more digits is larger
+    return [(len(p) if i % 2 else 0, p) for i, p in enumerate(parts)], name
 
 
 def positive(option: str, value: float | None) -> float:

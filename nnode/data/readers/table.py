@@ -9,8 +9,14 @@ import numpy as np
 from nnode.data.exits import destinations, exits_of, read_exits
 from nnode.data.options import TableOptions
 from nnode.data.readers.columns import Table, opened
-from nnode.data.readers.recordings import check_known, table_path, wanted
-from nnode.data.sequence import Sequence
+from nnode.data.readers.recordings import (
+    check_known,
+    natural,
+    one_of,
+    table_path,
+    wanted,
+)
+from nnode.data.sequence import TIME_UNITS, Sequence
 from nnode.errors import ConfigError, DataError
 
 #: Share of the sampling interval by which sampling times may deviate from equal spacing.
@@ -47,9 +53,10 @@ def read_table(
         walls: CSV or Parquet with a segment per row, x1, y1, x2, y2 (m).
 
     Returns:
-        Sequences named ``recording/sequence``, in the order in which they appear. An agent that
-        is absent at some times of a sequence is NaN there (see
-        :func:`nnode.data.quality.find_faults`). Vehicles are ordered by their first position.
+        Sequences named ``recording/sequence``, in the order of their names, whatever that of the
+        rows. An agent that is absent at some times of a sequence is NaN there (see
+        :func:`nnode.data.quality.find_faults`). Vehicles are ordered by their first position,
+        people by name.
 
     Raises:
         ConfigError: no domain, or an unknown recording.
@@ -74,10 +81,10 @@ def read_table(
             "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
         )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
-    time = table.numbers(names["time"])
+    time = table.times(names["time"], one_of("time_unit", options.time_unit, TIME_UNITS))[1]
     values = {name: table.numbers(names[name]) for name in (*axes, *goals) if name in names}
     if "length" in names:
-        values["length"] = table.numbers(names["length"], empty=True)
+        values["length"] = table.positive(names["length"])
     words = {k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names}
     recording = (
         table.names(names["recording"])
@@ -93,7 +100,7 @@ def read_table(
     for i, key in enumerate(zip(recording, sequence, strict=True)):
         groups.setdefault(key, []).append(i)
     found = []
-    for (run, number), rows in groups.items():
+    for (run, number), rows in sorted(groups.items(), key=lambda item: [*map(natural, item[0])]):
         if asked is not None and run not in asked:
             continue
         name = number if number.startswith(f"{run}/") else f"{run}/{number}"
@@ -163,10 +170,10 @@ def _is_crowd(options: TableOptions) -> bool:
 
 
 def _people(agent: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Distinct agents in order of appearance, and each row's number among them."""
-    number: dict[str, int] = {}
-    code = np.array([number.setdefault(name, len(number)) for name in agent])
-    return list(number), code
+    """Distinct agents in order of their names, and each row's number among them."""
+    names = sorted(set(agent), key=natural)
+    number = {name: i for i, name in enumerate(names)}
+    return names, np.array([number[name] for name in agent])
 
 
 def _grid(

@@ -10,7 +10,7 @@ from nnode.data.options import LaneOptions, VehicleTableOptions
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.recordings import one_of, positive, table_path
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import TIME_UNITS, Sequence, check_interval
 from nnode.errors import ConfigError, DataError
 
 #: Metres per unit of length.
@@ -47,15 +47,22 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> list[Se
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     check_cutting(options)
     table = opened(source)
-    return cut_vehicles({table.path.stem: _rows(table, options)}, options)
+    rows = _rows(table, options)
+    order = np.lexsort((rows.time, rows.vehicle.astype(str)))
+    step = np.diff(rows.time[order])[rows.vehicle[order][1:] == rows.vehicle[order][:-1]]
+    step = step[step > 0]
+    if step.size:
+        check_interval(float(np.median(step)), f"{table.path}: rows of a vehicle")
+    return cut_vehicles({table.path.stem: rows}, options)
 
 
 def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
-    units = {"s": 1.0, "ms": 1e-3, "frame": np.nan}
-    scale = one_of("time_unit", options.time_unit, units)
+    scale = one_of("time_unit", options.time_unit, {**TIME_UNITS, "frame": np.nan})
     if options.time_unit == "frame":
         scale = 1.0 / positive("frame_rate", options.frame_rate)
-    time = table.numbers(column) * scale
+    dates = table.instants(column)
+    # numbers keep their origin, with which the time grid begins
+    time = table.numbers(column) * scale if dates is None else (dates - dates.min()) / 1e9
     far = np.flatnonzero(~(np.abs(time) < _LATEST * options.dt))
     if far.size:
         raise DataError(
@@ -77,7 +84,7 @@ def _rows(table: Table, options: VehicleTableOptions) -> Vehicles:
         speed = np.abs(table.numbers(names["speed"])) * scale
     if "length" in names:
         scale = one_of("length_unit", length_unit, LENGTH_UNITS)
-        length = table.numbers(names["length"], empty=True) * scale
+        length = table.positive(names["length"]) * scale
     return Vehicles(
         path=table.path,
         row=table.row,

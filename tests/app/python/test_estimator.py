@@ -225,6 +225,52 @@ def test_what_is_asked_too_early_or_does_not_exist_is_refused(tidy: pd.DataFrame
             nnode.Calibrator().fit(nothing)
 
 
+@pytest.mark.filterwarnings("error")
+def test_anonymous_pairs_have_intervals() -> None:
+    """Each is a cluster of its own; one pair alone has no interval, which is said."""
+    table = pairs(6, 20.0)
+    assert not {"follower", "leader"} & set(table)
+    given = nnode.sequences(table)
+    fitted = nnode.Calibrator("idm").fit(given)
+    assert fitted.result_.clusters == len(given) == 6
+    assert np.isfinite(fitted.parameters_[["lower", "upper"]].to_numpy(dtype=float)).all()
+    alone = nnode.Calibrator("idm").fit(given[:1])
+    assert "no intervals: the training sequences are one cluster" in alone.result_.summary()
+    assert alone.parameters_.lower.isna().all()
+
+
+@pytest.mark.real
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("file", "columns", "T", "s0"),
+    [
+        (
+            "ngsim_events/events.parquet",
+            {"pair": "event", "v_follower": "speed", "v_leader": "leader_speed"},
+            1.054,
+            1.404,
+        ),
+        (
+            "waymo_pairs/hv_av_2.parquet",
+            {"time": "t", "pair": "event", "run": "split"},
+            1.455,
+            4.981,
+        ),
+    ],
+)
+def test_published_pairs_are_calibrated(
+    real_data: Path, file: str, columns: dict[str, str], T: float, s0: float
+) -> None:
+    """Intervals are finite and hold what others published of the same pairs."""
+    given = nnode.sequences(real_data / file, data="pairs", columns=columns)
+    found = nnode.Calibrator("idm").fit(given).parameters_
+    free = found[found.at_bound == ""]
+    assert set(free.index) >= {"idm.T", "idm.s0", "idm.a", "idm.b"}
+    assert np.isfinite(free[["lower", "upper"]].to_numpy(dtype=float)).all()
+    for name, value in (("idm.T", T), ("idm.s0", s0)):
+        assert found.lower[name] < value < found.upper[name]
+
+
 def test_people_are_calibrated_as_well() -> None:
     rows = [
         (run, 0.2 * k, f"{run}/{i}", (-1) ** i * (0.4 * k * 0.9 - 2.0 + 0.2 * run), 0.6 * i)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -71,6 +72,24 @@ def test_nothing_missing_is_an_empty_table() -> None:
     assert found.effects == []
     assert found.to_dataframe().empty
     assert "<table" not in found._repr_html_()
+
+
+def test_the_order_of_rows_and_sequences_changes_no_diagnosis() -> None:
+    rows = [
+        (f"s{number}", time, f"{number}/{i}", x)
+        for number, one in enumerate(platoons(number=12, seconds=6.0))
+        for k, time in enumerate(one.time)
+        for i, x in enumerate(one.x[k, :, 0])
+    ]
+    frame = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
+    shuffled = frame.sample(frac=1.0, random_state=3)
+    assert shuffled.sequence.iloc[0] != "s0"
+    told = []
+    for given in (frame, shuffled, nnode.sequences(frame, faults="keep")[::-1]):
+        plain = nnode.diagnose(given, model="lin", options=ALONE).plain()
+        del plain["seconds"]
+        told.append(json.dumps(plain, sort_keys=True))
+    assert told[0] == told[1] == told[2]
 
 
 @pytest.mark.usefixtures("found")

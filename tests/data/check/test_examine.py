@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 
 from nnode.data.check.examine import Examination, examine, sure
-from nnode.data.options import VehicleTableOptions, WalkwayOptions
+from nnode.data.options import PairOptions, VehicleTableOptions, WalkwayOptions
 from nnode.data.prepare import FORMATS
+from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
 from nnode.errors import ConfigError, DataError
 from tests.data.check.planted import cars, people, saved, text
 
@@ -253,6 +254,90 @@ def test_pairs_and_tidy_tables_and_semicolons(tmp_path: Path) -> None:
     assert platoon.n_agents == 12
 
 
+def spaced(units: dict[str, float]) -> pd.DataFrame:
+    """Four pairs of spacings and speeds, numbered anew on either side of a division."""
+    table = cars(2)
+    lead, follow = (table[table["veh"] == i].reset_index() for i in (0, 1))
+    own = pd.DataFrame(
+        {"t": lead["t"], "spacing": (lead["x"] - follow["x"] - 4.5) / units["position"],
+         "speed": follow["v"] / units["speed"], "leader_speed": lead["v"] / units["speed"]}
+    )  # fmt: skip
+    parts = [own.assign(event=i, split=side) for i in range(2) for side in ("train", "test")]
+    return pd.concat(parts)
+
+
+@pytest.mark.parametrize("position", ["m", "ft"])
+@pytest.mark.parametrize("speed", ["m/s", "km/h"])
+def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, speed: str) -> None:
+    """How spacings change with the speeds tells one unit by the other."""
+    units = {"position": LENGTH_UNITS[position], "speed": SPEED_UNITS[speed]}
+    found = examine(saved(spaced(units), tmp_path, "pairs.csv"))
+    assert said(found) == said(found, "warning") == {}
+    assert (found.scale.position, found.scale.speed) == (position, speed)
+    options = found.source.options
+    assert isinstance(options, PairOptions)
+    assert options.columns == {
+        "time": "t", "pair": "event", "run": "split", "v_follower": "speed",
+        "v_leader": "leader_speed",
+    }  # fmt: skip
+    assert {s.name for s in found.sequences} == {"train/0", "train/1", "test/0", "test/1"}
+    assert found.sequences[0].v is not None
+    speeds = np.gradient(found.sequences[0].x[:, 0, 0], 0.1)
+    assert np.abs(speeds - found.sequences[0].v[:, 0, 0]).max() < 0.5
+
+
+DATES = {
+    "dates": lambda t: (pd.Timestamp("2020-01-01 23:00") + pd.to_timedelta(t, unit="s")).astype(
+        str
+    ),
+    "durations": lambda t: pd.to_timedelta(t, unit="s").astype(str),
+    "ms": lambda t: 1_577_865_600_000 + (1e3 * t).round().astype("int64"),
+    "us": lambda t: 1_577_865_600_000_000 + (1e6 * t).round().astype("int64"),
+    "ns": lambda t: 1_577_865_600_000_000_000 + (1e9 * t).round().astype("int64"),
+}
+
+
+@pytest.mark.parametrize("kind", DATES)
+@pytest.mark.parametrize("group", ["vehicles", "table", "pairs"])
+def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) -> None:
+    table = cars()
+    if group == "table":
+        table = table.rename(columns={"veh": "agent", "t": "time"}).assign(sequence=0)
+        table = table[["sequence", "time", "agent", "x"]]
+    elif group == "pairs":
+        table = spaced({"position": 1.0, "speed": 1.0})
+    clock = "time" if group == "table" else "t"
+    table[clock] = DATES[kind](table[clock])
+    found = examine(saved(table, tmp_path, "t.csv"))
+    assert said(found) == {}
+    assert found.source.group == group
+    assert found.scale.time == (kind if kind in ("ms", "us", "ns") else "s")
+    assert found.source.options.time_unit == found.scale.time
+    assert found.tracks.dt == pytest.approx(0.1, abs=1e-6)
+    assert found.sequences
+
+
+def test_lines_that_make_a_table_make_seconds_of_dates(tmp_path: Path) -> None:
+    path = tmp_path / "german.csv"
+    table = cars().assign(t=DATES["dates"](cars()["t"]))
+    table.to_csv(path, index=False, sep=";", decimal=",")
+    found = examine(path)
+    exec(compile("\n".join(found.source.convert), "convert", "exec"), {})
+    options = vehicles(found)
+    kind = FORMATS[type(options)]
+    (platoon,) = kind.read(kind.files(options), options)
+    assert platoon.n_agents == 12
+    assert platoon.time[0] == 0.0
+
+
+def test_overlaps_of_bumpers_are_a_finding(tmp_path: Path) -> None:
+    table = cars()
+    table["length"] = 4.5
+    assert "overlap" not in said(examine(saved(table, tmp_path)))
+    table.loc[table["veh"] == 3, "length"] = 200.0
+    assert "long, at" in said(examine(saved(table, tmp_path)))["overlap"]
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -291,7 +376,9 @@ REAL = {
     "juelich/bo-360-090-090.txt": ("pedpy", "crowd"),
     "ngsim/i80_lanes_1_2.csv": ("vehicles", "traffic"),
     "ngsim_pairs/i80_pairs.parquet": ("pairs", "traffic"),
+    "ngsim_events/events.parquet": ("pairs", "traffic"),
     "tgsim/pairs.parquet": ("pairs", "traffic"),
+    "waymo_pairs/hv_av_2.parquet": ("pairs", "traffic"),
     "openacc/astazero.parquet": ("astazero", "traffic"),
     "openacc/zalazone/mixed_dynamic_part7.csv": ("openacc", "traffic"),
 }

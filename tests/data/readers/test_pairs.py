@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from omegaconf import OmegaConf
+from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.clusters import clusters, index_of
 from nnode.data.options import Gaps, PairOptions, SplitMode, SplitOptions
 from nnode.data.prepare import prepare
+from nnode.data.quality import find_faults
 from nnode.data.readers.pairs import pair_files, read_pairs
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
@@ -89,7 +91,9 @@ def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> 
     assert len(found) == 10
     assert {s.name for s in found} == {f"pairs/{p}_{k:03d}" for p in (1, 3) for k in range(5)}
     assert {s.n_samples for s in found} == {11}
-    assert all(s.agents == () and s.length is not None and s.length[1] == 4.5 for s in found)
+    assert all(s.length is not None and s.length[1] == 4.5 for s in found)
+    # vehicles without a name are called after their pair, so that its windows are one cluster
+    assert {s.agents for s in found} == {(f"{p} follower", f"{p} leader") for p in (1, 3)}
 
 
 def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
@@ -187,6 +191,116 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
     assert (s.name, s.agents, s.kind) == ("1/run-1-veh-16-pair-7", ("16", "6"), ("HV", "CAV"))
 
 
+def spaced(pair: object, spacing: float = 20.0, k: int = 51, **more: object) -> pd.DataFrame:
+    """A follower at 10 m/s behind a leader whose speed falls evenly from 12 to 9 m/s."""
+    t = 0.1 * np.arange(k)
+    v = 12.0 - 0.6 * t
+    gap = spacing + (12.0 * t - 0.3 * t**2) - 10.0 * t
+    own = {"pair": pair, "time": t, "spacing": gap, "v_follower": 10.0, "v_leader": v}
+    return pd.DataFrame({**own, **more})
+
+
+def test_positions_follow_from_spacing_and_speeds(tmp_path: Path) -> None:
+    table = spaced(1)
+    (s,) = read(save(tmp_path / "p.csv", table))
+    assert s.length is not None
+    assert s.v is not None
+    # the trapezium rule is exact for a speed that changes evenly
+    np.testing.assert_allclose(s.x[:, 1, 0], 12.0 * s.time - 0.3 * s.time**2, atol=1e-9)
+    gap = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
+    np.testing.assert_allclose(gap, table.spacing, atol=1e-9)
+    np.testing.assert_allclose(np.diff(s.x[:, 0, 0]), 1.0, atol=1e-9)
+    np.testing.assert_array_equal(s.v[:, :, 0], table[["v_follower", "v_leader"]])
+    assert s.length[1] == 5.0
+    assert np.isnan(s.length[0])
+
+    # the length of a leader changes where fronts are, and no gap
+    (longer,) = read(save(tmp_path / "q.csv", spaced(1, leader_length=12.0)))
+    assert longer.length is not None
+    assert longer.length[1] == 12.0
+    np.testing.assert_allclose(longer.x[:, 0] - s.x[:, 0], -7.0)
+    (unknown,) = read(save(tmp_path / "p.csv", spaced(1)), length=None)
+    assert unknown.length is None
+    np.testing.assert_allclose(unknown.x[:, 1, 0] - unknown.x[:, 0, 0], table.spacing)
+
+
+def test_speeds_and_spacings_have_their_units(tmp_path: Path) -> None:
+    table = spaced(1)
+    feet = table.assign(
+        spacing=table.spacing / FOOT, v_leader=table.v_leader * 3.6, v_follower=36.0
+    )
+    (s,) = read(save(tmp_path / "p.csv", feet), position_unit="ft", speed_unit="km/h")
+    (si,) = read(save(tmp_path / "q.csv", table))
+    np.testing.assert_allclose(s.x, si.x, atol=1e-9)
+
+
+def test_without_positions_the_spacing_needs_both_speeds(tmp_path: Path) -> None:
+    for missing in ("spacing", "v_follower", "v_leader"):
+        path = save(tmp_path / "p.csv", spaced(1).drop(columns=missing))
+        with pytest.raises(DataError, match="spacing, v_follower and v_leader are needed"):
+            read(path)
+    path = save(tmp_path / "p.csv", spaced(1).assign(spacing=[np.nan] + [20.0] * 50))
+    with pytest.raises(DataError, match="line 2: column 'spacing' holds nothing"):
+        read(path)
+
+
+def test_anonymous_pairs_are_a_cluster_each(tmp_path: Path) -> None:
+    parts = [spaced(i, 20.0 + i) for i in range(12)]
+    found = read(save(tmp_path / "p.csv", *parts), window=1.0)
+    assert len(found) == 60
+    label = clusters(index_of(found))
+    assert label.max() + 1 == 12
+    # windows of one pair are one
+    names = np.array([s.name.partition("_")[0] for s in found])
+    assert all(len(set(label[names == name])) == 1 for name in names)
+
+
+def test_pairs_that_name_one_vehicle_share_that_one(tmp_path: Path) -> None:
+    parts = [spaced(i, follower=i // 2) for i in range(6)]
+    found = read(save(tmp_path / "p.csv", *parts))
+    assert clusters(index_of(found)).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    holed = spaced(3).drop(index=range(5, 51, 5))
+    parts = [spaced(1), spaced(2, k=4), holed, spaced(4, spacing=0.2, leader_length=0.5)]
+    path = save(tmp_path / "p.csv", *parts)
+    store = prepare(PairOptions(path=str(path), min_samples=10), tmp_path / "store")
+    left = {entry["name"]: entry["why"] for entry in store.manifest["left_out"]}
+    assert left == {
+        "pairs/2": "fewer than data.min_samples=10 times",
+        "pairs/3": "no data.min_samples=10 times without a gap",
+    }
+    assert [entry["sequence"] for entry in store.manifest["dropped"]] == ["pairs/4"]
+    assert store.manifest["counts"] == {"read": 2, "kept": 1, "dropped": 1}
+    said = " ".join(record.getMessage() for record in caplog.records)
+    assert "2 records are left out" in said
+    assert "1 of 2 sequences are left out for their faults: overlap in 1" in said
+
+    store = prepare(PairOptions(path=str(path), window=4.0), tmp_path / "store")
+    assert store.manifest["left_out"] == [
+        {"name": "pairs/2", "why": "no data.window=4 s without a gap"},
+        {"name": "pairs/3", "why": "no data.window=4 s without a gap"},
+    ]
+
+
+@pytest.mark.parametrize("length", [0.0, -4.5])
+@pytest.mark.parametrize("column", ["leader_length", "follower_length"])
+def test_lengths_are_positive(tmp_path: Path, column: str, length: float) -> None:
+    path = save(tmp_path / "p.csv", drive(**{column: length}).drop(columns="spacing"))
+    with pytest.raises(DataError, match=f"line 2: column '{column}' holds .*expected a positive"):
+        read(path)
+
+
+def test_a_spacing_of_fronts_is_refused(tmp_path: Path) -> None:
+    table = drive()
+    path = save(tmp_path / "p.csv", table.assign(spacing=table.x_leader - table.x_follower))
+    with pytest.raises(DataError, match=r"leader's length, is 0.00 m; .*data\.columns\.spacing"):
+        read(path)
+    (s,) = read(path, columns={"spacing": None})
+    assert s.length is None
+
+
 def test_without_the_folder_it_is_said_where_it_is_published(tmp_path: Path) -> None:
     options = configured("tgsim", "tgsim", tmp_path)
     with pytest.raises(DataError, match=r"github.com/usdot-fhwa-stol/.* at commit bd31e5189d9a"):
@@ -248,6 +362,61 @@ def test_pairs_of_tgsim(real_data: Path) -> None:
     # the spacings were made with vehicles of 5 m
     assert all(s.length is not None and abs(s.length[1] - 5.0) < 1e-9 for s in found)
     assert clusters(index_of(found)).max() + 1 == len({s.recording for s in found}) == 10
+
+
+EVENTS = {"pair": "event", "v_follower": "speed", "v_leader": "leader_speed"}
+WAYMO = {"time": "t", "pair": "event", "run": "split"}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("file", "columns", "number"),
+    [("ngsim_events/events.parquet", EVENTS, 201), ("waymo_pairs/hv_av_2.parquet", WAYMO, 89)],
+)
+def test_published_pairs_without_positions(
+    real_data: Path, file: str, columns: dict[str, str], number: int
+) -> None:
+    found = read(real_data / file, columns=columns)
+    table = pd.read_parquet(real_data / file)
+    assert len(found) == clusters(index_of(found)).max() + 1 == number
+    assert sum(s.n_samples for s in found) == len(table)
+    names = [columns["pair"], *(["split"] if "split" in table else [])]
+    rows = {"/".join(map(str, key[::-1])): own for key, own in table.groupby(names, sort=False)}
+    for s in found:
+        assert s.length is not None
+        assert s.v is not None
+        own = rows[s.name.removeprefix("pairs/")]
+        np.testing.assert_allclose(s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0, own.spacing, atol=1e-9)
+        np.testing.assert_array_equal(s.v[:, 1, 0], own[columns.get("v_leader", "v_leader")])
+        # the follower's position, of which only the spacing is measured, has its measured speed
+        moved = cumulative_trapezoid(s.v[:, 0, 0], s.time, initial=0.0)
+        assert np.abs(s.x[:, 0, 0] - s.x[0, 0, 0] - moved).max() < 2.0
+        assert find_faults(s, "traffic") == []
+
+
+@pytest.mark.real
+def test_a_published_idm_gives_the_published_error_of_spacings(real_data: Path) -> None:
+    """Parameters of Wen, Jian & He 2023; speeds by Euler's method, paths by the trapezium rule."""
+    a, b, v0, s0, headway = 1.08200092, 0.37833643, 29.72641382, 4.98069566, 1.4551363
+    squares = total = 0.0
+    for s in read(real_data / "waymo_pairs" / "hv_av_2.parquet", columns=WAYMO):
+        if s.split != "test":
+            continue
+        assert s.length is not None
+        assert s.v is not None
+        spacing = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
+        (follower, leader), v = s.v[:, :, 0].T, s.v[0, 0, 0]
+        rear = spacing + cumulative_trapezoid(follower, s.time, initial=0.0)
+        place, gaps = 0.0, [spacing[0]]
+        for k in range(s.n_samples - 1):
+            wanted = s0 + v * headway + v * (v - leader[k]) / (2 * np.sqrt(a * b))
+            then = v + 0.1 * a * (1 - (v / v0) ** 4 - (wanted / gaps[-1]) ** 2)
+            place += 0.1 * (v + then) / 2
+            v = then
+            gaps.append(rear[k + 1] - place)
+        squares += float(((spacing - np.array(gaps)) ** 2).sum())
+        total += float((spacing**2).sum())
+    assert np.sqrt(squares / total) == pytest.approx(0.2782, abs=5e-5)
 
 
 def _gap_error(s: Sequence, p: dict[str, float], dt: float = 0.1) -> float:

@@ -42,6 +42,40 @@ def test_traffic_is_ordered_by_position(tmp_path: Path) -> None:
     assert (first.name, second.name, second.recording) == ("own/s1", "own/s2", "own")
 
 
+@pytest.mark.parametrize("domain", ["traffic", "crowd"])
+def test_the_order_of_rows_changes_nothing(tmp_path: Path, domain: str) -> None:
+    place = {} if domain == "traffic" else {"y": 1.0}
+    parts = [
+        rows(
+            f"s{s}",
+            f"a{n}",
+            LINE + 30.0 * (n * 7 % 12),
+            t0=s,
+            kind=f"k{n}",
+            length=4.0 + n,
+            **place,
+        )
+        for s in range(12)
+        for n in range(12)
+    ]
+    table = pd.concat(parts)
+    found = read(tmp_path, table, domain=domain)
+    assert [s.name for s in found] == [f"own/s{s}" for s in range(12)]
+    for seed in range(3):
+        again = read(tmp_path, table.sample(frac=1.0, random_state=seed), domain=domain)
+        for own, other in zip(again, found, strict=True):
+            assert (own.name, own.agents, own.kind) == (other.name, other.agents, other.kind)
+            np.testing.assert_array_equal(own.x, other.x)
+            np.testing.assert_array_equal(own.time, other.time)
+            np.testing.assert_array_equal(own.length, other.length)
+
+
+@pytest.mark.parametrize("length", [0.0, -5.0])
+def test_lengths_are_positive(tmp_path: Path, length: float) -> None:
+    with pytest.raises(DataError, match=r"line 2: column 'length' holds .*expected a positive"):
+        read(tmp_path, rows("s", "a", LINE, length=length), rows("s", "b", LINE + 40))
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_crowd_with_everything(tmp_path: Path, suffix: str) -> None:
     parts = [

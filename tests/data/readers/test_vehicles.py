@@ -212,7 +212,7 @@ def test_reconstructed_motorway(real_data: Path) -> None:
         ({"window": -1.0}, "window=-1.0: expected a positive number"),
         ({"direction": 2}, "direction=2: expected 1 or -1"),
         ({"position_unit": "yd"}, "position_unit=yd: expected one of m, ft, cm, km"),
-        ({"time_unit": "h"}, "time_unit=h: expected one of s, ms, frame"),
+        ({"time_unit": "h"}, "time_unit=h: expected one of s, ms, us, ns, frame"),
         ({"time_unit": "frame"}, "frame_rate=None: expected a positive number"),
         ({"time_unit": "frame", "frame_rate": -5.0}, "frame_rate=-5.0"),
         ({"min_vehicles": 0}, "must be at least 1"),

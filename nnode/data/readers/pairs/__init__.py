@@ -2,23 +2,29 @@
 
 A pair is its own little platoon of two, the leader last. Where the source gives the spacing from
 bumper to bumper in place of the leader's length, that follows from it and from the positions.
+Without positions, these follow from the spacing and the speeds, see :func:`read_pairs`.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
-from nnode.data.options import Gaps, PairOptions
+from nnode.data.options import PairOptions
 from nnode.data.readers.columns import Table, opened
+from nnode.data.readers.pairs.pieces import Pair, pieces_of, sequence_of, too_short
 from nnode.data.readers.recordings import (
+    Reading,
     check_known,
+    natural,
     one_of,
     place_below,
     positive,
@@ -26,10 +32,14 @@ from nnode.data.readers.recordings import (
     wanted,
 )
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import TIME_UNITS, Sequence
 from nnode.errors import ConfigError, DataError
 
+log = logging.getLogger(__name__)
+
 _REQUIRED = ("time", "x_follower", "x_leader")
+#: What positions follow from where there are none.
+_INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
 _METRES = ("leader_length", "follower_length", "spacing")
 _SPEEDS = ("v_follower", "v_leader")
 #: What belongs to a pair as a whole.
@@ -41,25 +51,6 @@ INDEX = "index"
 #: m by which a length that follows from spacings may vary within a pair: the error that a single
 #: position may have without being a fault (:mod:`nnode.data.quality`).
 UNSTEADY = 0.5
-#: Share of the sampling interval by which a step may deviate.
-UNEVEN = 0.01
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A pair's rows in one file, in order of time, and what belongs to it as a whole."""
-
-    table: Table
-    rows: np.ndarray
-    words: dict[str, str]
-    time: np.ndarray
-    x: np.ndarray
-    v: np.ndarray | None
-    length: np.ndarray
-
-    @property
-    def called(self) -> str:
-        return f"{self.table.path}: pair {self.words['pair']}"
 
 
 def pair_files(options: PairOptions) -> dict[str, Path]:
@@ -83,8 +74,13 @@ def pair_files(options: PairOptions) -> dict[str, Path]:
     return files
 
 
-def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[Sequence]:
+def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Reading:
     """Read pairs.
+
+    Without positions, that of the leader's front is the integral of its speed by the trapezium
+    rule, from 0 at the pair's first time, and that of the follower's front is the leader's less
+    the leader's length and the spacing: the measured spacing is kept exactly. The length is
+    ``data.length`` where the table has none.
 
     Args:
         files: see :func:`pair_files`.
@@ -92,9 +88,10 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
 
     Returns:
         Sequences of two vehicles, follower and leader, named ``run/pair``, with a number behind
-        where a pair is cut. Speeds are the measured ones where the source has those of both. A
-        pair without a column of it is a file; without a run, all are of one recording, which is
-        called like the data.
+        where a pair is cut, in the order of these names. Speeds are the measured ones where the
+        source has those of both. A pair without a column of it is a file; without a run, all are
+        of one recording, which is called like the data. A vehicle without an identifier is called
+        after the pair and is in no other one. ``left_out`` tells of pairs that are too short.
 
     Raises:
         ConfigError: an option out of its range, an unknown recording or lane.
@@ -114,9 +111,12 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
     if asked is not None:
         check_known(asked, [pair.words["run"] for pair in pairs])
     lanes = _lanes(options, pairs)
+    start = min((pair.origin for pair in pairs), default=0)
     found: list[Sequence] = []
     taken: dict[str, str] = {}
-    for pair in pairs:
+    short: list[dict[str, str]] = []
+    anonymous = 0
+    for pair in sorted(pairs, key=lambda p: (natural(p.words["run"]), natural(p.words["pair"]))):
         run, lane = pair.words["run"], pair.words.get("lane", "")
         if (asked is not None and run not in asked) or (lanes and lane not in lanes):
             continue
@@ -127,9 +127,13 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
                 "their own (data.columns.pair, data.pattern)"
             )
         taken[name] = str(pair.table.path)
-        pieces = list(_pieces(pair, options))
+        anonymous += not (pair.words.get("follower") or pair.words.get("leader"))
+        pair = replace(pair, time=pair.time + (pair.origin - start) / 1e9)
+        pieces = list(pieces_of(pair, options))
+        if not pieces:
+            short.append({"name": name, "why": too_short(pair, options)})
         for number, (time, x, v) in enumerate(pieces):
-            found.append(_sequence(name, number, len(pieces), pair, time, x, v, options))
+            found.append(sequence_of(name, number, len(pieces), pair, time, x, v, options))
     if not found:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
@@ -137,11 +141,17 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
             + (f" or lasts for {options.window:g} s" if options.window else "")
             + "; lower data.min_samples or data.window"
         )
-    return found
+    if anonymous:
+        log.info(
+            "%d of %d pairs name neither follower nor leader and are taken as independent of each "
+            "other; data.columns.follower and data.columns.leader tell which share a vehicle",
+            anonymous, len(taken),
+        )  # fmt: skip
+    return Reading(found, short)
 
 
 def _check(options: PairOptions) -> None:
-    for name in ("dt", "window"):
+    for name in ("dt", "window", "length"):
         if getattr(options, name) is not None:
             positive(name, getattr(options, name))
     if options.min_samples < 2:
@@ -189,16 +199,20 @@ def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
     }
 
 
-def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[_Pair]:
-    names = table.choose(_REQUIRED, (*_METRES, *_SPEEDS, *_WORDS), options.columns)
+def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[Pair]:
+    names, integrated = _columns(table, options)
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
-    time = table.numbers(names["time"])
-    x = np.stack([table.numbers(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
-    v = None
+    unit = one_of("time_unit", options.time_unit, TIME_UNITS)
+    origin, time = table.times(names["time"], unit)
+    x = v = None
+    if not integrated:
+        x = np.stack([table.numbers(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
     if all(name in names for name in _SPEEDS):
         v = np.stack([table.numbers(names[name]) for name in _SPEEDS], -1) * speeds
-    own = {n: table.numbers(names[n], empty=True) * metres for n in _METRES if n in names}
+    own = {n: table.positive(names[n]) * metres for n in _METRES[:2] if n in names}
+    if "spacing" in names:
+        own["spacing"] = table.numbers(names["spacing"], empty=not integrated) * metres
     words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
     everywhere = _everywhere(key, table.path, options, listed, set(words))
     label = np.array(["\0".join(cells) for cells in zip(*_keys(words), strict=True)], dtype=object)
@@ -212,16 +226,48 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
             i, j = sorted(rows[again[0] : again[0] + 2])
             raise DataError(
                 f"{table.path}, {table.row(j)}: a second row of one pair at {time[j]:g} s (first "
-                f"in {table.row(i)}); expected one row per pair and time"
+                f"in {table.row(i)}); expected one row per pair and time; name the column that "
+                "tells pairs apart (data.columns.pair)"
             )
         said = dict(everywhere)
         for name, cells in words.items():
             _steady(table, names[name], cells, rows)
             said[name] = str(cells[rows[0]])
-        yield _Pair(
-            table, rows, said, time[rows], x[rows], None if v is None else v[rows],
-            np.array([_follower(own, rows), _leader(table, own, x, rows)]),
+        if x is None:
+            assert v is not None
+            leader = float(own["leader_length"][rows[0]]) if "leader_length" in own else np.nan
+            leader = float(options.length or np.nan) if np.isnan(leader) else leader
+            place = _integrated(time[rows], v[rows, 1], own["spacing"][rows], leader)
+        else:
+            place, leader = x[rows], _leader(table, own, x, rows)
+        yield Pair(
+            table, rows, said, origin, time[rows], place, None if v is None else v[rows],
+            np.array([_follower(own, rows), leader]),
         )  # fmt: skip
+
+
+def _columns(table: Table, options: PairOptions) -> tuple[dict[str, str], bool]:
+    """Columns by meaning, and whether positions are to be integrated."""
+    further = (*_METRES, *_SPEEDS, *_WORDS)
+    places = _REQUIRED[1:]
+    names = table.choose(_REQUIRED[:1], (*places, *further), options.columns)
+    if set(names) >= _INTEGRATED and not any(place in names for place in places):
+        return names, True
+    try:
+        return table.choose(_REQUIRED, further, options.columns), False
+    except DataError as error:
+        raise DataError(
+            f"{error}; without positions, spacing, v_follower and v_leader are needed, from which "
+            "positions are integrated"
+        ) from error
+
+
+def _integrated(
+    time: np.ndarray, v_leader: np.ndarray, spacing: np.ndarray, length: float
+) -> np.ndarray:
+    """``(K, 2)`` m, fronts of follower and leader, see :func:`read_pairs`."""
+    leader = cumulative_trapezoid(v_leader, time, initial=0.0)
+    return np.stack([leader - np.nan_to_num(length) - spacing, leader], -1)
 
 
 def _keys(words: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -283,10 +329,17 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
             f"{length[np.nanargmax(off)]:.2f} m, {usual:.2f} m in other rows of the pair; expected "
             "one length of the leader: leave out data.columns.spacing and give leader_length"
         )
+    if usual <= 0:
+        raise DataError(
+            f"{table.path}, {table.row(int(rows[0]))}: x_leader - x_follower - spacing, the "
+            f"leader's length, is {usual:.2f} m; expected a positive number, as the spacing is "
+            "bumper to bumper and positions are fronts: leave it out with "
+            "data.columns.spacing=null, or correct it"
+        )
     return usual
 
 
-def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
+def _lanes(options: PairOptions, pairs: list[Pair]) -> list[str]:
     if options.lane is None:
         return []
     chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
@@ -296,90 +349,3 @@ def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
         if name not in present:
             raise ConfigError(f"data.lane={name}: the pairs have the lanes {', '.join(present)}")
     return names
-
-
-_Piece = tuple[np.ndarray, np.ndarray, np.ndarray | None]
-
-
-def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
-    """Times, positions and speeds of every part without a gap."""
-    if len(pair.time) < options.min_samples:
-        return
-    step = np.diff(pair.time)
-    usual = float(np.median(step))
-    gaps = np.flatnonzero(np.abs(step - usual) > UNEVEN * usual)
-    if gaps.size and options.gaps is Gaps.error:
-        i = int(gaps[0])
-        raise DataError(
-            f"{pair.called} steps from {pair.time[i]:g} s to {pair.time[i + 1]:g} s "
-            f"({pair.table.row(int(pair.rows[i + 1]))}), expected steps of {usual:g} s "
-            f"({len(gaps)} such gaps); data.gaps=cut cuts the pair there"
-        )
-    for rows in np.split(np.arange(len(pair.time)), gaps + 1):
-        if len(rows) < 2:
-            continue
-        time, x, v = pair.time[rows], pair.x[rows], None if pair.v is None else pair.v[rows]
-        dt = usual
-        if options.dt is not None:
-            dt = options.dt
-            if dt < usual * (1 - UNEVEN):
-                raise ConfigError(
-                    f"data.dt={dt:g} s is finer than the {usual:g} s of {pair.called}; expected no "
-                    "more times than were measured"
-                )
-            first, last = np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6)
-            grid = np.arange(first, last + 1) * dt
-            x = _at(grid, time, x)
-            v = None if v is None else _at(grid, time, v)
-            time = grid
-        yield from _windows(time, x, v, dt, options)
-
-
-def _at(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(grid, time, column) for column in values.T], -1)
-
-
-def _windows(
-    time: np.ndarray, x: np.ndarray, v: np.ndarray | None, dt: float, options: PairOptions
-) -> Iterator[_Piece]:
-    """Consecutive windows that share their boundary sample; what is left at the end is not used."""
-    starts, steps = [0], len(time) - 1
-    if options.window is not None:
-        steps = round(options.window / dt)
-        if steps < 1 or abs(options.window / dt - steps) > 1e-6 * steps:
-            raise ConfigError(
-                f"data.window={options.window:g} s is no whole number of steps of {dt:g} s"
-            )
-        starts = list(range(0, len(time) - steps, steps))
-    for first in starts:
-        rows = slice(first, first + steps + 1)
-        if len(time[rows]) >= options.min_samples:
-            yield time[rows], x[rows], None if v is None else v[rows]
-
-
-def _sequence(
-    name: str,
-    number: int,
-    pieces: int,
-    pair: _Pair,
-    time: np.ndarray,
-    x: np.ndarray,
-    v: np.ndarray | None,
-    options: PairOptions,
-) -> Sequence:
-    words = pair.words
-    agents = (words.get("follower", ""), words.get("leader", ""))
-    kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
-    codes = (words.get("follower_kind", ""), words.get("leader_kind", ""))
-    kind = tuple(kinds.get(code, code) for code in codes)
-    return Sequence(
-        name=name if pieces == 1 else f"{name}_{number:03d}",
-        recording=words["run"],
-        time=time,
-        x=x[:, :, None],
-        v=None if v is None else v[:, :, None],
-        agents=agents if all(agents) else (),
-        length=None if np.isnan(pair.length).all() else pair.length,
-        kind=kind if any(kind) else None,
-        split=words.get("split", "").lower(),
-    )
