@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from nnode.data.readers.recordings import (
 )
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
 from nnode.data.sequence import Sequence
+from nnode.data.smooth import bridge
 from nnode.errors import ConfigError, DataError
 
 _REQUIRED = ("time", "x_follower", "x_leader")
@@ -92,7 +93,9 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
 
     Returns:
         Sequences of two vehicles, follower and leader, named ``run/pair``, with a number behind
-        where a pair is cut. Speeds are the measured ones where the source has those of both. A
+        where a pair is cut: where more than ``max_hole`` s are missing. Shorter holes are filled
+        (:func:`nnode.data.smooth.bridge`; speeds by straight lines); a row without a position or
+        a speed is one that is missing. Speeds are the measured ones where the source has those of both. A
         pair without a column of it is a file; without a run, all are of one recording, which is
         called like the data.
 
@@ -128,8 +131,9 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
             )
         taken[name] = str(pair.table.path)
         pieces = list(_pieces(pair, options))
-        for number, (time, x, v) in enumerate(pieces):
-            found.append(_sequence(name, number, len(pieces), pair, time, x, v, options))
+        for number, (time, x, v, filled) in enumerate(pieces):
+            made = _sequence(name, number, len(pieces), pair, time, x, v, options)
+            found.append(replace(made, filled=filled))
     if not found:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
@@ -194,10 +198,10 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
     time = table.numbers(names["time"])
-    x = np.stack([table.numbers(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
+    x = np.stack([table.measured(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
     v = None
     if all(name in names for name in _SPEEDS):
-        v = np.stack([table.numbers(names[name]) for name in _SPEEDS], -1) * speeds
+        v = np.stack([table.measured(names[name]) for name in _SPEEDS], -1) * speeds
     own = {n: table.numbers(names[n], empty=True) * metres for n in _METRES if n in names}
     words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
     everywhere = _everywhere(key, table.path, options, listed, set(words))
@@ -298,7 +302,7 @@ def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
     return names
 
 
-_Piece = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+_Piece = tuple[np.ndarray, np.ndarray, np.ndarray | None, int]
 
 
 def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
@@ -307,18 +311,23 @@ def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
         return
     step = np.diff(pair.time)
     usual = float(np.median(step))
-    gaps = np.flatnonzero(np.abs(step - usual) > UNEVEN * usual)
+    known = np.isfinite(pair.x if pair.v is None else np.hstack([pair.x, pair.v])).all(axis=1)
+    measured = pair.time[known]
+    all_time, all_x, added = bridge(measured, pair.x[known], options.max_hole)
+    all_v = None if pair.v is None else _at(all_time, measured, pair.v[known])
+    gaps = np.flatnonzero(np.abs(np.diff(all_time) - usual) > UNEVEN * usual)
     if gaps.size and options.gaps is Gaps.error:
         i = int(gaps[0])
         raise DataError(
-            f"{pair.called} steps from {pair.time[i]:g} s to {pair.time[i + 1]:g} s "
-            f"({pair.table.row(int(pair.rows[i + 1]))}), expected steps of {usual:g} s "
+            f"{pair.called} steps from {all_time[i]:g} s to {all_time[i + 1]:g} s "
+            f"({pair.table.row(int(pair.rows[pair.time == all_time[i + 1]][0]))}), expected "
+            f"steps of {usual:g} s "
             f"({len(gaps)} such gaps); data.gaps=cut cuts the pair there"
         )
-    for rows in np.split(np.arange(len(pair.time)), gaps + 1):
+    for rows in np.split(np.arange(len(all_time)), gaps + 1):
         if len(rows) < 2:
             continue
-        time, x, v = pair.time[rows], pair.x[rows], None if pair.v is None else pair.v[rows]
+        time, x, v = all_time[rows], all_x[rows], None if all_v is None else all_v[rows]
         dt = usual
         if options.dt is not None:
             dt = options.dt
@@ -332,7 +341,9 @@ def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
             x = _at(grid, time, x)
             v = None if v is None else _at(grid, time, v)
             time = grid
-        yield from _windows(time, x, v, dt, options)
+        for piece in _windows(time, x, v, dt, options):
+            within = (added >= piece[0][0]) & (added <= piece[0][-1])
+            yield *piece, 2 * int(within.sum())
 
 
 def _at(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -341,7 +352,7 @@ def _at(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _windows(
     time: np.ndarray, x: np.ndarray, v: np.ndarray | None, dt: float, options: PairOptions
-) -> Iterator[_Piece]:
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
     """Consecutive windows that share their boundary sample; what is left at the end is not used."""
     starts, steps = [0], len(time) - 1
     if options.window is not None:
