@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
@@ -86,6 +86,9 @@ class LoaderOptions:
 class DataOptions:
     """What all data sources share."""
 
+    #: Whether the data are those of the paper, whose faults are judged as there.
+    published: ClassVar[bool] = False
+
     name: str = MISSING  # label in results and plots
     domain: str = MISSING  # traffic (positions x) | crowd (x and y)
     # folder with the raw files, or a URL; NNODE_DATA in the environment sets that of public data;
@@ -97,6 +100,8 @@ class DataOptions:
     faults: Faults = Faults.drop
     # s; missing samples are interpolated where no more time than this is missing; 0: nowhere
     max_hole: float = 0.5
+    # s, window of the local cubics that smooth positions and give speeds; null: as measured
+    smooth: float | None = None
     # whether one identifier in two sequences of a recording is one agent
     agents: Agents = Agents.auto
     # measured | smoothed: speeds at the first sample, with which simulations start; smoothed: of
@@ -109,6 +114,8 @@ class DataOptions:
 @dataclass
 class EsimasOptions(DataOptions):
     """The preprocessed ESIMAS sequences (.mat)."""
+
+    published: ClassVar[bool] = True
 
     name: str = "esimas"
     domain: str = "traffic"
@@ -131,8 +138,6 @@ class LaneOptions(DataOptions):
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
     # whether every follower and its leader are a sequence of their own, min_vehicles aside
     pairs: bool = False
-    # s, window of the local cubics that smooth positions and give speeds; null: as measured
-    smooth: float | None = None
 
 
 @dataclass

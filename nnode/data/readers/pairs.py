@@ -95,9 +95,9 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> list[
         Sequences of two vehicles, follower and leader, named ``run/pair``, with a number behind
         where a pair is cut: where more than ``max_hole`` s are missing. Shorter holes are filled
         (:func:`nnode.data.smooth.bridge`; speeds by straight lines); a row without a position or
-        a speed is one that is missing. Speeds are the measured ones where the source has those of both. A
-        pair without a column of it is a file; without a run, all are of one recording, which is
-        called like the data.
+        a speed is one that is missing. Speeds are the measured ones where the source has those of
+        both. A pair without a column of it is a file; without a run, all are of one recording,
+        which is called like the data.
 
     Raises:
         ConfigError: an option out of its range, an unknown recording or lane.

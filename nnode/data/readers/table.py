@@ -79,8 +79,8 @@ def read_table(
         )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
     time = table.numbers(names["time"])
-    values = {name: table.numbers(names[name]) for name in goals if name in names}
-    values |= {axis: table.measured(names[axis]) for axis in axes}
+    values: dict[str, np.ndarray] = {axis: table.measured(names[axis]) for axis in axes}
+    values |= {name: table.numbers(names[name]) for name in goals if name in names}
     if "length" in names:
         values["length"] = table.numbers(names["length"], empty=True)
     words = {k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names}
