@@ -19,7 +19,8 @@ from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
-from nnode.data.dataset import Source
+from nnode.data.dataset import SequenceDataset, SmoothSpeeds, Source, noise_of
+from nnode.data.smooth import BEARABLE, Noise
 from nnode.errors import ConfigError
 from nnode.files import xarray
 from nnode.models import System
@@ -57,7 +58,10 @@ class Calibration:
             none. ``parameters`` and ``cost_heldout`` are the pool's, which another sequence gets.
         pooling: how they came about, and costs of second halves, which they were not calibrated on.
         start_speeds: ``kind``, measured, smoothed or fitted; of fitted ones ``sequences``, first
-            speeds (m/s) by vehicle, and their root mean square ``change`` from the data's.
+            speeds (m/s) by vehicle, and their root mean square ``change`` from those that
+            simulations start with otherwise.
+        noise: of the measurement, see :class:`nnode.data.smooth.Noise`.
+        filled: number of missing samples of the data that were interpolated.
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
@@ -78,6 +82,8 @@ class Calibration:
     own: pd.DataFrame | None
     pooling: dict[str, Any]
     start_speeds: dict[str, Any]
+    noise: Noise
+    filled: int
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
@@ -94,10 +100,14 @@ class Calibration:
         if np.isfinite(self.cost_heldout):
             before, after = self.heldout_start, self.cost_heldout
             lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        lines.append(f"{self.noise}{self._started()}")
+        if self.filled:
+            lines.append(f"missing samples that were interpolated: {self.filled}")
         if "change" in self.start_speeds:
+            whose = "smoothed paths" if self.start_speeds.get("smoothed") else "the data"
             lines.append(
                 f"first speeds of training sequences are fitted: {self.start_speeds['change']:.3g} "
-                "m/s (root mean square) from the data's, which held-out sequences start with"
+                f"m/s (root mean square) from those of {whose}, which held-out sequences start with"
             )
         if self.pooling:
             lines.append(
@@ -115,6 +125,23 @@ class Calibration:
         short = short_names(map(str, self.parameters.index))
         rows = _rows(self.parameters).items()
         return "\n".join([*lines, *(f"{short[name]} = {_words(row)}" for name, row in rows)])
+
+    def _started(self) -> str:
+        """What was done about first speeds that noise makes wrong."""
+        bad = self.noise.beyond and self.model.domain == "traffic" and self.model.order > 1
+        if not bad:
+            return ""
+        if self.start_speeds.get("smoothed"):
+            return (
+                f", more than the {BEARABLE:g} m/s that a law of second order bears: speeds are "
+                "those of smoothed paths (trainer.start_speeds=given takes the data's)"
+            )
+        if self.start_speeds["kind"] != "measured":
+            return ""
+        return (
+            f", more than the {BEARABLE:g} m/s that a law of second order bears: estimates are "
+            "biased; take trainer.start_speeds=auto"
+        )
 
     def plot(self) -> Figure:
         """The calibrated speed curve, or the force between two people."""
@@ -190,6 +217,7 @@ class Calibration:
         if self.own is not None:
             found["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
         found["start_speeds"] = self.start_speeds
+        found["noise"], found["filled"] = self.noise.plain(), self.filled
         found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
         rows_of = self.history.to_dict("records")
         # what was not measured at an evaluation is not there
@@ -251,6 +279,8 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         own=None if own is None else own.table,
         pooling=own.facts if own else {},
         start_speeds=speeds,
+        noise=noise_of(store),
+        filled=sum(one["samples"] for one in store.manifest.get("filled", [])),
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
@@ -264,6 +294,9 @@ def _by_tangents(
     for, of models that have exact tangents; otherwise none."""
     config, options = trainer.provenance.config, trainer.options
     speeds: dict[str, Any] = {"kind": config["data"].get("start_speeds", "measured")}
+    data = trainer.train.dataset
+    if isinstance(data, SequenceDataset) and isinstance(data.store, SmoothSpeeds):
+        store, speeds = data.store, {"kind": "smoothed", "smoothed": True}
     if not isinstance(trainer.optimizer, GaussNewton):
         return {}, None, speeds
     # compiled code takes a second to import
@@ -286,7 +319,7 @@ def _by_tangents(
         first = {s.name: s.velocity()[0, :, 0] for s in (store[i] for i in indices)}
         away = np.concatenate([(np.array(v) - first[n])[:-1] for n, v in by_name.items()])
         change = float(np.sqrt(np.mean(away**2)))
-        speeds = {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
+        speeds |= {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
     if options.pooling is not Pooling.pooled:
         chosen = [store[i] for i in indices]
         own = own_parameters(options.pooling, double, chosen, make, int(config["seed"]))

@@ -12,7 +12,14 @@ from rich.table import Table
 
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import merge_saved
-from nnode.app.training import build_solver, set_threads, source_hashes, straight_loader, stream
+from nnode.app.training import (
+    build_solver,
+    set_threads,
+    source_hashes,
+    started,
+    straight_loader,
+    stream,
+)
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.distributed import World
@@ -96,13 +103,14 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     elif trained and part != "train":
         print(f"{trained} of the {len(indices)} sequences were trained on")
     device = World().use(Device(config.device), "device")
+    source = started(checkpoint, store)
     model, solver = checkpoint.build().to(device), build_solver(solver_options, device)
     dtype = getattr(torch, checkpoint.config["trainer"]["dtype"])
     convention = Convention(checkpoint.config["trainer"]["cost"])
 
     def measure(simulate: Simulate) -> Metrics:
         size = data.loader.batch_size
-        batches = stream(straight_loader(store, indices, size), dtype, device)
+        batches = stream(straight_loader(source, indices, size), dtype, device)
         return evaluate(simulate, batches, convention)
 
     name = checkpoint.config["model"]["name"]

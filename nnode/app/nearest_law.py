@@ -191,6 +191,7 @@ def _diagnose(
             job.system, inputs.sequences, job.options, stages=stages, nearer=nearer, hint=hint
         )
     found.diagnosis.data_faults = inputs.data_faults
+    found.diagnosis.notes += inputs.measured
     found.diagnosis.model = name
     return found
 

@@ -7,7 +7,9 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.data.clusters import clusters, relation
+from nnode.data.dataset import noise_of
 from nnode.data.options import DataOptions
+from nnode.data.policy import told_filled
 from nnode.data.prepare import prepare
 from nnode.plots.quality import plot_faults
 
@@ -27,6 +29,9 @@ def prepare_data(config: DictConfig, folder: Path) -> None:
     if reasons:
         listed = ", ".join(f"{kind} in {number}" for kind, number in sorted(reasons.items()))
         print(f"faults: {listed} sequences; pictures in {folder / 'faults'}")
+    if store.manifest["filled"]:
+        print(told_filled(store.manifest["filled"]))
+    print(noise_of(store))
     gap = options.split.gap
     number = int(clusters(store.index, gap).max()) + 1
     print(f"clusters: {number} (sequences that {relation(store.index, gap)} are one)")

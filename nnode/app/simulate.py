@@ -14,7 +14,7 @@ from nnode.app.cli.saved import merge_saved
 from nnode.app.evaluate import choose
 from nnode.app.export import checkpoint_of
 from nnode.app.python.inputs import Table, data_used
-from nnode.app.training import set_threads, threads_given_back
+from nnode.app.training import set_threads, started, threads_given_back
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.clusters import clusters
 from nnode.data.dataset import Source
@@ -108,6 +108,7 @@ def _simulated(
 ) -> Simulated:  # fmt: skip
     model, name = free(checkpoint.build()), str(checkpoint.config["model"]["name"])
     set_threads(checkpoint.config["trainer"]["threads"], model.domain)
+    store = started(checkpoint, store)
     part, indices, trained = choose(store, checkpoint, part)
     label = clusters(store.index)
     open_ = _some(choose(store, checkpoint, "train")[1], seed)

@@ -26,7 +26,7 @@ from nnode.calibrate.options import (
     TrainerOptions,
 )
 from nnode.calibrate.trainer import Provenance, Trainer
-from nnode.data.dataset import SequenceDataset, Source, make_loader
+from nnode.data.dataset import SequenceDataset, SmoothSpeeds, Source, make_loader, sound_speeds
 from nnode.data.options import DataOptions, LoaderOptions
 from nnode.data.sequence import Batch
 from nnode.data.split import Split, split
@@ -71,6 +71,14 @@ def stream(
 ) -> Iterator[Batch]:
     """The mini-batches of a loader, in the precision and on the device asked for."""
     return (batch.to(device, dtype) for batch in loader)
+
+
+def started(checkpoint: Checkpoint, store: Source) -> Source:
+    """Sequences with the speeds that simulations of a checkpoint start with, as in training."""
+    model = checkpoint.build()
+    if checkpoint.config["trainer"].get("start_speeds") != StartSpeeds.auto.value:
+        return store
+    return sound_speeds(store, model.domain, model.order)
 
 
 def straight_loader(
@@ -161,7 +169,13 @@ def trainer_of(
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)
-    if options.start_speeds is StartSpeeds.fitted and optimizer_options.name != "gauss_newton":
+    exact = optimizer_options.name == "gauss_newton"
+    source: Source = store
+    if options.start_speeds is StartSpeeds.auto:
+        source = sound_speeds(store, model.domain, model.order)
+        fits = exact and isinstance(source, SmoothSpeeds)
+        options.start_speeds = StartSpeeds.fitted if fits else StartSpeeds.given
+    if options.start_speeds is StartSpeeds.fitted and not exact:
         raise ConfigError(
             "trainer.start_speeds=fitted needs optimizer=gauss_newton, found "
             f"optimizer={optimizer_options.name}; data.start_speeds=smoothed takes any"
@@ -170,14 +184,14 @@ def trainer_of(
     _check_same_data(store, checkpoint)
     parts = _parts(store, data, checkpoint)
     loader = make_loader(
-        SequenceDataset(store, parts.train),
+        SequenceDataset(source, parts.train),
         data.loader,
         seed=seed,
         rank=world.rank,
         size=world.size,
     )
     heldout = (
-        straight_loader(store, parts.heldout, data.loader.batch_size, world)
+        straight_loader(source, parts.heldout, data.loader.batch_size, world)
         if parts.heldout
         else None
     )
@@ -231,7 +245,7 @@ def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> S
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     known = {} if checkpoint is None else checkpoint.split
     if not known or not {name for names in known.values() for name in names} <= set(places):
-        return split(store, data.split)
+        return split(store.index, data.split)
     train, heldout, dropped = (
         sorted(places[name] for name in known.get(part, [])) for part in PARTS
     )

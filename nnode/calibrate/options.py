@@ -54,8 +54,14 @@ class Pooling(str, Enum):
 
 
 class StartSpeeds(str, Enum):
-    """First speeds of training sequences: the data's, or fitted beside the parameters."""
+    """First speeds of training sequences: the data's, or fitted beside the parameters.
 
+    ``auto``: where noise makes the data's wrong by more than :data:`nnode.data.smooth.BEARABLE`,
+    vehicles' speeds are those of smoothed paths, and gauss_newton fits the first ones of laws of
+    second order; otherwise they are given.
+    """
+
+    auto = "auto"
     given = "given"
     fitted = "fitted"
 
@@ -104,8 +110,9 @@ class TrainerOptions:
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
     pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
-    # given | fitted: first speeds of training sequences, those of the data, or the best ones
-    start_speeds: StartSpeeds = StartSpeeds.given
+    # auto | given | fitted: first speeds of training sequences, those of the data, or the best;
+    # auto: as the noise of the measurement asks for
+    start_speeds: StartSpeeds = StartSpeeds.auto
     dtype: Precision = Precision.float64
     device: Device = Device.auto
     threads: int | None = None  # of torch; null: one for traffic, all cores for crowds

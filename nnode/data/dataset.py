@@ -13,11 +13,65 @@ from torch.utils.data import DataLoader
 from nnode.data.options import LoaderOptions
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.sequences import Sequences
+from nnode.data.smooth import Noise, measured_noise, smooth_speeds
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
+#: Sequences by which noise is told, where no manifest tells it.
+_TOLD = 400
+
+
+class SmoothSpeeds:
+    """A source of sequences with the speeds of smoothed paths, positions as they are.
+
+    Args:
+        source: the sequences as they were measured.
+    """
+
+    def __init__(self, source: Store | Sequences) -> None:
+        self.source, self.index, self.manifest = source, source.index, source.manifest
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, i: int) -> Sequence:
+        return smooth_speeds(self.source[i])
+
+    def __iter__(self) -> Iterator[Sequence]:
+        return (self[i] for i in range(len(self)))
+
+
 #: What sequences are taken from.
-Source = Store | Sequences
+Source = Store | Sequences | SmoothSpeeds
+
+
+def noise_of(source: Source) -> Noise:
+    """The noise of measurement of a source, as its manifest tells it or as it shows."""
+    told = source.manifest.get("noise")
+    if told is not None:
+        known = {key: float("nan") if value is None else value for key, value in told.items()}
+        return Noise(**known)
+    every = max(1, -(-len(source) // _TOLD))
+    return measured_noise(source[i] for i in range(0, len(source), every))
+
+
+def sound_speeds(source: Source, domain: str, order: int) -> Source:
+    """Sequences whose speeds a simulation can start with.
+
+    Args:
+        source: the sequences as they were measured.
+        domain, order: of the model.
+
+    Returns:
+        The same; of vehicles, for laws of second order, with the speeds of smoothed paths where the
+        noise of the measurement is :attr:`~nnode.data.smooth.Noise.beyond` what these laws bear,
+        and where ``data.start_speeds`` does not ask for others.
+    """
+    options = source.manifest.get("options", {})
+    asked = options.get("start_speeds", "measured") != "measured"
+    if domain != "traffic" or order < 2 or asked or isinstance(source, SmoothSpeeds):
+        return source
+    return SmoothSpeeds(source) if noise_of(source).beyond else source
 
 
 class SequenceDataset(torch.utils.data.Dataset[Sequence]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
@@ -86,6 +86,9 @@ class LoaderOptions:
 class DataOptions:
     """What all data sources share."""
 
+    #: Whether the data are those of the paper, whose faults are judged as there.
+    published: ClassVar[bool] = False
+
     name: str = MISSING  # label in results and plots
     domain: str = MISSING  # traffic (positions x) | crowd (x and y)
     # folder with the raw files, or a URL; NNODE_DATA in the environment sets that of public data;
@@ -95,6 +98,10 @@ class DataOptions:
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop
+    # s; missing samples are interpolated where no more time than this is missing; 0: nowhere
+    max_hole: float = 0.5
+    # s, window of the local cubics that smooth positions and give speeds; null: as measured
+    smooth: float | None = None
     # whether one identifier in two sequences of a recording is one agent
     agents: Agents = Agents.auto
     # measured | smoothed: speeds at the first sample, with which simulations start; smoothed: of
@@ -108,8 +115,11 @@ class DataOptions:
 class EsimasOptions(DataOptions):
     """The preprocessed ESIMAS sequences (.mat)."""
 
+    published: ClassVar[bool] = True
+
     name: str = "esimas"
     domain: str = "traffic"
+    max_hole: float = 0.0  # the published sequences as they are
     min_vehicles: int = 3  # 2 or 3: which of the two published families
 
 
@@ -122,14 +132,12 @@ class LaneOptions(DataOptions):
     kinds: Any = field(default_factory=dict)  # {class code: name}; codes may be numbers
     lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
     dt: float = 0.2  # reference time grid, s
-    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
+    max_hole: float = 1.0  # s between two rows of a vehicle; a longer hole is not interpolated
     min_vehicles: int = 3  # fewest vehicles of a platoon
     min_samples: int = 3  # fewest points of the time grid
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
     # whether every follower and its leader are a sequence of their own, min_vehicles aside
     pairs: bool = False
-    # s, window of the local cubics that smooth positions and give speeds; null: as measured
-    smooth: float | None = None
 
 
 @dataclass
@@ -220,7 +228,7 @@ class OpenAccOptions(DataOptions):
     # m by which a gap may change between two samples otherwise than the speeds tell, without being
     # taken for unknown: the error that one position may have; null: whatever
     max_error: float | None = 0.5
-    max_hole: float = 1.0  # s; a longer hole in a vehicle's record is not interpolated
+    max_hole: float = 1.0  # s between two rows of a vehicle; a longer hole is not interpolated
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
     min_vehicles: int = 2  # fewest vehicles of a platoon
     min_duration: float = 5.0  # s, shortest sequence where window is null
@@ -246,6 +254,7 @@ class JuelichOptions(DataOptions):
 
     name: str = "juelich"
     domain: str = "crowd"
+    max_hole: float = 0.0  # the published recordings as they are
     t_seq: float = 1.0  # s, length of a sequence
     frame_rate: float | None = None  # 1/s; null reads it from the file's header
     unit: str | None = None  # cm | m; null reads it from the file's header
@@ -267,6 +276,7 @@ class WalkwayOptions(JuelichOptions):
     """One file of walking people: PedPy's text, or JuPedSim's SQLite database."""
 
     name: str = "pedpy"
+    max_hole: float = 0.5  # s of missing frames of a person that are interpolated; 0: none
     path: str = MISSING  # the file; relative to data.source where that is given
     geometry: str | None = None  # text file with the walkable area as WKT, m
 

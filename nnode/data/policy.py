@@ -79,7 +79,7 @@ def apply_policy(
     if not kept:
         raise DataError(
             f"nothing is left of {len(sequences)} sequences: {_counts(faulty, faults)}; "
-            + ("these cannot be simulated" if keep else "data.faults=keep keeps faulty ones")
+            + _advice(faulty, faults, keep)
         )
     return kept, dropped
 
@@ -109,6 +109,28 @@ def without(
             f"{len(dropped)} of {len(read)} sequences are left out for their faults: {listed}"
         )
     return told
+
+
+def _advice(sequences: list[Sequence], faults: dict[str, list[Fault]], keep: bool) -> str:
+    """What to do where nothing is left."""
+    if not keep and any(s.n_agents and usable(s, faults[s.name]) for s in sequences):
+        return "data.faults=keep keeps faulty ones"
+    if any(fault.kind == "gap_in_time" for s in sequences for fault in faults[s.name]):
+        return (
+            "what is missing cannot be simulated; data.max_hole=SECONDS interpolates longer "
+            "holes, or cut the sequences where vehicles come and go"
+        )
+    return "these cannot be simulated; correct the rows that the faults name"
+
+
+def told_filled(filled: list[dict[str, Any]]) -> str:
+    """How many samples were interpolated, in a sentence."""
+    names = ", ".join(one["sequence"] for one in filled[:LISTED])
+    more = f" and {len(filled) - LISTED} more" if len(filled) > LISTED else ""
+    return (
+        f"{sum(one['samples'] for one in filled)} missing samples in {len(filled)} sequences "
+        f"({names}{more}) are interpolated; data.max_hole sets up to how many seconds"
+    )
 
 
 def _counts(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> str:

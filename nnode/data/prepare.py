@@ -34,7 +34,7 @@ from nnode.data.options import (
     VehicleTableOptions,
     WalkwayOptions,
 )
-from nnode.data.policy import apply_policy, by_recording, drop_absent, without
+from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
 from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.columns import Table
 from nnode.data.readers.esimas import esimas_files, read_esimas
@@ -44,13 +44,13 @@ from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.openacc import openacc_files, read_openacc
 from nnode.data.readers.pairs import pair_files, read_pairs
-from nnode.data.readers.recordings import Reading
+from nnode.data.readers.recordings import Reading, positive
 from nnode.data.readers.sumo import read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
 from nnode.data.readers.vehicles import read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence, check_interval
-from nnode.data.smooth import start_smoothed
+from nnode.data.smooth import measured_noise, smoothed, start_smoothed
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError, DataError
 from nnode.files import file_name
@@ -81,6 +81,7 @@ class Format:
 
     files: Callable[[Any], _Files]
     read: Callable[[_Files, Any], list[Sequence]]
+    smooths: bool = False  # whether the reader applies ``data.smooth`` itself, before it cuts
 
 
 def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
@@ -91,20 +92,21 @@ def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any]
 #: The format that each kind of options stands for; a new format is one more entry.
 FORMATS: dict[type[DataOptions], Format] = {
     EsimasOptions: Format(esimas_files, _each(read_esimas)),
-    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
-    NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
-    JuelichOptions: Format(juelich_files, _each(read_juelich)),
+    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles), smooths=True),
+    NgsimOptions: Format(vehicle_files, _each(read_ngsim), smooths=True),
+    JuelichOptions: Format(juelich_files, _each(read_juelich), smooths=True),
     TableOptions: Format(
         table_files, lambda files, options: read_table(files[TIDY], options, files.get(WALLS))
     ),
     WalkwayOptions: Format(
         walkway_files,
         lambda files, options: read_walkway(files[PEOPLE], options, files.get(GEOMETRY)),
+        smooths=True,
     ),
     PairOptions: Format(pair_files, read_pairs),
     OpenAccOptions: Format(openacc_files, read_openacc),
-    SumoOptions: Format(sumo_files, _each(read_sumo)),
-    HighDOptions: Format(highd_files, read_highd),
+    SumoOptions: Format(sumo_files, _each(read_sumo), smooths=True),
+    HighDOptions: Format(highd_files, read_highd, smooths=True),
 }
 
 
@@ -122,7 +124,9 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
         The store. Its manifest tells the source files and their SHA-256, all options, the
         package's version, the sampling interval (s), how many sequences were read, kept and
         dropped (in all and by recording), every fault that was found, every sequence and agent
-        that was dropped and why, and every record of which there is no sequence.
+        that was dropped and why, every record of which there is no sequence, in which sequences
+        how many samples were filled, and the noise of the measurement (see
+        :class:`nnode.data.smooth.Noise`).
 
     Raises:
         ConfigError: options that contradict each other or the data.
@@ -177,15 +181,19 @@ def judge(
         NNodeError: see :func:`prepare`.
     """
     domain = _domain(options, read)
+    left_out = read.left_out if isinstance(read, Reading) else []
     _plausible(options, read)
+    if options.smooth is not None and not FORMATS[type(options)].smooths:
+        positive("smooth", options.smooth)
+        read = [smoothed(s, options.smooth) for s in read]
+    noise = measured_noise(read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
     faults = {}
     for number, s in enumerate(sequences):
-        faults[s.name] = find_faults(s, domain)
+        faults[s.name] = find_faults(s, domain, 0.0 if options.published else noise.position)
         if stages is not None:
             stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
-    left_out = read.left_out if isinstance(read, Reading) else []
     for text in without(read, dropped, left_out):
         log.warning("%s", text)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
@@ -195,6 +203,9 @@ def judge(
     kept = [unique[s.name] for s in kept]
     if options.start_speeds is Starts.smoothed:
         kept = [start_smoothed(s) for s in kept]
+    filled = [{"sequence": s.name, "samples": s.filled} for s in kept if s.filled]
+    if filled:
+        log.info("%s", told_filled(filled))
     if notes:
         more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
         log.info("%s%s; data.agents decides by hand", notes[0], more)
@@ -211,6 +222,8 @@ def judge(
         "dropped": dropped,
         "dropped_agents": absent,
         "left_out": left_out,
+        "filled": filled,
+        "noise": noise.plain(),
         "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
     }
     return Judged(domain, sequences, faults, kept, manifest)

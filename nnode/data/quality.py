@@ -9,7 +9,7 @@ condemn noise. And what a fault means for a calibration: see the ``faults`` opti
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -37,6 +37,9 @@ KINDS: dict[str, str] = {
 
 #: Kinds that no simulation can start from or be compared with.
 UNUSABLE = frozenset({"gap_in_time", "non_finite", "duplicate"})
+
+#: Standard deviations of a step's error that are no fault: noise exceeds them once in 16,000 steps.
+NOISY = 4.0
 
 #: Steps whose median displacement extrapolates a path; more than one, as steps are noisy.
 RECENT = 3
@@ -116,12 +119,19 @@ LIMITS: dict[Domain, Limits] = {
 }
 
 
-def find_faults(sequence: Sequence, domain: Domain) -> list[Fault]:
+def find_faults(sequence: Sequence, domain: Domain, noise: float = 0.0) -> list[Fault]:
     """Every fault of a sequence, in order of time; those without a time come first.
 
     NaN means that an agent has no position at that time.
+
+    Args:
+        noise: m, standard deviation of the noise of vehicles' positions where it is known: a step
+            holds that of two positions, and is no fault up to NOISY times its deviation.
     """
     limits = LIMITS[domain]
+    if domain == "traffic":
+        error = max(limits.noise, NOISY * np.sqrt(2) * np.nan_to_num(noise))
+        limits = replace(limits, noise=float(error))
     view = _View(sequence, domain, limits)
     found = [*_short(view), *_times(view), *_values(view), *_duplicates(view)]
     if sequence.n_samples and sequence.n_agents:

@@ -81,6 +81,8 @@ class Sequence:
             left, or None.
         split: the side of the published division that it is on, ``train`` or ``test``; empty: the
             source publishes none.
+        filled: number of samples that are missing in the source and were interpolated when it was
+            read (``data.max_hole``).
     """
 
     name: str
@@ -97,6 +99,7 @@ class Sequence:
     walls: np.ndarray | None = None
     site: str = ""
     split: str = ""
+    filled: int = 0
 
     def __post_init__(self) -> None:
         x = np.asarray(self.x, dtype=np.float64)

@@ -1,16 +1,18 @@
-"""Smoothing of measured positions: cubics fitted to a moving window (Savitzky & Golay 1964).
+"""Measured positions with holes and noise: interpolated, smoothed, and how noisy they are.
 
-Off by default: a model is calibrated to what was measured. Positions from video carry errors that
-differences amplify; ``data.smooth`` asks for the positions and speeds of local cubics instead, and
-``data.start_speeds=smoothed`` for first speeds by parabolas, positions as they are.
+Local cubics (Savitzky & Golay 1964) do both. Holes of up to ``data.max_hole`` seconds are filled.
+Smoothing is off by default: a model is calibrated to what was measured. Positions from video carry
+errors that differences amplify; ``data.smooth`` asks for the positions and speeds of local cubics
+instead, and ``data.start_speeds=smoothed`` for first speeds by parabolas, positions as they are.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.signal import savgol_filter
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
@@ -20,6 +22,246 @@ DEGREE = 3
 #: s of positions that tell a smoothed first speed: errors of 0.3 m that are new at every 0.1 s then
 #: leave 0.4 m/s, and an acceleration that changes by 1 m/s³ as much.
 START = 2.0
+#: s of positions on either side of a hole that the cubic across it is fitted to. Within holes of
+#: 0.1 to 0.5 s of cars that accelerate, its positions have a smaller error than a straight line's
+#: at every noise from 0 to 0.3 m. A line would also bias speeds: it is late by 0.04 to 0.2 m/s
+#: where a car accelerates, the cubic by less than 0.01 m/s (table in docs/data.md).
+REACH = 0.5
+#: Least number of samples by which noise is told: five fourth differences.
+LEAST = 9
+#: s, windows of ``data.smooth`` that are suggested.
+WINDOWS = (1.0, 1.5, 2.0, 3.0, 4.0)
+
+#: m/s; first speeds that are wrong by more are not taken from single samples. A follower forgets
+#: its first speed within about 2.5 s (idm with T = 1.4 s, a = 1.2 m/s²), so that 0.2 m/s move its
+#: path by 0.5 m, the error that a single position may have (nnode.data.quality). In simulations
+#: of idm, 40 followers for 40 s, errors of 0.07 m/s leave all parameters within 1 %, those of
+#: 0.28 m/s lead to errors of 1 % of v0 and 5 % of s0, those of 0.7 m/s of 2 % and 13 % (table in
+#: docs/data.md).
+BEARABLE = 0.2
+#: Median of the size of a standard normal variable, and the sum of squares of 1, 4, 6, 4, 1.
+_MEDIAN, _FOURTH = 0.6745, 70.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Errors of measurement that are new at every sample, as standard deviations.
+
+    Errors that last over several samples do not show in differences and are not counted.
+
+    Attributes:
+        position: m, of one coordinate; NaN where no sequence is long enough.
+        start_speed: m/s, of the speeds that simulations start with: measured ones, or forward
+            differences of positions.
+    """
+
+    position: float
+    start_speed: float
+
+    @property
+    def beyond(self) -> bool:
+        """Whether first speeds are wrong by more than BEARABLE."""
+        return self.start_speed > BEARABLE
+
+    def plain(self) -> dict[str, float | None]:
+        """For a manifest: ``position`` (m) and ``start_speed`` (m/s), None where unknown."""
+        return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.position):
+            return "noise of measured positions: unknown, as sequences have fewer than 9 samples"
+        return (
+            f"noise of measured positions: {self.position:.2g} m (standard deviation, by fourth "
+            f"differences); first speeds are uncertain by {self.start_speed:.2g} m/s"
+        )
+
+
+def measured_noise(sequences: Iterable[Sequence]) -> Noise:
+    """The noise of measured sequences.
+
+    Of every agent the median size of fourth differences, in which motion hardly shows, divided by
+    that of unit noise; of all agents the median. Half of the samples, or of the agents, may be
+    faulty. On simulated cars that accelerate, noise of 0.02, 0.1 and 0.3 m at 5, 10 and 25 Hz is
+    found to 2 % (table in docs/data.md).
+    """
+    places: list[np.ndarray] = []
+    speeds: list[np.ndarray] = []
+    for s in sequences:
+        if s.n_samples < LEAST or not s.n_agents:
+            continue
+        found = _noise(s.x)
+        places.append(found)
+        # a forward difference holds the errors of two positions
+        speeds.append(np.sqrt(2) * found / s.dt if s.v is None else _noise(s.v))
+    position, start = (_usual(found) for found in (places, speeds))
+    return Noise(position, start)
+
+
+def _noise(x: np.ndarray) -> np.ndarray:
+    """``(N,)`` standard deviations of the noise of ``(K, N, D)``, NaN where nothing is known."""
+    size = np.abs(np.diff(x, 4, axis=0)).transpose(1, 0, 2).reshape(x.shape[1], -1)
+    known = np.isfinite(size).any(axis=1)
+    found = np.full(x.shape[1], np.nan)
+    found[known] = np.nanmedian(size[known], axis=1) / (_MEDIAN * np.sqrt(_FOURTH))
+    return found
+
+
+def _usual(parts: list[np.ndarray]) -> float:
+    values = np.concatenate(parts) if parts else np.empty(0)
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else float("nan")
+
+
+def suggested_window(noise: Noise, dt: float) -> float:
+    """The shortest window (s) of ``data.smooth`` whose speeds are uncertain by BEARABLE at most.
+
+    It is at most 4 s: longer ones flatten what a driver does.
+    """
+    for window in WINDOWS:
+        samples = 2 * round(window / dt / 2) + 1
+        if samples >= DEGREE + 2:
+            slope = np.linalg.norm(savgol_coeffs(samples, DEGREE, deriv=1, delta=dt))
+            if noise.position * slope <= BEARABLE:
+                return window
+    return WINDOWS[-1]
+
+
+def smooth_speeds(sequence: Sequence) -> Sequence:
+    """A sequence with the speeds of local cubics of START s in place of the measured ones.
+
+    First speeds are those of :func:`start_smoothed`. Positions stay as they are. It is what a
+    simulation gets where the noise is :attr:`Noise.beyond`: the vehicle in front, whose measured
+    speed acts on the others at every time, as well as those that start.
+    """
+    v = sequence.velocity().copy()
+    for n in range(sequence.n_agents):
+        for d in range(v.shape[2]):
+            v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], START)[1]
+    if v.shape[2] == 1:
+        v = np.maximum(v, 0.0)
+    return start_smoothed(replace(sequence, v=v))
+
+
+def smoothed(sequence: Sequence, window: float) -> Sequence:
+    """A sequence with the positions and speeds of local cubics, see :func:`smooth`.
+
+    One whose times are uneven or that has holes stays as it is: it is faulty.
+    """
+    steps = np.diff(sequence.time)
+    if (
+        not np.isfinite(sequence.x).all()
+        or (np.abs(steps - sequence.dt) > 0.01 * sequence.dt).any()
+    ):
+        return sequence
+    x, v = sequence.x.copy(), np.empty_like(sequence.x)
+    for n in range(sequence.n_agents):
+        for d in range(x.shape[2]):
+            x[:, n, d], v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], window)
+    # a vehicle that stands shall not roll back
+    return replace(sequence, x=x, v=np.maximum(v, 0.0) if x.shape[2] == 1 else v)
+
+
+def smooth_records(x: np.ndarray, step: float, window: float) -> np.ndarray:
+    """``(K, N, D)`` positions of local cubics, every record without a hole by itself.
+
+    Args:
+        x: ``(K, N, D)`` m at equally spaced times, NaN where a sample is missing.
+        step: s, between two times.
+        window: s.
+    """
+    x = x.copy()
+    for n in range(x.shape[1]):
+        rows = np.flatnonzero(np.isfinite(x[:, n]).all(axis=1))
+        for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+            for d in range(x.shape[2]):
+                x[part, n, d] = smooth(part * step, x[part, n, d], window)[0]
+    return x
+
+
+def fill(x: np.ndarray, step: float, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions with short holes filled, see :func:`across`.
+
+    Holes before the first and behind the last known sample stay, as there is only one side.
+
+    Args:
+        x: ``(K, N, D)`` m at equally spaced times, NaN where a sample is missing.
+        step: s, between two times.
+        longest: s; holes in which more time is missing stay.
+
+    Returns:
+        ``(K, N, D)`` m, and ``(K, N)`` True where a sample was filled.
+    """
+    known = np.isfinite(x).all(axis=2)
+    filled = np.zeros(known.shape, dtype=bool)
+    most = int(longest / step + 1e-6) if step > 0 else 0
+    if known.all() or not most:
+        return x, filled
+    x = x.copy()
+    for n in range(x.shape[1]):
+        rows = np.flatnonzero(known[:, n])
+        time, own = rows * step, x[rows, n]
+        for i in np.flatnonzero((np.diff(rows) > 1) & (np.diff(rows) <= most + 1)):
+            hole = np.arange(rows[i] + 1, rows[i + 1])
+            x[hole, n] = across(time, own, int(i), hole * step)
+            filled[hole, n] = True
+    return x, filled
+
+
+def bridge(
+    time: np.ndarray, x: np.ndarray, longest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A record with the samples of its short holes added, see :func:`across`.
+
+    Args:
+        time: ``(K,)`` s, ascending, of the known samples.
+        x: ``(K, D)`` m.
+        longest: s; holes in which more time is missing stay, and so do those that are no multiple
+            of the usual step, to a tenth of it.
+
+    Returns:
+        All times, all positions, and the times that were added.
+    """
+    steps = np.diff(time)
+    if not steps.size:
+        return time, x, time[:0]
+    usual = float(np.median(steps))
+    number = np.round(steps / usual)
+    hole = (number > 1) & ((number - 1) * usual <= longest + 1e-6)
+    hole &= np.abs(steps - number * usual) <= 0.1 * usual
+    if not hole.any():
+        return time, x, time[:0]
+    places, times, values = [], [], []
+    for i in map(int, np.flatnonzero(hole)):
+        at = np.linspace(time[i], time[i + 1], int(number[i]) + 1)[1:-1]
+        places += [i + 1] * len(at)
+        times.append(at)
+        values.append(across(time, x, i, at))
+    added = np.concatenate(times)
+    return np.insert(time, places, added), np.insert(x, places, np.concatenate(values), 0), added
+
+
+def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarray:
+    """Positions in the hole between samples ``i`` and ``i + 1``.
+
+    They are those of a cubic fitted by least squares to the samples up to REACH s before the hole
+    and behind it; of a straight line, where these are fewer than four.
+
+    Args:
+        time: ``(K,)`` s, ascending, of the known samples.
+        x: ``(K, D)`` m.
+        at: ``(M,)`` s.
+
+    Returns:
+        ``(M, D)`` m.
+    """
+    low = int(np.searchsorted(time, time[i] - REACH - 1e-6))
+    high = int(np.searchsorted(time, time[i + 1] + REACH + 1e-6))
+    rows = slice(low, high) if high - low > DEGREE else slice(i, i + 2)
+    middle = (time[i] + time[i + 1]) / 2
+    degree = DEGREE if high - low > DEGREE else 1
+    powers = np.vander(time[rows] - middle, degree + 1)
+    found = np.linalg.lstsq(powers, x[rows] - x[i], rcond=None)[0]
+    return np.asarray(np.vander(at - middle, degree + 1) @ found + x[i])
 
 
 def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:

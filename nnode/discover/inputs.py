@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
-from nnode.data.dataset import Source
+from nnode.data.dataset import Source, noise_of
 from nnode.data.options import DataOptions, Faults
+from nnode.data.policy import told_filled
 from nnode.data.prepare import open_data
 from nnode.data.quality import Fault
 from nnode.data.readers.recordings import natural
@@ -32,6 +33,7 @@ class Inputs:
         data_faults: the same for the report, agents by identifier or, where there are none, by
             their number in the sequence.
         manifest: where the data come from.
+        measured: sentences about the noise of the measurement and about samples that were filled.
     """
 
     domain: Domain
@@ -40,6 +42,7 @@ class Inputs:
     faults: dict[str, list[Fault]]
     data_faults: list[DataFault]
     manifest: dict[str, Any]
+    measured: list[str] = field(default_factory=list)
 
 
 def read_inputs(options: DataOptions, folder: Path) -> Inputs:
@@ -74,7 +77,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
     Raises:
         DataError: fewer than three sequences are left, or no vehicle follows another.
     """
-    names = {field.name for field in fields(Fault)}
+    names = {one.name for one in fields(Fault)}
     faults: dict[str, list[Fault]] = {}
     reported = []
     for entry in store.manifest.get("faults", []):
@@ -95,7 +98,17 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
         faults=faults,
         data_faults=reported,
         manifest=store.manifest,
+        measured=_measured(store),
     )
+
+
+def _measured(store: Source) -> list[str]:
+    """What is known of the measurement, for the report's notes."""
+    noise, filled = noise_of(store), store.manifest.get("filled", [])
+    text = f"The {noise}."
+    if noise.beyond:
+        text = text[:-1] + "; starts and measured leaders are those of smoothed paths."
+    return [text] + ([f"{told_filled(filled)}."] if filled else [])
 
 
 def _check_enough(

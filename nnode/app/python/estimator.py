@@ -27,6 +27,7 @@ from nnode.app.training import (
     trainer_of,
 )
 from nnode.calibrate.options import Device
+from nnode.data.dataset import Source, sound_speeds
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError, NotFittedError
 from nnode.exchange.trajectories import simulated
@@ -56,8 +57,8 @@ class Calibrator:
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
         pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
             pool's, in ``result_.own``; see :mod:`nnode.calibrate.gauss_newton.pooling`.
-        start_speeds: ``given``, or ``fitted`` beside the parameters to each training sequence; see
-            :mod:`nnode.calibrate.gauss_newton.start_speeds`.
+        start_speeds: ``auto``, ``given``, or ``fitted`` beside the parameters to each training
+            sequence; see :class:`nnode.calibrate.options.StartSpeeds`.
         optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the
             command does, Gauss and Newton's method for the field's laws, else L-BFGS (where the
             command has the paper's stochastic descent).
@@ -82,7 +83,7 @@ class Calibrator:
     leader: str | None = None
     cost: str = "integral"
     pooling: str = "pooled"
-    start_speeds: str = "given"
+    start_speeds: str = "auto"
     optimizer: str | Mapping[str, Any] | None = None
     solver: str | None = None
     method: str | None = None
@@ -137,7 +138,10 @@ class Calibrator:
         """
         if not hasattr(self, "result_"):
             raise _unfitted()
-        given, model, solver = Sequences.of(X), self.model_, self._solver
+        model, solver = self.model_, self._solver
+        given: Source = Sequences.of(X)
+        if self.start_speeds == "auto":
+            given = sound_speeds(given, model.domain, model.order)
         dtype = next(model.parameters()).dtype
         with threads_given_back():
             set_threads(None, model.domain)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.gauss_newton.method import Curved, TangentCost
+from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK
 from nnode.calibrate.options import StartSpeeds
 from nnode.errors import ConfigError
 
@@ -45,6 +46,7 @@ class StartSpeedCost(TangentCost):
             )
         lead = torch.arange(batch.agent.shape[1]) == (batch.agent.sum(1) - 1)[:, None]
         self.fitted = batch.agent & ~lead if self.system.leader == "measured" else batch.agent
+        self._given = batch.v[0].clone()
 
     def costs(self, rows: np.ndarray) -> np.ndarray:
         """As of the base class, at the best first speeds."""
@@ -77,18 +79,35 @@ class StartSpeedCost(TangentCost):
         )
 
     def _settled(self, rows: np.ndarray) -> tuple[np.ndarray, Tensor]:
-        """Move first speeds to the best ones; costs ``(B,)``, and derivatives of errors by them."""
+        """Move first speeds to the best ones; costs ``(B,)``, and derivatives of errors by them.
+
+        Each sequence begins from the better of the last ones and of those that were given: speeds
+        that other parameters asked for may be far from the best, where no step helps. A step that
+        does not lower the cost is tried again with more damping.
+        """
         start = self.batch.v[0]  # changed in place
+        last = start.clone()
+        start.copy_(self._given)
         x, v, _, _ = self._simulated(rows, ())
-        away, seen = self._errors(x, v)
-        now = self._cost(away, seen)
+        given, seen = self._errors(x, v)
+        start.copy_(last)
+        x, v, _, _ = self._simulated(rows, ())
+        away, _ = self._errors(x, v)
+        now, before = self._cost(away, seen), self._cost(given, seen)
+        better = before < now
+        start.copy_(torch.where(better[:, None, None], self._given, start))
+        away = torch.where(better[:, None], given, away)
+        now = torch.where(better, before, now)
         going = torch.ones(len(now), dtype=torch.bool)
+        damping = torch.full((len(now),), DAMPING, dtype=torch.float64)
         for turn in range(_TURNS + 1):
             by_start = self._by_start(rows, away)
             if turn == _TURNS or not going.any():
                 break
             found = self._curved(away.double(), seen, by_start)
-            step = -np.einsum("bjk,bk->bj", self._inverse(found.hessian), found.gradient)
+            own = np.einsum("bjj->bj", found.hessian) * damping.numpy()[:, None]
+            stiff = found.hessian + own[:, :, None] * np.eye(own.shape[1])
+            step = -np.einsum("bjk,bk->bj", self._inverse(stiff), found.gradient)
             before = start.clone()
             moved = torch.from_numpy(step)[..., None].to(start) * self.fitted[..., None]
             start += torch.where(going[:, None, None], moved, 0.0)
@@ -99,7 +118,8 @@ class StartSpeedCost(TangentCost):
             worse = ~(value < now)
             start.copy_(torch.where(worse[:, None, None], before, start))
             away = torch.where(worse[:, None], away, new)
-            going &= ~worse & (now - value > _SETTLED * now)
+            damping = torch.where(worse, damping * STIFFEN, damping * EASE)
+            going &= torch.where(worse, damping < STUCK, now - value > _SETTLED * now)
             now = torch.where(worse, now, value)
         return now.numpy(), by_start
 

@@ -19,6 +19,7 @@ from nnode.data.check.tracks import LAG, Tracks, tracks_from, tracks_of
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import Fault, find_faults
 from nnode.data.sequence import Domain, Sequence
+from nnode.data.smooth import measured_noise
 from nnode.errors import DataError, NNodeError
 
 #: Sequences in which faults are looked for.
@@ -352,7 +353,10 @@ def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -
     whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
     found.findings += find.coming_and_going(tracks, domain, whole)
     found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
-    found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain))}
+    noise = measured_noise(found.sequences)
+    known = 0.0 if found.source.options.published else noise.position
+    found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain, known))}
+    found.findings += find.measurement(noise, found.sequences, domain)
     every = [fault for own in found.faults.values() for fault in own]
     found.findings += find.faults(every, len(found.sequences))
     found.findings += _made(found, len(sequences))

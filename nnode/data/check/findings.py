@@ -13,9 +13,11 @@ from scipy.spatial import cKDTree
 
 from nnode.data.check.scale import AGREE, INTERVAL, RATES, USUAL, Medians, Scale
 from nnode.data.check.tracks import Tracks
+from nnode.data.policy import told_filled
 from nnode.data.quality import KINDS, LIMITS, Fault
 from nnode.data.readers.columns import Table
-from nnode.data.sequence import Domain
+from nnode.data.sequence import Domain, Sequence
+from nnode.data.smooth import BEARABLE, Noise, suggested_window
 
 #: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
 #: over a second: that of gravity, m/s².
@@ -168,6 +170,25 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
             f"{who} {speed:.3g} m/s (median of those who move); expected {usual.low:g} to "
             f"{usual.high:g} m/s: {usual.source}; check rate and units",
         )  # fmt: skip
+
+
+def measurement(noise: Noise, sequences: list[Sequence], domain: Domain) -> Iterator[Finding]:
+    """Noise of the positions that a reader makes, and samples that it interpolated."""
+    filled = [{"sequence": s.name, "samples": s.filled} for s in sequences if s.filled]
+    if filled:
+        yield Finding("filled", "note", told_filled(filled))
+    if not sequences or not np.isfinite(noise.position):
+        return
+    if not noise.beyond:
+        yield Finding("noise", "note", str(noise))
+        return
+    window = suggested_window(noise, sequences[0].dt)
+    law = "a law of second order" if domain == "traffic" else "a social force"
+    text = f"{noise}, more than the {BEARABLE:g} m/s that {law} bears: "
+    cure = f"data.smooth={window:g} (s) smooths positions and speeds"
+    if domain == "traffic":
+        cure = f"training and fits smooth and fit first speeds by themselves; {cure}"
+    yield Finding("noise", "warning", text + cure)
 
 
 def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:

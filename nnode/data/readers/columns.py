@@ -252,6 +252,15 @@ class Table:
             return _since_first(self.frame[column].to_numpy(dtype=np.int64), unit)
         return _since_first(values, unit)
 
+    def measured(self, column: str) -> np.ndarray:
+        """The column as ``(rows,)`` float64, NaN where a cell is empty: a missing sample.
+
+        Raises:
+            DataError: a cell that holds something else than a finite number, or all are empty.
+        """
+        values = self.numbers(column, empty=True)
+        return values if np.isfinite(values).any() else self.numbers(column)
+
     def names(self, column: str, *, empty: bool = False) -> np.ndarray:
         """The column as ``(rows,)`` text; whole numbers are written without a decimal point.
 

@@ -21,6 +21,7 @@ from nnode.data.exits import Exit, destinations, exits_of, read_exits
 from nnode.data.options import JuelichOptions, Velocity
 from nnode.data.readers.recordings import one_of, positive, raw_files
 from nnode.data.sequence import Sequence
+from nnode.data.smooth import fill, smooth_records
 from nnode.errors import ConfigError, DataError
 
 #: Units of the coordinates, with their size in m.
@@ -110,6 +111,9 @@ def cut_people(
     _check_once(path, table)
     _check_dense(path, table)
     frames, ids, x = _positions(table)
+    x, filled = fill(x, 1 / rate, options.max_hole)
+    if options.smooth is not None:
+        x = smooth_records(x, 1 / rate, positive("smooth", options.smooth))
     v = _velocity(x, rate, options.velocity)
     if walls is None:
         walls = _walls(path.stem, options.walls, axis, x, view)
@@ -141,6 +145,7 @@ def cut_people(
                 if 0 <= before < first
                 else None,
                 walls=walls,
+                filled=int(filled[rows][:, people].sum()),
             )
         )
     if not found:

@@ -19,10 +19,13 @@ from nnode.data.identity import given_anew, numbered
 from nnode.data.options import Agents, LaneOptions
 from nnode.data.readers.recordings import check_known, positive, wanted
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import smooth
+from nnode.data.smooth import bridge, smooth
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
+
+#: A step longer than so many usual ones is a hole.
+HOLE = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +59,14 @@ class Vehicles:
 class _Stint:
     """A vehicle's uninterrupted stay in one lane, on the reference time grid.
 
-    Sample k of ``x`` (m) and ``speed`` (m/s) belongs to the grid's time ``first + k``.
+    Sample k of ``x`` (m) and ``speed`` (m/s) belongs to the grid's time ``first + k``; ``filled``
+    says whether it lies in a hole of the record.
     """
 
     vehicle: str
     first: int
     x: np.ndarray
+    filled: np.ndarray
     speed: np.ndarray | None
     length: float
     kind: str | None
@@ -195,6 +200,7 @@ def _stints(
             "expected one row per vehicle and time"
         )
     hole = ~other & (step > options.max_hole + 1e-9)
+    usual = float(np.median(step[~other])) if (~other).any() else 0.0
     number = np.ones(len(order), dtype=int)
     if options.agents is Agents.auto:
         number = _numbers(ids[code], time, x, other, hole, stem)
@@ -217,18 +223,28 @@ def _stints(
         if last < first:
             continue
         grid = np.arange(first, last + 1) * options.dt
+        own_time, own_x, _ = bridge(time[rows], x[rows, None], options.max_hole)
         code_of_kind = "" if kind is None else kind[i]
         found[place].append(
             _Stint(
                 vehicle=numbered(str(ids[code[rows[0]]]), int(number[rows[0]]), taken),
                 first=first,
-                x=np.interp(grid, time[rows], x[rows]),
+                x=np.interp(grid, own_time, own_x[:, 0]),
+                filled=_within_holes(grid, time[rows], usual),
                 speed=None if speed is None else np.interp(grid, time[rows], speed[rows]),
                 length=np.nan if length is None else float(length[i]),
                 kind=None if kind is None else names_of_kinds.get(code_of_kind, code_of_kind),
             )
         )
     return found
+
+
+def _within_holes(grid: np.ndarray, time: np.ndarray, usual: float) -> np.ndarray:
+    """``(K,)`` whether a grid time lies in a hole between rows, away from these."""
+    after = np.searchsorted(time, grid - 1e-6).clip(0, len(time) - 1)
+    before = np.maximum(after - 1, 0)
+    hole = time[after] - time[before] > HOLE * usual
+    return np.asarray(hole & (time[after] > grid + 1e-6) & (time[before] < grid - 1e-6))
 
 
 def _numbers(
@@ -354,4 +370,5 @@ def _sequence(
         agents=tuple(s.vehicle for s in platoon),
         length=None if np.isnan(length).all() else length,
         kind=kinds or None,
+        filled=int(cut([s.filled for s in platoon]).sum()),
     )

@@ -17,6 +17,7 @@ from nnode.data.readers.recordings import (
     wanted,
 )
 from nnode.data.sequence import TIME_UNITS, Sequence
+from nnode.data.smooth import fill
 from nnode.errors import ConfigError, DataError
 
 #: Share of the sampling interval by which sampling times may deviate from equal spacing.
@@ -55,14 +56,16 @@ def read_table(
     Returns:
         Sequences named ``recording/sequence``, in the order of their names, whatever that of the
         rows. An agent that is absent at some times of a sequence is NaN there (see
-        :func:`nnode.data.quality.find_faults`). Vehicles are ordered by their first position,
-        people by name.
+        :func:`nnode.data.quality.find_faults`), where no row or an empty cell tells its position
+        for longer than ``max_hole``. Shorter holes are filled, see :func:`nnode.data.smooth.fill`;
+        a platoon begins and ends when all vehicles are there, if that costs no more than
+        ``max_hole`` at either end. Vehicles are ordered by their first position, people by name.
 
     Raises:
         ConfigError: no domain, or an unknown recording.
         DataError: columns or cells that are missing or hold no number (names the row), one
-            agent twice at one time, unequal time steps, or values that change within a
-            sequence although they belong to an agent.
+            agent twice at one time, time steps that are no multiples of the usual one, or values
+            that change within a sequence although they belong to an agent.
     """
     crowd = _is_crowd(options)
     table = opened(source)
@@ -82,7 +85,8 @@ def read_table(
         )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
     time = table.times(names["time"], one_of("time_unit", options.time_unit, TIME_UNITS))[1]
-    values = {name: table.numbers(names[name]) for name in (*axes, *goals) if name in names}
+    values: dict[str, np.ndarray] = {axis: table.measured(names[axis]) for axis in axes}
+    values |= {name: table.numbers(names[name]) for name in goals if name in names}
     if "length" in names:
         values["length"] = table.positive(names["length"])
     words = {k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names}
@@ -105,7 +109,7 @@ def read_table(
             continue
         name = number if number.startswith(f"{run}/") else f"{run}/{number}"
         index = np.array(rows)
-        grid, k = _grid(table, name, time, index)
+        grid, k = _grid(table, name, time, index, options.max_hole)
         people, n = _people(agent[index])
         if len(grid) * len(people) > MOST_CELLS:
             raise DataError(
@@ -121,22 +125,25 @@ def read_table(
                     f"there a second time at {time[row]:g} s (first in {table.row(at[i, j])})"
                 )
             at[i, j] = row
+        known = _known(at, [values[axis] for axis in axes])
         if not crowd:
-            first = values["x"][np.array([column[column >= 0][0] for column in at.T])]
+            first = values["x"][_ends(known)[0]]
             order = np.argsort(first, kind="stable")
-            at, people = at[:, order], [people[j] for j in order]
+            at, known, people = at[:, order], known[:, order], [people[j] for j in order]
         owner = np.array([column[column >= 0][0] for column in at.T])
-        for key, column in {**values, **words}.items():
+        whole: dict[str, np.ndarray] = {**values, **words}
+        for key, column in whole.items():
             if key not in axes:
                 _constant(table, key, column, at, owner)
         x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
+        grid, x, filled = _filled(grid, x, options.max_hole, trim=not crowd)
         length = values["length"][owner] if "length" in values else None
         group = tuple(words["group"][owner]) if "group" in words else None
         goal = None
         if goals[0] in values:
             goal = np.stack([values[goal][owner] for goal in goals], axis=-1)
         elif exits:
-            start, end = (np.stack([values[a][i] for a in axes], -1) for i in _ends(at))
+            start, end = (np.stack([values[a][i] for a in axes], -1) for i in _ends(known))
             goal = destinations(exits_of(exits, start, end, people, group), start)
         found.append(
             Sequence(
@@ -150,9 +157,38 @@ def read_table(
                 group=group,
                 destination=goal,
                 walls=segments,
+                filled=filled,
             )
         )
     return found
+
+
+def _known(at: np.ndarray, positions: list[np.ndarray]) -> np.ndarray:
+    """Rows by time and agent, -1 where none or one without a position; of an agent who has no
+    position at all the rows as they are."""
+    known = np.where((at >= 0) & np.isfinite([x[at] for x in positions]).all(axis=0), at, -1)
+    return np.where((known >= 0).any(axis=0), known, at)
+
+
+def _filled(
+    grid: np.ndarray, x: np.ndarray, longest: float, trim: bool
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Times, positions with short holes filled, and how many were.
+
+    Args:
+        trim: whether times at either end go at which not all agents are there, if these are short.
+    """
+    if not np.isnan(x).any() or len(grid) < 2:
+        return grid, x, 0
+    step = float(np.median(np.diff(grid)))
+    x, filled = fill(x, step, longest)
+    present = np.flatnonzero(np.isfinite(x).all(axis=(1, 2)))
+    if trim and len(present):
+        low, high = int(present[0]), int(present[-1]) + 1
+        most = longest / step + 1e-6
+        low, high = low if low <= most else 0, high if len(grid) - high <= most else len(grid)
+        grid, x, filled = grid[low:high], x[low:high], filled[low:high]
+    return grid, x, int(filled.sum())
 
 
 def _ends(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,15 +213,21 @@ def _people(agent: np.ndarray) -> tuple[list[str], np.ndarray]:
 
 
 def _grid(
-    table: Table, name: str, time: np.ndarray, rows: np.ndarray
+    table: Table, name: str, time: np.ndarray, rows: np.ndarray, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sampling times of a sequence, and each row's number among them."""
+    """Sampling times of a sequence, and each row's number among them.
+
+    Times that all agents lack are added where no more than ``longest`` s are missing. A longer hole
+    stays: it is a fault of the sequence, see :func:`nnode.data.quality.find_faults`.
+    """
     # Agents' rows may differ in the last digits of a time that is meant to be the same.
     unique, first, code = np.unique(np.round(time[rows], 9), return_index=True, return_inverse=True)
     step = np.diff(unique)
     if step.size:
         usual = float(np.median(step))
-        uneven = np.flatnonzero(np.abs(step - usual) > UNEVEN * usual)
+        uneven = np.flatnonzero(
+            np.abs(step - usual * np.maximum(np.round(step / usual), 1)) > UNEVEN * usual
+        )
         if uneven.size:
             k = int(uneven[0])
             raise DataError(
@@ -193,6 +235,11 @@ def _grid(
                 f"{unique[k]:g} s to {unique[k + 1]:g} s, expected steps of {usual:g} s; "
                 "interpolate it to equal steps or cut it there into two sequences"
             )
+        number = np.round(step / usual)
+        more = np.where((number - 1) * usual <= longest + 1e-6, number - 1, 0).astype(int)
+        if more.any():
+            place = np.arange(len(unique)) + np.concatenate([[0], np.cumsum(more)])
+            return np.interp(np.arange(place[-1] + 1), place, unique), place[code]
     return unique, code
 
 

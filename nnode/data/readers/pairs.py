@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from nnode.data.options import PairOptions
+from nnode.data.options import Gaps, PairOptions
 from nnode.data.readers.columns import Table, opened
-from nnode.data.readers.pairs.pieces import Pair, pieces_of, sequence_of, too_short
 from nnode.data.readers.recordings import (
     Reading,
     check_known,
@@ -33,6 +32,7 @@ from nnode.data.readers.recordings import (
 )
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
 from nnode.data.sequence import TIME_UNITS, Sequence
+from nnode.data.smooth import bridge
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -42,6 +42,8 @@ _REQUIRED = ("time", "x_follower", "x_leader")
 _INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
 _METRES = ("leader_length", "follower_length", "spacing")
 _SPEEDS = ("v_follower", "v_leader")
+#: Share of the sampling interval by which a step may deviate.
+UNEVEN = 0.01
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
 
@@ -51,6 +53,27 @@ INDEX = "index"
 #: m by which a length that follows from spacings may vary within a pair: the error that a single
 #: position may have without being a fault (:mod:`nnode.data.quality`).
 UNSTEADY = 0.5
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A pair's rows in one file, in order of time, and what belongs to it as a whole.
+
+    ``time`` (s) counts from ``origin`` (ns).
+    """
+
+    table: Table
+    rows: np.ndarray
+    words: dict[str, str]
+    origin: int
+    time: np.ndarray
+    x: np.ndarray
+    v: np.ndarray | None
+    length: np.ndarray
+
+    @property
+    def called(self) -> str:
+        return f"{self.table.path}: pair {self.words['pair']}"
 
 
 def pair_files(options: PairOptions) -> dict[str, Path]:
@@ -88,10 +111,13 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
 
     Returns:
         Sequences of two vehicles, follower and leader, named ``run/pair``, with a number behind
-        where a pair is cut, in the order of these names. Speeds are the measured ones where the
-        source has those of both. A pair without a column of it is a file; without a run, all are
-        of one recording, which is called like the data. A vehicle without an identifier is called
-        after the pair and is in no other one. ``left_out`` tells of pairs that are too short.
+        where a pair is cut, in the order of these names. A pair is cut where more than
+        ``max_hole`` s are missing. Shorter holes are filled (:func:`nnode.data.smooth.bridge`;
+        speeds by straight lines); a row without a position or a speed is one that is missing.
+        Speeds are the measured ones where the source has those of both. A pair without a column
+        of it is a file; without a run, all are of one recording, which is called like the data. A
+        vehicle without an identifier is called after the pair and is in no other one.
+        ``left_out`` tells of pairs that are too short.
 
     Raises:
         ConfigError: an option out of its range, an unknown recording or lane.
@@ -129,11 +155,12 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         taken[name] = str(pair.table.path)
         anonymous += not (pair.words.get("follower") or pair.words.get("leader"))
         pair = replace(pair, time=pair.time + (pair.origin - start) / 1e9)
-        pieces = list(pieces_of(pair, options))
+        pieces = list(_pieces(pair, options))
         if not pieces:
-            short.append({"name": name, "why": too_short(pair, options)})
-        for number, (time, x, v) in enumerate(pieces):
-            found.append(sequence_of(name, number, len(pieces), pair, time, x, v, options))
+            short.append({"name": name, "why": _too_short(pair, options)})
+        for number, (time, x, v, filled) in enumerate(pieces):
+            made = _sequence(name, number, len(pieces), pair, time, x, v, options)
+            found.append(replace(made, filled=filled))
     if not found:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
@@ -199,7 +226,7 @@ def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
     }
 
 
-def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[Pair]:
+def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[_Pair]:
     names, integrated = _columns(table, options)
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
@@ -207,9 +234,10 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
     origin, time = table.times(names["time"], unit)
     x = v = None
     if not integrated:
-        x = np.stack([table.numbers(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
+        x = np.stack([table.measured(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
     if all(name in names for name in _SPEEDS):
-        v = np.stack([table.numbers(names[name]) for name in _SPEEDS], -1) * speeds
+        speed = table.numbers if integrated else table.measured
+        v = np.stack([speed(names[name]) for name in _SPEEDS], -1) * speeds
     own = {n: table.positive(names[n]) * metres for n in _METRES[:2] if n in names}
     if "spacing" in names:
         own["spacing"] = table.numbers(names["spacing"], empty=not integrated) * metres
@@ -240,7 +268,7 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
             place = _integrated(time[rows], v[rows, 1], own["spacing"][rows], leader)
         else:
             place, leader = x[rows], _leader(table, own, x, rows)
-        yield Pair(
+        yield _Pair(
             table, rows, said, origin, time[rows], place, None if v is None else v[rows],
             np.array([_follower(own, rows), leader]),
         )  # fmt: skip
@@ -339,7 +367,7 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
     return usual
 
 
-def _lanes(options: PairOptions, pairs: list[Pair]) -> list[str]:
+def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
     if options.lane is None:
         return []
     chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
@@ -349,3 +377,107 @@ def _lanes(options: PairOptions, pairs: list[Pair]) -> list[str]:
         if name not in present:
             raise ConfigError(f"data.lane={name}: the pairs have the lanes {', '.join(present)}")
     return names
+
+
+def _too_short(pair: _Pair, options: PairOptions) -> str:
+    """Why there is no sequence of a pair."""
+    if len(pair.time) < options.min_samples:
+        return f"fewer than data.min_samples={options.min_samples} times"
+    if options.window is not None:
+        return f"no data.window={options.window:g} s without a gap"
+    return f"no data.min_samples={options.min_samples} times without a gap"
+
+
+_Piece = tuple[np.ndarray, np.ndarray, np.ndarray | None, int]
+
+
+def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
+    """Times, positions and speeds of every part without a gap."""
+    if len(pair.time) < options.min_samples:
+        return
+    step = np.diff(pair.time)
+    usual = float(np.median(step))
+    known = np.isfinite(pair.x if pair.v is None else np.hstack([pair.x, pair.v])).all(axis=1)
+    measured = pair.time[known]
+    all_time, all_x, added = bridge(measured, pair.x[known], options.max_hole)
+    all_v = None if pair.v is None else _at(all_time, measured, pair.v[known])
+    gaps = np.flatnonzero(np.abs(np.diff(all_time) - usual) > UNEVEN * usual)
+    if gaps.size and options.gaps is Gaps.error:
+        i = int(gaps[0])
+        raise DataError(
+            f"{pair.called} steps from {all_time[i]:g} s to {all_time[i + 1]:g} s "
+            f"({pair.table.row(int(pair.rows[pair.time == all_time[i + 1]][0]))}), expected "
+            f"steps of {usual:g} s "
+            f"({len(gaps)} such gaps); data.gaps=cut cuts the pair there"
+        )
+    for rows in np.split(np.arange(len(all_time)), gaps + 1):
+        if len(rows) < 2:
+            continue
+        time, x, v = all_time[rows], all_x[rows], None if all_v is None else all_v[rows]
+        dt = usual
+        if options.dt is not None:
+            dt = options.dt
+            if dt < usual * (1 - UNEVEN):
+                raise ConfigError(
+                    f"data.dt={dt:g} s is finer than the {usual:g} s of {pair.called}; expected no "
+                    "more times than were measured"
+                )
+            first, last = np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6)
+            grid = np.arange(first, last + 1) * dt
+            x = _at(grid, time, x)
+            v = None if v is None else _at(grid, time, v)
+            time = grid
+        for piece in _windows(time, x, v, dt, options):
+            within = (added >= piece[0][0]) & (added <= piece[0][-1])
+            yield *piece, 2 * int(within.sum())
+
+
+def _at(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(grid, time, column) for column in values.T], -1)
+
+
+def _windows(
+    time: np.ndarray, x: np.ndarray, v: np.ndarray | None, dt: float, options: PairOptions
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
+    """Consecutive windows that share their boundary sample; what is left at the end is not used."""
+    starts, steps = [0], len(time) - 1
+    if options.window is not None:
+        steps = round(options.window / dt)
+        if steps < 1 or abs(options.window / dt - steps) > 1e-6 * steps:
+            raise ConfigError(
+                f"data.window={options.window:g} s is no whole number of steps of {dt:g} s"
+            )
+        starts = list(range(0, len(time) - steps, steps))
+    for first in starts:
+        rows = slice(first, first + steps + 1)
+        if len(time[rows]) >= options.min_samples:
+            yield time[rows], x[rows], None if v is None else v[rows]
+
+
+def _sequence(
+    name: str,
+    number: int,
+    pieces: int,
+    pair: _Pair,
+    time: np.ndarray,
+    x: np.ndarray,
+    v: np.ndarray | None,
+    options: PairOptions,
+) -> Sequence:
+    words = pair.words
+    # one without an identifier is in no other pair
+    agents = tuple(words.get(who) or f"{words['pair']} {who}" for who in ("follower", "leader"))
+    kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
+    codes = (words.get("follower_kind", ""), words.get("leader_kind", ""))
+    kind = tuple(kinds.get(code, code) for code in codes)
+    return Sequence(
+        name=name if pieces == 1 else f"{name}_{number:03d}",
+        recording=words["run"],
+        time=time,
+        x=x[:, :, None],
+        v=None if v is None else v[:, :, None],
+        agents=agents,
+        length=None if np.isnan(pair.length).all() else pair.length,
+        kind=kind if any(kind) else None,
+        split=words.get("split", "").lower(),
+    )
