@@ -89,7 +89,9 @@ def read_table(
     values |= {name: table.numbers(names[name]) for name in goals if name in names}
     if "length" in names:
         values["length"] = table.positive(names["length"])
-    words = {k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names}
+    words: dict[str, np.ndarray] = {
+        k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names
+    }
     recording = (
         table.names(names["recording"])
         if "recording" in names
@@ -131,8 +133,7 @@ def read_table(
             order = np.argsort(first, kind="stable")
             at, known, people = at[:, order], known[:, order], [people[j] for j in order]
         owner = np.array([column[column >= 0][0] for column in at.T])
-        whole: dict[str, np.ndarray] = {**values, **words}
-        for key, column in whole.items():
+        for key, column in {**values, **words}.items():
             if key not in axes:
                 _constant(table, key, column, at, owner)
         x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
