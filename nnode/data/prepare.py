@@ -44,6 +44,7 @@ from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.openacc import openacc_files, read_openacc
 from nnode.data.readers.pairs import pair_files, read_pairs
+from nnode.data.readers.recordings import reading
 from nnode.data.readers.sumo import read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
@@ -79,6 +80,15 @@ class Format:
 
     files: Callable[[Any], _Files]
     read: Callable[[_Files, Any], list[Sequence]]
+
+    def sequences(self, files: _Files, options: Any) -> list[Sequence]:
+        """Read the files.
+
+        Raises:
+            NNodeError: what cannot be read, see :func:`nnode.data.readers.recordings.reading`.
+        """
+        with reading(", ".join(str(getattr(file, "path", file)) for file in files.values())):
+            return self.read(files, options)
 
 
 def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
@@ -134,7 +144,7 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
     with Stages("preparing", {"reading": 2.0, "looking for faults": 1.0}) as stages:
         stages.begin("reading")
         files = layout.files(replace(options, download=downloads))
-        read = layout.read(files, options)
+        read = layout.sequences(files, options)
         stages.begin("looking for faults")
         judged = judge(options, files, read, stages)
     with _drawn(folder, judged, draw):

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from nnode.data.check.scale import AGREE, INTERVAL, RATES, USUAL, Medians, Scale
 from nnode.data.check.tracks import Tracks
 from nnode.data.quality import KINDS, LIMITS, Fault
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, floats, quoted
 from nnode.data.sequence import Domain
 
 #: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
@@ -52,10 +52,10 @@ def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
         empty = own.isna().to_numpy()
         bad = empty
         if meaning != "agent":
-            bad = ~np.isfinite(np.array(pd.to_numeric(own, errors="coerce"), dtype=float))
+            bad = ~np.isfinite(floats(own))
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
-            shown = "nothing" if empty[i] else repr(str(own.iloc[i])[:40])
+            shown = "nothing" if empty[i] else quoted(own.iloc[i])[:42]
             yield Finding(
                 "cells", "error",
                 f"column {column!r} ({meaning}) holds no number in {bad.sum()} of {len(own)} rows, "
