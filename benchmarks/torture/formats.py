@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from nnode.app.check import check_file
+from nnode.data.identity import identify
 from nnode.data.options import (
     DataOptions,
     HighDOptions,
@@ -23,9 +24,12 @@ from nnode.data.options import (
     SumoOptions,
     WalkwayOptions,
 )
-from nnode.data.prepare import FORMATS, judge
+from nnode.data.policy import drop_absent
+from nnode.data.prepare import FORMATS
+from nnode.data.quality import find_faults
 from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META
 from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE
+from nnode.data.sequence import Domain
 from nnode.data.sequences import Sequences
 
 ROOM = "POLYGON ((0 0, 20 0, 20 4, 0 4, 0 0), (4 1, 5 1, 5 2, 4 2, 4 1))"
@@ -42,7 +46,13 @@ _KINDS = ("object", "float32", "int8", "uint64", "string", "category", "complex"
 
 def read_all(options: DataOptions, files: dict[str, Any]) -> None:
     """Read files and look for faults, without the last resort for foreign errors."""
-    judge(options, files, FORMATS[type(options)].read(files, options))
+    sequences = FORMATS[type(options)].read(files, options)
+    domain: Domain = "crowd" if options.domain == "crowd" else "traffic"
+    if domain == "crowd":
+        sequences, _ = drop_absent(sequences)
+    for sequence in sequences:
+        find_faults(sequence, domain)
+    identify(sequences, domain, options.agents)
 
 
 def ngsim() -> bytes:

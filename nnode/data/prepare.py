@@ -36,7 +36,7 @@ from nnode.data.options import (
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent
 from nnode.data.quality import Fault, find_faults
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, quoted
 from nnode.data.readers.esimas import esimas_files, read_esimas
 from nnode.data.readers.highd import highd_files, read_highd
 from nnode.data.readers.juelich import juelich_files, read_juelich
@@ -222,8 +222,12 @@ def judge(
 def _of_file(source: Path | Table) -> dict[str, str]:
     """Name and SHA-256 of what was read."""
     if isinstance(source, Table):
-        rows = pd.util.hash_pandas_object(source.frame, index=False).to_numpy()
-        return {"name": source.path.name, "sha256": hashlib.sha256(rows.tobytes()).hexdigest()}
+        try:
+            rows = pd.util.hash_pandas_object(source.frame, index=False)
+        except (TypeError, ValueError):  # lists, and other cells without a hash
+            rows = pd.util.hash_pandas_object(source.frame.map(quoted), index=False)
+        whole = hashlib.sha256(rows.to_numpy().tobytes()).hexdigest()
+        return {"name": source.path.name, "sha256": whole}
     return {"name": source.name, "sha256": sha256(source)}
 
 

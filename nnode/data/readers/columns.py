@@ -219,10 +219,11 @@ class Table:
 
 def floats(cells: pd.Series) -> np.ndarray:
     """A column's cells ``(rows,)`` as float64, NaN where they hold no real number."""
-    if cells.dtype.kind == "c":
-        return np.full(len(cells), np.nan)
     try:
-        return np.array(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
+        found = pd.to_numeric(cells, errors="coerce")
+        if found.dtype.kind == "c":  # which would lose its imaginary part
+            return np.full(len(cells), np.nan)
+        return np.array(found, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # such as whole numbers beyond float64
         return np.array([_float(cell) for cell in cells])
 
