@@ -11,10 +11,11 @@ from typing import Any
 #: Characters of a message, at most.
 LONGEST = 2000
 
-#: What a terminal obeys or cannot show: control characters other than line feed and tab, the marks
-#: that reverse the direction of writing, separators of lines, and halves of surrogate pairs.
+#: What a terminal obeys or does not show: control characters other than line feed and tab, marks of
+#: the direction of writing and of no width, separators of lines, and halves of surrogate pairs.
 _CONTROL = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+    "\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e007f]"
 )
 
 

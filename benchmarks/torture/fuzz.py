@@ -1,7 +1,8 @@
 """Malformed files for every reader and loader, in a child process with little memory.
 
-Only the package's own errors may come of them; no program may start, and no file be written
-outside the folder. The child watches itself with an audit hook, its parent watches the child.
+Only the package's own errors may come of them, short and without control characters; no program may
+start, and no file be written outside the folder. The child watches itself with an audit hook, its
+parent watches the child.
 """
 
 from __future__ import annotations
@@ -23,18 +24,21 @@ from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unicodedata import category
 
 from benchmarks.torture.campaign import check_names
 from benchmarks.torture.child import Child
 from benchmarks.torture.report import Row
 from benchmarks.torture.targets import Target, quiet, targets
-from nnode.errors import NNodeError
+from nnode.errors import LONGEST, NNodeError
 from nnode.progress import Stages
 
 #: Bytes of address space that a child may take beyond what it has when it starts.
 ROOM = 2 << 30
 #: Seconds that one input may take.
 SLOW = 10
+#: What a message must not hold: control and format characters, surrogates, separators of lines.
+_HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 #: So many losses of a target are told in full.
 _TOLD = 20
 
@@ -190,8 +194,9 @@ def _work(target: Target, first: int, last: int, seed: int, scratch: Path, notes
         try:
             target.read(path)
             found.read += 1
-        except NNodeError:
+        except NNodeError as error:
             found.refused += 1
+            found.losses += [f"input {number}: {what}" for what in _unfit(str(error))]
         except (Exception, _TooSlow) as error:
             where = "".join(traceback.format_tb(error.__traceback__)[-3:])
             found.losses.append(f"input {number}: {type(error).__name__}: {error}\n{where}"[:900])
@@ -205,6 +210,13 @@ def _work(target: Target, first: int, last: int, seed: int, scratch: Path, notes
             more = len(found.losses) - _TOLD
             told = found.losses[:_TOLD] + ([""] * more if more > 0 else [])
             notes.write_text(json.dumps({**asdict(found), "losses": told}))
+
+
+def _unfit(message: str) -> list[str]:
+    """What a message must not be: long, or something that a terminal obeys."""
+    control = sorted({ascii(c) for c in message if c not in "\n\t" and category(c) in _HIDDEN})
+    found = [f"a message of {len(message)} characters"] if len(message) > LONGEST else []
+    return found + ([f"a message with {', '.join(control)}"] if control else [])
 
 
 def _too_slow(number: int, frame: FrameType | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,24 +16,23 @@ import pandas as pd
 import torch
 from scipy.io import savemat
 
+from benchmarks.torture import formats
+from benchmarks.torture.formats import read_all
 from benchmarks.torture.gadgets import evil_checkpoint, strange_checkpoint
 from benchmarks.torture.inputs import damaged_bytes, damaged_formula, damaged_text
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
 from nnode.compiled import source
 from nnode.data.options import (
+    EsimasOptions,
     JuelichOptions,
-    OpenAccOptions,
     PairOptions,
     TableOptions,
     VehicleTableOptions,
 )
-from nnode.data.readers.esimas import read_esimas
-from nnode.data.readers.juelich import read_juelich
-from nnode.data.readers.openacc import read_openacc
-from nnode.data.readers.pairs import read_pairs
-from nnode.data.readers.table import read_table
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.highd import TRACKS
+from nnode.data.readers.table import TABLE as TIDY
+from nnode.data.readers.table import WALLS
 from nnode.data.sequence import Sequence
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
 from nnode.models import Traffic, build_model
@@ -200,7 +200,10 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
         outside: what evil files try to write; nothing else does.
     """
     traffic = _trajectories().drop(columns=["y", "dest_y", "dest_x"])
-    crowd, walls = _trajectories(), b"x1,y1,x2,y2\n0,0,5,0\n5,2,0,2\n"
+    crowd, walls = (
+        _trajectories().assign(x=lambda f: f["x"] / 15),
+        b"x1,y1,x2,y2\n0,0,5,0\n5,2,0,2\n",
+    )
     of_traffic, of_crowd = TableOptions(domain="traffic"), TableOptions(domain="crowd")
     (scratch / "crowd.csv").write_bytes(_csv(crowd))
     manifest, table = _store(scratch / "manifest")
@@ -211,34 +214,48 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
     kept = (scratch / "kept" / KEPT / "one.json").read_bytes()
     checkpoint = _checkpoint(scratch)
     pandas_only = JuelichOptions(frame_rate=None, unit=None, walls={"corridor": [0.0, 3.0]})
-    cars = VehicleTableOptions(min_samples=2)
-    windows = VehicleTableOptions(min_samples=2, window=0.4)
+    tracks = formats.highd(scratch / "highd")
+    (scratch / "room.txt").write_bytes(_corridor())
+    pickled = [pickle.dumps(f) for f in (traffic, crowd, _vehicles(), _pairs())]
+    texts = [_csv(f) for f in (traffic, crowd, _vehicles(), _pairs())]
+    texts += [_corridor(), formats.ngsim(), _platoon(), formats.flat_platoons()]
 
     def vehicles(path: Path) -> None:
-        for options in (cars, windows):
-            read_vehicles(path, options)
+        for window in (None, 0.4):
+            options = VehicleTableOptions(path=str(path), min_samples=2, window=window)
+            read_all(options, {path.stem: path})
 
     def pairs(path: Path) -> None:
         for options in (PairOptions(), PairOptions(dt=0.4, window=0.8, min_samples=2)):
-            read_pairs({path.name: path}, options)
+            options.path = str(path)
+            read_all(options, {path.name: path})
 
     return [
         Target("esimas", "sequence_datademo.mat", [_mat(packed=False), _mat(packed=True)],
-               damaged_bytes, read_esimas),
+               damaged_bytes, lambda path: read_all(EsimasOptions(), {"demo": path})),
         Target("juelich", "corridor.txt", [_corridor()], damaged_text,
-               lambda path: read_juelich(path, pandas_only)),
+               lambda path: read_all(pandas_only, {"corridor": path})),
         Target("table CSV", "table.csv", [_csv(traffic)], damaged_text,
-               lambda path: read_table(path, of_traffic)),
+               lambda path: read_all(of_traffic, {TIDY: path})),
         Target("table CSV, crowd", "people.csv", [_csv(crowd)], damaged_text,
-               lambda path: read_table(path, of_crowd)),
+               lambda path: read_all(of_crowd, {TIDY: path})),
         Target("table Parquet", "table.parquet", [_parquet(traffic)], damaged_bytes,
-               lambda path: read_table(path, of_traffic)),
+               lambda path: read_all(of_traffic, {TIDY: path})),
         Target("vehicles CSV", "cars.csv", [_csv(_vehicles())], damaged_text, vehicles),
         Target("pairs CSV", "pairs.csv", [_csv(_pairs())], damaged_text, pairs),
-        Target("OpenACC", "platoon.csv", [_platoon()], damaged_text,
-               lambda path: read_openacc({path.name: path}, OpenAccOptions(min_duration=0.3))),
+        Target("OpenACC", "platoon.csv", [_platoon(), formats.flat_platoons()], damaged_text,
+               formats.read_platoons),
+        Target("NGSIM", "ngsim.csv", [formats.ngsim()], damaged_text, formats.read_ngsim),
+        Target("highD, tracks", f"highd/01{TRACKS}", [tracks], damaged_text, formats.read_highd),
+        Target("SUMO", "fcd.xml", formats.sumo(), damaged_text, formats.read_sumo),
+        Target("JuPedSim", "walk.sqlite", [formats.walkway(scratch)], damaged_bytes,
+               formats.read_walkway),
+        Target("walkable area", "area.wkt", [formats.ROOM.encode()], damaged_text,
+               formats.read_geometry(scratch / "room.txt")),
+        Target("data frame", "frame.pickle", pickled, formats.strange_frame, formats.read_frame),
+        Target("check", "checked.csv", texts, damaged_text, formats.check),
         Target("walls CSV", "walls.csv", [walls], damaged_text,
-               lambda path: read_table(scratch / "crowd.csv", of_crowd, path)),
+               lambda path: read_all(of_crowd, {TIDY: scratch / "crowd.csv", WALLS: path})),
         Target("checkpoint, bytes", "bytes.pt", [checkpoint], damaged_bytes, _open_checkpoint),
         Target("checkpoint, evil", "evil.pt", [checkpoint],
                lambda data, rng: evil_checkpoint(data, rng, outside), _open_checkpoint),

@@ -15,6 +15,7 @@ from nnode.app.cli.typed import changes, group_defaults, plain_options
 from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.check.findings import Finding
 from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
+from nnode.data.readers.columns import floats, quoted
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError, printable
 from nnode.machine import how_made
@@ -209,14 +210,14 @@ def _columns(found: Examination) -> list[Block]:
     for column in map(str, frame.columns):
         meaning, one = by.get(column, ("not used", None))
         cells = frame[column]
-        values = pd.to_numeric(cells, errors="coerce")
-        numeric = bool(values.notna().any())
+        values = pd.Series(floats(cells)).dropna()
+        numeric = len(values) > 0
         rows[column] = {
             "meaning": meaning,
             "because": "" if one is None else how[one.sure],
             "least": f"{values.min():.6g}" if numeric else "",
             "greatest": f"{values.max():.6g}" if numeric else "",
-            "different": int(cells.nunique()),
+            "different": cells.dropna().map(quoted).nunique(),
             "empty": int(cells.isna().sum()),
         }
     table = pd.DataFrame(rows).T.rename_axis("column")

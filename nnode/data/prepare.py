@@ -36,7 +36,7 @@ from nnode.data.options import (
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
 from nnode.data.quality import Fault, find_faults
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, quoted
 from nnode.data.readers.esimas import esimas_files, read_esimas
 from nnode.data.readers.highd import highd_files, read_highd
 from nnode.data.readers.juelich import juelich_files, read_juelich
@@ -44,7 +44,7 @@ from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.openacc import openacc_files, read_openacc
 from nnode.data.readers.pairs import pair_files, read_pairs
-from nnode.data.readers.recordings import Reading, positive
+from nnode.data.readers.recordings import Reading, positive, reading
 from nnode.data.readers.sumo import read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
@@ -82,6 +82,15 @@ class Format:
     files: Callable[[Any], _Files]
     read: Callable[[_Files, Any], list[Sequence]]
     smooths: bool = False  # whether the reader applies ``data.smooth`` itself, before it cuts
+
+    def sequences(self, files: _Files, options: Any) -> list[Sequence]:
+        """Read the files.
+
+        Raises:
+            NNodeError: what cannot be read, see :func:`nnode.data.readers.recordings.reading`.
+        """
+        with reading(", ".join(str(getattr(file, "path", file)) for file in files.values())):
+            return self.read(files, options)
 
 
 def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
@@ -140,7 +149,7 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
     with Stages("preparing", {"reading": 2.0, "looking for faults": 1.0}) as stages:
         stages.begin("reading")
         files = layout.files(replace(options, download=downloads))
-        read = layout.read(files, options)
+        read = layout.sequences(files, options)
         stages.begin("looking for faults")
         judged = judge(options, files, read, stages)
     with _drawn(folder, judged, draw):
@@ -232,8 +241,12 @@ def judge(
 def _of_file(source: Path | Table) -> dict[str, str]:
     """Name and SHA-256 of what was read."""
     if isinstance(source, Table):
-        rows = pd.util.hash_pandas_object(source.frame, index=False).to_numpy()
-        return {"name": source.path.name, "sha256": hashlib.sha256(rows.tobytes()).hexdigest()}
+        try:
+            rows = pd.util.hash_pandas_object(source.frame, index=False)
+        except (TypeError, ValueError):  # lists, and other cells without a hash
+            rows = pd.util.hash_pandas_object(source.frame.map(quoted), index=False)
+        whole = hashlib.sha256(rows.to_numpy().tobytes()).hexdigest()
+        return {"name": source.path.name, "sha256": whole}
     return {"name": source.name, "sha256": sha256(source)}
 
 

@@ -47,6 +47,9 @@ RECENT = 3
 #: Pairs of positions near each other that are looked at one by one; each takes 24 bytes.
 PAIRS = 10**7
 
+#: m, beyond which squares of distances may be no numbers.
+_FAR = 1e150
+
 #: Positions that may be joined by distances within a path's reach where swaps are looked for.
 CROWDED = 2000
 
@@ -315,7 +318,7 @@ def _groups(a: np.ndarray, b: np.ndarray, reach: float) -> Iterator[tuple[np.nda
     Points of different groups are farther apart, so that each group is a problem of its own. Groups
     of more than :data:`CROWDED` points are left out: paths cannot be told apart there.
     """
-    known = [np.flatnonzero(np.isfinite(x).all(axis=1)) for x in (a, b)]
+    known = [np.flatnonzero(_placed(x)) for x in (a, b)]
     i, j = (own[k] for own, k in zip(known, _near(a[known[0]], b[known[1]], reach), strict=True))
     n = len(a)
     graph = coo_array((np.ones(len(i)), (i, n + j)), shape=(2 * n, 2 * n))
@@ -324,6 +327,11 @@ def _groups(a: np.ndarray, b: np.ndarray, reach: float) -> Iterator[tuple[np.nda
     for group in np.split(members, np.flatnonzero(np.diff(label[members])) + 1):
         if 1 < len(group) <= CROWDED:
             yield group[group < n], group[group >= n] - n
+
+
+def _placed(x: np.ndarray) -> np.ndarray:
+    """Which positions (..., D) are known, and have squares."""
+    return np.asarray((np.abs(x) < _FAR).all(axis=-1))
 
 
 def _near(a: np.ndarray, b: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -382,7 +390,7 @@ def _bumpers(view: _View) -> Iterator[Fault]:
 
 def _overlaps(view: _View) -> Iterator[Fault]:
     x, limit = view.x, view.limits.spacing
-    time, agent = np.nonzero(np.isfinite(x).all(axis=2))
+    time, agent = np.nonzero(_placed(x))
     # times lie apart by more than the limit in a dimension of their own
     points = np.column_stack([x[time, agent], 2 * limit * time])
     i, j = _near(points, points, limit)

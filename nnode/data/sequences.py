@@ -26,7 +26,7 @@ from nnode.data.options import (
 )
 from nnode.data.prepare import FORMATS, judge
 from nnode.data.readers.columns import Table
-from nnode.data.readers.recordings import table_path
+from nnode.data.readers.recordings import reading, table_path
 from nnode.data.readers.table import TABLE, WALLS
 from nnode.data.sequence import Domain, Sequence, check_interval
 from nnode.errors import ConfigError, DataError
@@ -104,13 +104,15 @@ class Sequences:
                 )
             return cls(source)
         if options is None:
-            options = seen_options(source)
+            with reading(source if isinstance(source, str | Path) else "the table"):
+                options = seen_options(source)
         if source is not None and not isinstance(source, pd.DataFrame):
             if not hasattr(options, "path"):
                 raise ConfigError(f"data={options.name} is no table: leave the path out")
             options = replace(options, path=str(Path(source).expanduser()))  # type: ignore[call-arg]
-        files = _files(options, source if isinstance(source, pd.DataFrame) else None)
-        judged = judge(options, files, FORMATS[type(options)].read(files, options))
+        with reading("the table" if isinstance(source, pd.DataFrame) else str(source)):
+            files = _files(options, source if isinstance(source, pd.DataFrame) else None)
+            judged = judge(options, files, FORMATS[type(options)].sequences(files, options))
         return cls(judged.kept, judged.manifest)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nnode.data import quality
 from nnode.data.options import JuelichOptions, VehicleTableOptions
 from nnode.data.quality import KINDS, LIMITS, Fault, find_faults, usable
 from nnode.data.readers.esimas import read_esimas
 from nnode.data.readers.juelich import juelich_files, read_juelich
 from nnode.data.readers.vehicles import read_vehicles
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Domain, Sequence
 from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults
 
 
@@ -261,3 +263,44 @@ def test_plot(tmp_path: Path, domain: str) -> None:
     fault = Fault("jump", "", (1,), float(s.time[3]), "")
     plot_faults(many, {m.name: [fault] for m in many[1:]}, domain, tmp_path / "f.png")  # type: ignore[arg-type]
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_memory_grows_with_the_number_of_vehicles() -> None:
+    # the matrix of all distances has 3.2 GB
+    n = 20_000
+    x = 20.0 * np.arange(n)[None, :, None] + 2.0 * np.arange(4)[:, None, None]
+    x[2:, [5, 6]] = x[2:, [6, 5]]
+    x[:, 9] = x[:, 8] + 0.5
+    s = Sequence(
+        name="a", recording="a", time=0.2 * np.arange(4), x=x, agents=tuple(map(str, range(n)))
+    )
+    tracemalloc.start()
+    try:
+        found = {(f.kind, f.agents) for f in find_faults(s, "traffic")}
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found == {("identity_swap", (5, 6)), ("overlap", (8, 9))}
+    assert most < 200e6
+
+
+@pytest.mark.parametrize("domain", ["traffic", "crowd"])
+def test_pairs_too_many_to_list_are_told_by_the_nearest(
+    monkeypatch: pytest.MonkeyPatch, domain: Domain
+) -> None:
+    dims = 1 if domain == "traffic" else 2
+    x = np.ones((3, 40, dims)) * np.arange(3)[:, None, None]
+    s = Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
+    every = [f for f in find_faults(s, domain) if f.kind == "overlap"]
+    assert len(every) == 40 * 39 / 2
+    monkeypatch.setattr(quality, "PAIRS", 1000)
+    some = [f for f in find_faults(s, domain) if f.kind == "overlap"]
+    assert {i for f in some for i in f.agents} == set(range(40))
+    assert len(some) <= 2 * 40 * 3 < len(every)
+
+
+def test_positions_whose_squares_are_no_numbers() -> None:
+    x = np.array([[[0.0], [10.0], [1e300]], [[1.0], [1e308], [-1e308]], [[2.0], [12.0], [1e300]]])
+    s = Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
+    with np.errstate(all="ignore"):
+        assert "jump" in {f.kind for f in find_faults(s, "traffic")}

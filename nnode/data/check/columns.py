@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from nnode.data.check.raw import Raw
+from nnode.data.readers.columns import floats
 
 #: Names by meaning, small letters and digits only; the first is the meaning's own.
 NAMES: dict[str, tuple[str, ...]] = {
@@ -116,7 +117,7 @@ def in_seconds(raw: Raw) -> Raw:
 
 def numbers(frame: pd.DataFrame, column: str) -> np.ndarray:
     """A column as float64, NaN where a cell holds no finite number."""
-    values = np.array(pd.to_numeric(frame[column], errors="coerce"), dtype=np.float64)
+    values = floats(frame[column])
     return np.where(np.isfinite(values), values, np.nan)
 
 

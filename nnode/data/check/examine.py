@@ -18,6 +18,7 @@ from nnode.data.check.source import Source, are_pairs, is_spaced, native_source,
 from nnode.data.check.tracks import LAG, Tracks, tracks_from, tracks_of
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import Fault, find_faults
+from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.errors import DataError, NNodeError
@@ -92,15 +93,16 @@ def examine(path: Path, domain: Domain | None = None, rate: float | None = None)
         ConfigError: there is no such file.
         DataError: it is no table of trajectories, or a damaged file of a known format.
     """
-    raw = read_raw(path)
-    if raw.native:
-        return _native(raw)
-    raw = in_seconds(raw)
-    found = meanings(raw)
-    native = native_source(raw, found)
-    if native is not None:
-        return _native(replace(raw, native=native))
-    return _table(raw, found, domain, rate)
+    with reading(path):
+        raw = read_raw(path)
+        if raw.native:
+            return _native(raw)
+        raw = in_seconds(raw)
+        found = meanings(raw)
+        native = native_source(raw, found)
+        if native is not None:
+            return _native(replace(raw, native=native))
+        return _table(raw, found, domain, rate)
 
 
 def _native(raw: Raw) -> Examination:
@@ -331,7 +333,7 @@ def _parts(raw: Raw, found: Mapping[str, Meaning]) -> np.ndarray | None:
 
 def _read(source: Source) -> list[Sequence]:
     kind = FORMATS[type(source.options)]
-    return kind.read(kind.files(source.options), source.options)
+    return kind.sequences(kind.files(source.options), source.options)
 
 
 def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:

@@ -15,7 +15,7 @@ from nnode.data.check.scale import AGREE, INTERVAL, RATES, USUAL, Medians, Scale
 from nnode.data.check.tracks import Tracks
 from nnode.data.policy import told_filled
 from nnode.data.quality import KINDS, LIMITS, Fault
-from nnode.data.readers.columns import Table
+from nnode.data.readers.columns import Table, floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import BEARABLE, Noise, suggested_window
 
@@ -54,10 +54,10 @@ def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
         empty = own.isna().to_numpy()
         bad = empty
         if meaning != "agent":
-            bad = ~np.isfinite(np.array(pd.to_numeric(own, errors="coerce"), dtype=float))
+            bad = ~np.isfinite(floats(own))
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
-            shown = "nothing" if empty[i] else repr(str(own.iloc[i])[:40])
+            shown = "nothing" if empty[i] else quoted(own.iloc[i])[:42]
             yield Finding(
                 "cells", "error",
                 f"column {column!r} ({meaning}) holds no number in {bad.sum()} of {len(own)} rows, "

@@ -154,14 +154,14 @@ class Table:
             raise DataError(
                 f"{self.path}: column {column!r} holds dates or durations; expected numbers"
             )
-        values = _floats(cells)
+        values = floats(cells)
         bad = ~np.isfinite(values)
         if empty:
             bad &= ~cells.isna().to_numpy()
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             cell = cells.iloc[i]
-            shown = "nothing" if cells.isna().iloc[i] else _quoted(cell)
+            shown = "nothing" if cells.isna().iloc[i] else quoted(cell)
             more = f" (and {bad.sum() - 1} more rows)" if bad.sum() > 1 else ""
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} holds {shown}{more}; expected a "
@@ -286,13 +286,14 @@ class Table:
         except (TypeError, ValueError):  # bytes that are no text, or lists in cells
             i = next(i for i, cell in enumerate(cells) if not absent[i] and _no_text(cell))
             raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells.iloc[i])}; "
+                f"{self.path}, {self.row(i)}: column {column!r} holds {quoted(cells.iloc[i])}; "
                 "expected a name or number"
             ) from None
         marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
         if marked.any():
             text = text.where(~marked, text[marked].map(csv_cell))
-        text = text.str.strip()
+        # NumPy takes text with zero characters behind it for the same text without them
+        text = text.str.rstrip("\0").str.strip()
         return np.asarray(text, dtype=object)
 
     def row(self, i: int) -> str:
@@ -317,12 +318,13 @@ class Table:
         return text + f"; rename the column that holds it to {key!r}"
 
 
-def _floats(cells: pd.Series) -> np.ndarray:
-    """Cells as float64, NaN where they hold no real number."""
-    if cells.dtype.kind == "c":
-        return np.full(len(cells), np.nan)
+def floats(cells: pd.Series) -> np.ndarray:
+    """A column's cells ``(rows,)`` as float64, NaN where they hold no real number."""
     try:
-        return np.array(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
+        found = pd.to_numeric(cells, errors="coerce")
+        if found.dtype.kind == "c":  # which would lose its imaginary part
+            return np.full(len(cells), np.nan)
+        return np.array(found, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # such as whole numbers beyond float64
         return np.array([_float(cell) for cell in cells])
 
@@ -342,7 +344,7 @@ def _no_text(cell: Any) -> bool:
     return False
 
 
-def _quoted(cell: Any) -> str:
+def quoted(cell: Any) -> str:
     """A cell for messages; whole numbers of thousands of digits cannot be written."""
     try:
         return repr(str(cell))

@@ -67,6 +67,9 @@ RECONSTRUCTED = {
 #: of one period tell differ by rounding: half of it (ms) parts them.
 APART = 7.5 * 60e3
 
+#: ms since 1970 that are exact as floating-point numbers.
+_LATEST = 2.0**53
+
 #: Hours by which the clocks of both freeways, in April and June, were behind UTC.
 BEHIND_UTC = 7
 
@@ -157,6 +160,12 @@ def _periods(table: Table) -> dict[str, Vehicles]:
     )
     roads = _roads(table, place, number.pop("Direction", None))
     start = number["Global_Time"] - 100 * number["Frame_ID"]  # ms at frame 0
+    odd = np.flatnonzero(~(np.abs(start) < _LATEST))
+    if odd.size:
+        raise DataError(
+            f"{table.path}, {table.row(int(odd[0]))}: Global_Time and Frame_ID put frame 0 at "
+            f"{start[odd[0]]:g} ms since 1970; correct them"
+        )
     found: dict[str, Vehicles] = {}
     for location in dict.fromkeys(place[roads]):
         own = roads[place[roads] == location]

@@ -28,6 +28,10 @@ log = logging.getLogger(__name__)
 HOLE = 1.5
 
 
+#: Times are counted in steps up to this number: it is exact, and adding to it as well.
+_LATEST = 2.0**52
+
+
 @dataclass(frozen=True, kw_only=True)
 class Vehicles:
     """Rows of one recording, one per vehicle and time, in any order and in SI units.
@@ -186,6 +190,13 @@ def _stints(
     """Every vehicle's stays by lane, on the reference time grid."""
     vehicle, lane = recording.vehicle, recording.lane
     length, kind = recording.length, recording.kind
+    far = np.flatnonzero(~(np.abs(recording.time) < _LATEST * options.dt))
+    if far.size:
+        raise DataError(
+            f"{recording.path}, {recording.row(int(far[0]))}: the time is "
+            f"{recording.time[far[0]]:g} s, which steps of {options.dt:g} s cannot count; "
+            "correct it"
+        )
     ids, code = np.unique(vehicle.astype(str), return_inverse=True)
     order = np.lexsort((recording.time, code))
     time, x, code = recording.time[order], recording.x[order], code[order]

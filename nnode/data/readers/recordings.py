@@ -5,13 +5,43 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from nnode.data import download
 from nnode.data.options import DataOptions
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError, DataError
+from nnode.errors import ConfigError, DataError, NNodeError
+
+#: What Python and its libraries raise for contents that no reader expects.
+FOREIGN = (
+    ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError,
+    TypeError, ValueError,
+)  # fmt: skip
+
+
+@contextmanager
+def reading(what: object) -> Iterator[None]:
+    """Errors of Python and its libraries become the package's own.
+
+    The readers have their own words for what they know to be wrong. This is for the rest.
+
+    Args:
+        what: is read; for the message.
+
+    Raises:
+        DataError: with the name and the text of the other error.
+    """
+    try:
+        yield
+    except NNodeError:
+        raise
+    except FOREIGN as error:
+        raise DataError(
+            f"{what} cannot be read ({type(error).__name__}: {error}); it holds something that no "
+            "reader expects: look for cells that are no numbers, names or times"
+        ) from error
 
 
 class Reading(list[Sequence]):

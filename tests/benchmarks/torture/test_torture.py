@@ -12,6 +12,7 @@ from benchmarks.torture.fuzz import fuzz
 from benchmarks.torture.jobs import jobs
 from benchmarks.torture.report import Row, keep
 from benchmarks.torture.targets import Target
+from nnode.errors import DataError
 from tests.app.conftest import Script, composed
 
 
@@ -25,9 +26,9 @@ def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
 
 @pytest.mark.thorough
 def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
-    found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=800")
+    found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=1150")
     assert found["tried"]["kills"] == 6
-    assert found["tried"]["fuzz"] == 800
+    assert found["tried"]["fuzz"] == 1150
     assert found["tried"]["disk"] >= 6
     assert found["tried"]["folder"] >= 2
     rows = {(row["campaign"], row["what"]): row for row in found["rows"]}
@@ -78,6 +79,29 @@ def test_a_reader_that_misbehaves_is_a_loss(
     assert f"did open {outside}" in words
     assert "MemoryError" in words
     assert len(found.losses) == 16 - found.read + sum("did open" in w for w in found.losses)
+
+
+def test_a_message_that_is_long_or_that_a_terminal_obeys_is_a_loss(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(path: Path) -> None:
+        error = DataError("plain")
+        error.args = (
+            ("x" * 2001, "\x1b[31m", "soft\xad", "größe\n\tm²")[path.read_bytes()[0] % 4],
+        )
+        raise error
+
+    from benchmarks.torture import fuzz as campaign
+
+    bad = Target("bad", "bad.bin", [bytes(8)], lambda data, rng: rng.randbytes(8), read)
+    monkeypatch.setattr(campaign, "targets", lambda *_: [bad])
+    found = fuzz(tmp_path, 24, 0)[0]
+    words = " ".join(found.losses)
+    assert found.tried == found.refused == 24
+    assert "a message of 2001 characters" in words
+    assert r"a message with '\x1b'" in words
+    assert r"a message with '\xad'" in words
+    assert len(found.losses) < 24
 
 
 def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:

@@ -1,0 +1,139 @@
+"""Cells and columns that no reader expects are told, whatever pandas makes of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import nnode
+from nnode.data.options import NgsimOptions, OpenAccOptions, SumoOptions, VehicleTableOptions
+from nnode.data.readers.columns import Table, floats
+from nnode.data.readers.ngsim import read_ngsim
+from nnode.data.readers.openacc import read_openacc
+from nnode.data.readers.recordings import reading
+from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.vehicles import read_vehicles
+from nnode.errors import ConfigError, DataError
+
+
+def lane() -> pd.DataFrame:
+    k, n = (m.ravel() for m in np.meshgrid(np.arange(20), np.arange(3), indexing="ij"))
+    agent = [f"c{i}" for i in n]
+    x = 25.0 * n + 3.0 * k
+    return pd.DataFrame({"sequence": "s", "time": 0.2 * k, "agent": agent, "x": x, "note": "-"})
+
+
+def cells(value: Any) -> pd.Series:
+    return pd.Series([value] * 60, dtype=object)
+
+
+def test_two_columns_of_one_name() -> None:
+    table = lane()
+    with pytest.raises(DataError, match="2 columns 'x'; give every column a name of its own"):
+        nnode.sequences(pd.concat([table, table[["x"]]], axis=1))
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "found"),
+    [
+        ("x", 10**400, "'1000000"),
+        pytest.param("x", 10**5000, "too large", id="huge"),
+        ("x", 1j, "'1j'"),
+        ("x", [1, 2], r"'\[1, 2\]'"),
+        ("x", np.array([1.0, 2.0]), r"'\[1\. 2\.\]'"),
+        ("agent", b"a\xff", r"b'a\\xff'|b'a\\\\xff'"),
+    ],
+)
+def test_cells_that_are_no_number_or_name(column: str, value: Any, found: str) -> None:
+    with pytest.raises(DataError, match=rf"table, row 1: column '{column}' holds .*{found}"):
+        nnode.sequences(lane().assign(**{column: cells(value)}))
+
+
+def test_complex_numbers_keep_no_real_part() -> None:
+    assert np.isnan(floats(pd.Series([1 + 2j]))).all()
+
+
+@pytest.mark.parametrize("value", [{}, [1], np.array([1, 2]), b"a\xff", 10**400], ids=str)
+def test_cells_of_columns_that_are_not_read_may_be_anything(value: Any) -> None:
+    assert len(nnode.sequences(lane().assign(note=cells(value)))) == 1
+
+
+def test_zero_characters_do_not_make_two_names_of_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    lane().to_csv(path, index=False)
+    path.write_bytes(path.read_bytes().replace(b"c1,75.0", b"c1\0,75.0"))
+    assert "c1" in list(Table(path).names("agent"))
+    assert not any("\0" in name for name in Table(path).names("agent"))
+
+
+def test_what_nobody_thought_of_names_the_file() -> None:
+    with (
+        pytest.raises(DataError, match=r"a\.csv cannot be read \(KeyError: 'q'\)"),
+        reading("a.csv"),
+    ):
+        raise KeyError("q")
+    with pytest.raises(ConfigError, match=r"^own$"), reading("a.csv"):
+        raise ConfigError("own")
+
+
+def platoon(folder: Path, row: str) -> Path:
+    rows = [f"r,{p},{0.1 * i:.1f},10,15" for p in (1, 2, 3) for i in range(12)]
+    path = folder / "flat.csv"
+    path.write_text("\n".join(["run,position,t,v,gap", *rows, row]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("position", ["2147483648", "1001", "-4", "0", "1.5", "1e300"])
+def test_a_place_in_the_platoon_that_is_none(tmp_path: Path, position: str) -> None:
+    path = platoon(tmp_path, f"r,{position},0.5,10,15")
+    with pytest.raises(DataError, match=r"line 38: position is .* whole number from 1 to 1000"):
+        read_openacc({path.name: path}, OpenAccOptions(path=str(path), min_duration=0.3))
+
+
+def test_a_time_that_asks_for_a_table_of_its_own(tmp_path: Path) -> None:
+    path = platoon(tmp_path, "r,1000,90000.0,10,15")
+    with pytest.raises(DataError, match=r"wrong, or cut the file"):
+        read_openacc({path.name: path}, OpenAccOptions(path=str(path), min_duration=0.3))
+
+
+@pytest.mark.parametrize("encoding", ["inf", "utf-7", "shift_jis", "idna"])
+def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "a.xml"
+    path.write_text(
+        f'<?xml version="1.0" encoding="{encoding}"?>\n<fcd-export>\n<timestep time="0">'
+        '<vehicle id="a" lane="e_0" pos="1" speed="1"/></timestep>\n</fcd-export>\n'
+    )
+    with pytest.raises(DataError):
+        read_sumo(path, SumoOptions(path=str(path)))
+
+
+def test_a_time_that_steps_cannot_count(tmp_path: Path) -> None:
+    path = tmp_path / "a.xml"
+    moments = [
+        f'<timestep time="{t}"><vehicle id="a" lane="e_0" pos="{i}" speed="1"/></timestep>'
+        for i, t in enumerate(("0", "0.5", "1", "1.5", "4e38"))
+    ]
+    path.write_text(f"<fcd-export>{''.join(moments)}</fcd-export>")
+    with pytest.raises(DataError, match=r"line 1: the time is 4e\+38 s, which steps"):
+        read_sumo(path, SumoOptions(path=str(path), dt=0.5))
+
+
+def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:
+    from benchmarks.torture.formats import ngsim
+
+    path = tmp_path / "a.csv"
+    path.write_bytes(ngsim().replace(b",1113433135100,", b",1e308,", 1))
+    with pytest.raises(DataError, match=r"line 2: Global_Time and Frame_ID put frame 0 at 1e\+308"):
+        read_ngsim(path, NgsimOptions(path=str(path)))
+
+
+def test_vehicles_with_numbers_of_thousands_of_digits(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("vehicle,time,x\n" + "".join(f"{n},0,{'9' * 5000}\n" for n in range(4)))
+    with pytest.raises(DataError, match="holds") as told:
+        read_vehicles(path, VehicleTableOptions(path=str(path)))
+    assert len(str(told.value)) <= 2000
