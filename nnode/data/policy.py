@@ -99,8 +99,8 @@ def without(
         why = Counter(entry["why"] for entry in left_out)
         listed = "; ".join(f"{text} in {n}" for text, n in why.most_common(LISTED))
         told.append(
-            f"{len(left_out)} records are left out, there is no sequence of them: {listed} "
-            f"(first {left_out[0]['name']})"
+            f"records that are left out, as there is no sequence of them: {len(left_out)} "
+            f"({listed}; first {left_out[0]['name']})"
         )
     if dropped:
         kinds = Counter(kind for d in dropped for kind in {r["kind"] for r in d["reasons"]})

@@ -60,12 +60,13 @@ def test_select_keeps_everything_of_the_chosen_agents() -> None:
         ({"time": np.zeros(5)}, r"time must be \(4,\)"),
         ({"v": np.zeros((4, 2, 1))}, r"v must be \(4, 3, 1\)"),
         ({"length": np.zeros(2)}, r"length must be \(3,\)"),
+        ({"length": np.array([4.0, np.nan, -4.0])}, r"a length is -4 m, expected a positive"),
         ({"destination": np.zeros((3, 2))}, r"destination must be \(3, 1\)"),
         ({"agents": ("a", "b")}, "agents must name 3 agents, got 2"),
         ({"kind": ("car",)}, "kind must name 3 agents, got 1"),
     ],
 )
-def test_wrong_shapes_are_refused_by_name(change: dict[str, object], message: str) -> None:
+def test_wrong_shapes_and_lengths_are_refused(change: dict[str, object], message: str) -> None:
     fields: dict[str, object] = {
         "name": "rec/7",
         "recording": "rec",

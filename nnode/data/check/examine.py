@@ -16,9 +16,10 @@ from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.scale import Medians, Scale, medians, scales
 from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
 from nnode.data.check.tracks import LAG, Tracks, tracks_from, tracks_of
+from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import Fault, find_faults
-from nnode.data.readers.recordings import reading
+from nnode.data.readers.recordings import Reading, reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.errors import DataError, NNodeError
@@ -339,7 +340,10 @@ def _read(source: Source) -> list[Sequence]:
 def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:
     """The sequences that the reader makes; what it refuses is a finding."""
     try:
-        return _read(source)
+        made = _read(source)
+        left_out = made.left_out if isinstance(made, Reading) else []
+        findings += [Finding("left_out", "warning", text) for text in without(made, [], left_out)]
+        return made
     except NNodeError as error:
         findings.append(Finding("reader", "error", f"data={source.group} refuses it: {error}"))
         return []

@@ -236,8 +236,8 @@ class Table:
             unit: s, of numbers.
 
         Returns:
-            The origin in ns: of numbers see 0 or, of times since 1970, the first of them; otherwise
-            the first one.
+            The origin in ns: of dates the first one, of numbers 0, or the first one of those in
+            ms, us or ns since 1970.
 
         Raises:
             DataError: a cell without such; names the row.
@@ -360,11 +360,12 @@ def _since_first(values: np.ndarray, unit: float) -> tuple[int, np.ndarray]:
         unit: s.
 
     Returns:
-        The origin in ns, and ``(rows,)`` s after it. It is 0, and for times since 1970 (beyond
-        :data:`EPOCH`) the first of them, as their differences would be rounded otherwise.
+        The origin in ns, and ``(rows,)`` s after it. It is 0, and for units below a second and
+        times since 1970 (beyond :data:`EPOCH`) the first of them, as their differences would be
+        rounded otherwise.
     """
     first = values.min()
-    if first * unit < EPOCH:
+    if unit == 1.0 or first * unit < EPOCH:
         return 0, values * unit
     return round(int(first) * (unit * 1e9)), (values - int(first)) * unit
 

@@ -133,7 +133,7 @@ def read_table(
             order = np.argsort(first, kind="stable")
             at, known, people = at[:, order], known[:, order], [people[j] for j in order]
         owner = np.array([column[column >= 0][0] for column in at.T])
-        for key, column in {**values, **words}.items():
+        for key, column in (*values.items(), *words.items()):
             if key not in axes:
                 _constant(table, key, column, at, owner)
         x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)

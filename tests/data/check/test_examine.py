@@ -286,6 +286,17 @@ def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, 
     assert np.abs(speeds - found.sequences[0].v[:, 0, 0]).max() < 0.5
 
 
+def test_pairs_that_are_left_out_are_a_finding(tmp_path: Path) -> None:
+    table = spaced({"position": 1.0, "speed": 1.0})
+    short = table[(table["event"] == 0) & (table["split"] == "test")]
+    table = pd.concat([table, short.iloc[:2].assign(event=7)])
+    told = said(examine(saved(table, tmp_path, "pairs.csv")), "warning")
+    assert told["left_out"] == (
+        "records that are left out, as there is no sequence of them: 1 (fewer than "
+        "data.min_samples=3 times in 1; first test/7)"
+    )
+
+
 DATES = {
     "dates": lambda t: (pd.Timestamp("2020-01-01 23:00") + pd.to_timedelta(t, unit="s")).astype(
         str

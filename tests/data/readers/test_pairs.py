@@ -274,7 +274,7 @@ def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptur
     assert [entry["sequence"] for entry in store.manifest["dropped"]] == ["pairs/4"]
     assert store.manifest["counts"] == {"read": 2, "kept": 1, "dropped": 1}
     said = " ".join(record.getMessage() for record in caplog.records)
-    assert "2 records are left out" in said
+    assert "records that are left out, as there is no sequence of them: 2 (" in said
     assert "1 of 2 sequences are left out for their faults: overlap in 1" in said
 
     store = prepare(PairOptions(path=str(path), window=4.0), tmp_path / "store")

@@ -110,6 +110,13 @@ def test_epochs_are_refused_with_the_unit_that_reads_them(
         np.testing.assert_allclose(own.x, other, rtol=0, atol=shift)
 
 
+def test_seconds_stay_as_they_are() -> None:
+    """Predictions have the times of the table, so that both can be joined."""
+    table = tidy().assign(time=1_577_865_600.0 + tidy().time)
+    predicted = Calibrator("lin", epochs=1).fit(table).predict(table).to_dataframe()
+    assert set(predicted.time) == set(table.time)
+
+
 def test_short_sequences_since_1970_have_one_interval() -> None:
     """Seconds since 1970 are rounded to 2e-7 s: three samples would give intervals that differ."""
     parts = []

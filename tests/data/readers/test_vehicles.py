@@ -46,6 +46,21 @@ def test_order_times_and_positions(platoon: Path) -> None:
     np.testing.assert_allclose(s.x[:, :, 0], s.time[:, None] * 10 + [0, 30, 60], atol=1e-9)
 
 
+def test_the_order_of_rows_changes_nothing(platoon: Path) -> None:
+    found = read(platoon, window=1.0)
+    save(platoon, pd.read_csv(platoon).sample(frac=1.0, random_state=0))
+    for own, other in zip(read(platoon, window=1.0), found, strict=True):
+        assert (own.name, own.agents) == (other.name, other.agents)
+        np.testing.assert_array_equal(own.x, other.x)
+
+
+@pytest.mark.parametrize("length", [0.0, -4.5])
+def test_lengths_are_positive(platoon: Path, length: float) -> None:
+    save(platoon, pd.read_csv(platoon).assign(length=length))
+    with pytest.raises(DataError, match=r"line 2: column 'length' holds .*expected a positive"):
+        read(platoon)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_units_map_and_attributes(tmp_path: Path, suffix: str) -> None:
     parts = []
