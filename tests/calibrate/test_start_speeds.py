@@ -136,8 +136,8 @@ def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
 
 
 def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
-    """Platoons of four by idm (v0 = 30, T = 1.4, s0 = 2, a = 1.2, b = 1.5), Heun's method at 0.02 s,
-    behind leaders of many speeds, with noise that is new at every 0.1 s."""
+    """Platoons of four by idm (v0 = 30, T = 1.4, s0 = 2, a = 1.2, b = 1.5), Heun's method at
+    0.02 s, behind leaders of many speeds, with noise that is new at every 0.1 s."""
     rng, h, found = np.random.default_rng(seed), 0.02, []
     for number in range(8):
         t = h * np.arange(2001)
