@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from nnode.data.options import LoaderOptions
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.sequences import Sequences
-from nnode.data.smooth import Noise, measured_noise, smooth_speeds
+from nnode.data.smooth import Noise, measured_noise, smooth_speeds, suggested_window
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
@@ -26,16 +26,18 @@ class SmoothSpeeds:
 
     Args:
         source: the sequences as they were measured.
+        window: s, see :func:`nnode.data.smooth.smooth_speeds`.
     """
 
-    def __init__(self, source: Store | Sequences) -> None:
+    def __init__(self, source: Store | Sequences, window: float) -> None:
         self.source, self.index, self.manifest = source, source.index, source.manifest
+        self.window = window
 
     def __len__(self) -> int:
         return len(self.source)
 
     def __getitem__(self, i: int) -> Sequence:
-        return smooth_speeds(self.source[i])
+        return smooth_speeds(self.source[i], self.window)
 
     def __iter__(self) -> Iterator[Sequence]:
         return (self[i] for i in range(len(self)))
@@ -71,7 +73,8 @@ def sound_speeds(source: Source, domain: str, order: int) -> Source:
     asked = options.get("start_speeds", "measured") != "measured"
     if domain != "traffic" or order < 2 or asked or isinstance(source, SmoothSpeeds):
         return source
-    return SmoothSpeeds(source) if noise_of(source).beyond else source
+    noise = noise_of(source)
+    return SmoothSpeeds(source, suggested_window(noise, source[0].dt)) if noise.beyond else source
 
 
 class SequenceDataset(torch.utils.data.Dataset[Sequence]):

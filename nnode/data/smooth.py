@@ -126,17 +126,20 @@ def suggested_window(noise: Noise, dt: float) -> float:
     return WINDOWS[-1]
 
 
-def smooth_speeds(sequence: Sequence) -> Sequence:
-    """A sequence with the speeds of local cubics of START s in place of the measured ones.
+def smooth_speeds(sequence: Sequence, window: float) -> Sequence:
+    """A sequence with the speeds of local cubics in place of the measured ones.
 
     First speeds are those of :func:`start_smoothed`. Positions stay as they are. It is what a
     simulation gets where the noise is :attr:`Noise.beyond`: the vehicle in front, whose measured
     speed acts on the others at every time, as well as those that start.
+
+    Args:
+        window: s, of the cubics, such as that of :func:`suggested_window`.
     """
     v = sequence.velocity().copy()
     for n in range(sequence.n_agents):
         for d in range(v.shape[2]):
-            v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], START)[1]
+            v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], window)[1]
     if v.shape[2] == 1:
         v = np.maximum(v, 0.0)
     return start_smoothed(replace(sequence, v=v))

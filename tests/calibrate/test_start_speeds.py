@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -119,3 +121,70 @@ def test_parabolas_tell_first_speeds() -> None:
     assert start_smoothed(short) is short
     found = nnode.sequences(pairs(number=2, seconds=5.0), data="pairs", start_speeds="smoothed")
     assert found.manifest["options"]["start_speeds"] == "smoothed"
+
+
+def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
+    """From far parameters first speeds go far, where steps without damping got stuck."""
+    sequences = driven()
+    row = np.array(list(HELLY.values()))
+    batch = collate(sequences)
+    given = TangentCost(known(), batch, FusedSolver(), Convention.integral)
+    fitted = StartSpeedCost(known(), batch, FusedSolver(), Convention.integral)
+    fitted(row * 3.0)
+    fitted(row * 0.2)
+    assert (fitted.costs(row) <= given.costs(row) + 1e-9).all()
+
+
+def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
+    """Platoons of four by idm (v0 = 30, T = 1.4, s0 = 2, a = 1.2, b = 1.5), Heun's method at
+    0.02 s, behind leaders of many speeds, with noise that is new at every 0.1 s."""
+    rng, h, found = np.random.default_rng(seed), 0.02, []
+    for number in range(8):
+        t = h * np.arange(2001)
+        # m/s, 6 to 34, accelerations up to 1.5 m/s²
+        parts = [(9.0, 0.11, 0.3 * number), (3.0, 0.35, 1.7 * number), (1.5, 0.8, number)]
+        lead = 20 + sum(size * np.sin(w * t + p) for size, w, p in parts)
+        place = np.concatenate([[0.0], np.cumsum((lead[1:] + lead[:-1]) / 2 * h)])
+
+        def rate(x: np.ndarray, v: np.ndarray, ahead: float, pace: float) -> np.ndarray:
+            before, speed = np.append(x[1:], ahead), np.append(v[1:], pace)
+            wish = 2 + np.maximum(0, 1.4 * v + v * (v - speed) / (2 * np.sqrt(1.2 * 1.5)))
+            return 1.2 * (1 - (v / 30) ** 4 - (wish / (before - x - 4.5)) ** 2)
+
+        v = np.full(3, lead[0]) + rng.normal(size=3)
+        x = -np.cumsum(4.5 + (2 + 1.4 * v[::-1]) * rng.uniform(0.8, 1.6, 3))[::-1]
+        path = np.empty((401, 4))
+        for k in range(2001):
+            if k % 5 == 0:
+                path[k // 5] = [*x, place[k]]
+            if k < 2000:
+                a = rate(x, v, place[k], lead[k])
+                then = rate(x + h * v, v + h * a, place[k + 1], lead[k + 1])
+                x, v = x + h * v + h**2 / 2 * a, v + h / 2 * (a + then)
+        path += sigma * rng.normal(size=path.shape)
+        length = np.full(4, 4.5)
+        found.append(
+            Sequence(
+                name=f"s{number}", recording=f"r{number}", time=0.1 * np.arange(401),
+                x=path[..., None], length=length,
+            )
+        )  # fmt: skip
+    return found
+
+
+@pytest.mark.thorough
+def test_noise_of_0_3_m_does_not_bias_what_is_fitted_by_default() -> None:
+    table = noisy(0.3)
+    own = nnode.Calibrator("idm", leader="measured", method="rk4").fit(table)
+    estimate = own.parameters_["estimate"]
+    wanted = {"v0": 30.0, "T": 1.4, "s0": 2.0, "a": 1.2, "b": 1.5}
+    for name, value in wanted.items():
+        assert estimate[f"idm.{name}"] == pytest.approx(value, rel=0.1), name
+    assert own.result_.noise.position == pytest.approx(0.3, rel=0.1)
+    assert own.result_.start_speeds["kind"] == "fitted"
+    assert "speeds are those of smoothed paths" in own.result_.summary()
+    given = [replace(s, v=np.maximum(s.velocity(), 0.0)) for s in table]
+    raw = nnode.Calibrator("idm", leader="measured", method="rk4", start_speeds="given").fit(given)
+    away = raw.parameters_["estimate"] / np.array(list(wanted.values())) - 1
+    assert away.abs().max() > 0.1
+    assert "estimates are biased" in raw.result_.summary()

@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 from scipy.io import savemat
@@ -226,10 +227,65 @@ def test_absent_vehicle_makes_the_sequence_faulty(tmp_path: Path) -> None:
         if not (s == "b" and a == 1 and k > 2)
     ]
     (tmp_path / "t.csv").write_text("sequence,time,agent,x\n" + "\n".join(rows))
-    options = TableOptions(domain="traffic", path=str(tmp_path / "t.csv"), faults=Faults.keep)
+    options = TableOptions(
+        domain="traffic", path=str(tmp_path / "t.csv"), faults=Faults.keep, max_hole=0.1
+    )
     store = prepare(options, tmp_path / "out")
     assert [s.name for s in store] == ["t/a"]
     assert store.manifest["recordings"]["t"]["faulty"] == {"gap_in_time": 1}
+
+
+def test_two_percent_of_missing_samples_cost_no_platoon(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    time = 0.1 * np.arange(100)
+    rows = pd.DataFrame(
+        [
+            (f"s{s}", t, a, 30 * a + 15 * t + 6 * np.sin(0.5 * t + s))
+            for s in range(8)
+            for a in range(4)
+            for t in time
+        ],
+        columns=["sequence", "time", "agent", "x"],
+    )
+    path = tmp_path / "t.csv"
+    rows[rng.random(len(rows)) > 0.02].to_csv(path, index=False)
+    store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
+    assert len(store) == 8
+    told = store.manifest["filled"]
+    assert sum(one["samples"] for one in told) == pytest.approx(0.02 * len(rows), rel=0.3)
+    assert {one["sequence"] for one in told} <= {s.name for s in store}
+    # what is longer is not filled, and no hint leads to a refusal
+    gone = rows[~(rows.time.between(3, 5) & (rows.agent == 1))]
+    gone.to_csv(path, index=False)
+    with pytest.raises(DataError, match=r"data\.max_hole=SECONDS") as error:
+        prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
+    assert "faults=keep" not in str(error.value)
+
+
+def test_noise_stands_in_the_manifest_and_is_no_fault(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    time = 0.1 * np.arange(200)
+    rows = pd.DataFrame(
+        [
+            (f"s{s}", t, a, 30 * a + 4 * t + 0.3 * rng.normal())
+            for s in range(5)
+            for a in range(3)
+            for t in time
+        ],
+        columns=["sequence", "time", "agent", "x"],
+    )
+    path = tmp_path / "t.csv"
+    rows.to_csv(path, index=False)
+    options = TableOptions(domain="traffic", path=str(path))
+    store = prepare(options, tmp_path / "out")
+    # steps of -0.5 m are common where cars drive slowly: none of them is a fault
+    assert len(store) == 5
+    assert store.manifest["noise"]["position"] == pytest.approx(0.3, rel=0.1)
+    assert store.manifest["noise"]["start_speed"] == pytest.approx(0.3 * 2**0.5 / 0.1, rel=0.1)
+    options.smooth = 2.0
+    smooth = prepare(options, tmp_path / "smooth")
+    assert smooth.manifest["noise"]["start_speed"] < 0.2
+    assert np.std(smooth[0].x[:, 0, 0] - 4 * time) < 0.15
 
 
 def test_one_data_set_has_one_sampling_interval(tmp_path: Path) -> None:

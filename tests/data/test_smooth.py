@@ -13,7 +13,7 @@ from nnode.data.options import NgsimOptions, VehicleTableOptions
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import smooth
+from nnode.data.smooth import BEARABLE, bridge, fill, measured_noise, smooth
 from nnode.errors import ConfigError
 
 DOCS = Path(__file__).parents[2] / "docs" / "data.md"
@@ -142,3 +142,43 @@ def test_the_page_s_figures_on_a_reconstructed_table(real_data: Path, window: fl
         *(spread(np.concatenate([acceleration(s).ravel() for s in own])) for own in (raw, found)),
     ]
     assert row(f"NGSIM, `data.smooth={window:g}`") == pytest.approx(figures, abs=0.0006)
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0])
+@pytest.mark.parametrize("sigma", [0.02, 0.1, 0.3])
+def test_the_noise_of_positions_is_found(rate: float, sigma: float) -> None:
+    rng = np.random.default_rng(int(100 * sigma + rate))
+    time = np.arange(int(50 * rate)) / rate
+    # accelerations up to 1.5 m/s², corrections of 5 s among them
+    paths = [
+        14 * time + 0.6 * np.sin(2 * np.pi * time / 5 + p) + 30 * np.sin(0.15 * time + 2 * p)
+        for p in range(20)
+    ]
+    x = np.stack(paths, 1)[..., None]
+    x = x + sigma * rng.normal(size=x.shape)
+    x[100, 3] += 40.0  # outliers do not matter
+    found = measured_noise([Sequence(name="a", recording="a", time=time, x=x)])
+    assert found.position == pytest.approx(sigma, rel=0.05)
+    assert found.start_speed == pytest.approx(np.sqrt(2) * sigma * rate, rel=0.05)
+    assert found.beyond == (found.start_speed > BEARABLE)
+
+
+def test_a_hole_does_not_bias_speeds() -> None:
+    time = 0.1 * np.arange(60)
+    x = 10 * time + 0.5 * 1.5 * time**2
+    lacking = x.copy()
+    lacking[20:25] = np.nan
+    found, filled = fill(lacking[:, None, None], 0.1, 0.5)
+    np.testing.assert_allclose(found[:, 0, 0], x, atol=1e-9)
+    assert filled[:, 0].nonzero()[0].tolist() == [20, 21, 22, 23, 24]
+    line = np.interp(time, time[~filled[:, 0]], x[~filled[:, 0]])
+    assert (np.diff(x) - np.diff(line))[19] / 0.1 < -0.3  # m/s, the bias of a straight line
+    longer = x.copy()
+    longer[20:26] = np.nan
+    assert not fill(longer[:, None, None], 0.1, 0.5)[1].any()
+    whole, places, added = bridge(
+        np.delete(time, range(20, 25)), np.delete(x, range(20, 25))[:, None], 0.5
+    )
+    np.testing.assert_allclose(whole, time, atol=1e-9)
+    np.testing.assert_allclose(places[:, 0], x, atol=1e-9)
+    assert len(added) == 5

@@ -104,7 +104,7 @@ def test_recordings_are_chosen_by_name(tmp_path: Path) -> None:
 
 def test_an_absent_agent_is_a_gap(tmp_path: Path) -> None:
     late = rows("s", "late", LINE + 50).iloc[2:]
-    (s,) = read(tmp_path, rows("s", "a", LINE), late)
+    (s,) = read(tmp_path, rows("s", "a", LINE), late, max_hole=0.1)
     np.testing.assert_array_equal(np.isnan(s.x[:, 1, 0]), [True, True, False, False, False])
     (fault,) = find_faults(s, "traffic")
     assert (fault.kind, fault.agents) == ("gap_in_time", (1,))
@@ -130,9 +130,50 @@ def test_walls(tmp_path: Path) -> None:
 
 def test_uneven_times(tmp_path: Path) -> None:
     part = rows("s", "a", LINE)
-    part.loc[3:, "time"] += 0.1
-    with pytest.raises(DataError, match=r"line 5: sequence own/s steps from 0.2 s to 0.4 s"):
+    part.loc[3:, "time"] += 0.05
+    with pytest.raises(DataError, match=r"line 5: sequence own/s steps from 0.2 s to 0.35 s"):
         read(tmp_path, part)
+
+
+def driven(*, cars: int = 3, samples: int = 80) -> pd.DataFrame:
+    """Cars that accelerate and brake by up to 1.5 m/s²."""
+    time = 0.1 * np.arange(samples)
+    x = 15 * time + 6 * np.sin(0.5 * time)
+    parts = [rows("s", f"c{i}", x + 30 * i) for i in range(cars)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_short_holes_are_filled(tmp_path: Path) -> None:
+    table = driven()
+    (whole,) = read(tmp_path, table)
+    assert whole.filled == 0
+    lacking = table.drop(index=[90, 91, 92, 93, 94])  # of one car
+    lacking = lacking[~lacking.time.between(5.95, 6.25)]  # of all cars
+    lacking.loc[20, "x"] = np.nan
+    (s,) = read(tmp_path, lacking)
+    np.testing.assert_allclose(s.time, whole.time, atol=1e-9)
+    assert s.filled == 5 + 3 * 3 + 1
+    np.testing.assert_allclose(s.x, whole.x, atol=2e-3)
+    # a straight line would start late by half the change of speed over the hole
+    np.testing.assert_allclose(np.diff(s.x, axis=0), np.diff(whole.x, axis=0), atol=2e-3)
+    (kept,) = read(tmp_path, lacking, max_hole=0.0)
+    assert {fault.kind for fault in find_faults(kept, "traffic")} == {"gap_in_time"}
+
+
+def test_a_platoon_begins_when_all_are_there(tmp_path: Path) -> None:
+    late = driven().drop(index=[80, 81, 82, 239])
+    (s,) = read(tmp_path, late)
+    assert (s.time[0], s.time[-1]) == (pytest.approx(0.3), pytest.approx(7.8))
+    assert s.filled == 0
+    assert not np.isnan(s.x).any()
+
+
+def test_a_long_hole_is_a_fault_of_its_sequence(tmp_path: Path) -> None:
+    table = driven()
+    other = table.assign(sequence="other")
+    first, second = read(tmp_path, table[~table.time.between(3.95, 5.05)], other)
+    assert "gap_in_time" in {fault.kind for fault in find_faults(first, "traffic")}
+    assert find_faults(second, "traffic") == []
 
 
 def test_one_agent_twice(tmp_path: Path) -> None:
