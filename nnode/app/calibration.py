@@ -264,11 +264,11 @@ def _by_tangents(
     # compiled code takes a second to import
     from nnode.calibrate.gauss_newton.intervals import intervals
     from nnode.calibrate.gauss_newton.pooling import own_parameters
-    from nnode.calibrate.gauss_newton.start_speeds import COSTS
+    from nnode.calibrate.gauss_newton.start_speeds import cost_of
     from nnode.solvers.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
-    make = partial(COSTS[options.start_speeds], solver=trainer.solver, convention=options.cost)
+    make = partial(cost_of, options.start_speeds, solver=trainer.solver, convention=options.cost)
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))

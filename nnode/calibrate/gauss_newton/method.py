@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,8 +60,18 @@ class TangentCost(Problem):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        system, batch = self.system, self.batch
-        lane = lanes.supports(system, batch)
+        system = self.system
+        self._places = {s: at for s, at in self._owned().items() if at[0] in self._own}
+        self.names = list(self._places)
+        limits, free = system.bounds(), Interval()
+        bounds = [limits.get(name, free) for name, _, _ in self._places.values()]
+        self.low = np.array([b.low for b in bounds])
+        self.high = np.array([b.high for b in bounds])
+        self.start = np.clip(self.row(system), self.low, self.high)
+
+    def _owned(self) -> dict[str, Any]:
+        """Symbols of the formula's parameters to where they are in the model."""
+        lane = lanes.supports(self.system, self.batch)
         added = [] if lane is None else list(lane.rates)[lane.order :]
         if lane is None or any(state not in lane.starts for state in added):
             raise ConfigError(
@@ -69,13 +80,7 @@ class TangentCost(Problem):
                 "nnode.calibrate.least_squares, which takes differences"
             )
         self.lane = lane
-        self._places = {s: at for s, at in lane.owned.items() if at[0] in self._own}
-        self.names = list(self._places)
-        limits, free = system.bounds(), Interval()
-        bounds = [limits.get(name, free) for name, _, _ in self._places.values()]
-        self.low = np.array([b.low for b in bounds])
-        self.high = np.array([b.high for b in bounds])
-        self.start = np.clip(self.row(system), self.low, self.high)
+        return lane.owned
 
     def row(self, system: System) -> np.ndarray:
         """``(P,)`` the parameters of a system of the same model."""

@@ -61,19 +61,18 @@ class GaussNewton(Optimizer):
         """Say what the next step lowers.
 
         Raises:
-            ConfigError: another solver than the compiled one, or a model that is no formula of a
-                lane.
+            ConfigError: another solver than the compiled one, or a model that is no formula.
         """
         if self._batch is batch:
             return
         self._batch = batch
         # compiled code takes a second to import
-        from nnode.calibrate.gauss_newton.start_speeds import COSTS
+        from nnode.calibrate.gauss_newton.start_speeds import cost_of
         from nnode.solvers.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
-        self._cost = COSTS[starts](self.system, self.started(batch), solver, convention)
+        self._cost = cost_of(starts, self.system, self.started(batch), solver, convention)
 
     def started(self, batch: Batch) -> Batch:
         """A batch with the first speeds that were fitted to its sequences, if any were."""

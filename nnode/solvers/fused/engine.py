@@ -99,15 +99,17 @@ class FusedSolver:
             DataError: the batch is of another domain, or has no sampling interval.
             SimulationError: a simulated state is not a finite number.
         """
+        return check_finite(self.unchecked(system, batch), batch)
+
+    def unchecked(self, system: System, batch: Batch) -> Trajectory:
+        """The same, with states that are not finite among them."""
         n = self._substeps(system, batch)
         lane = lanes.supports(system, batch)
-        if lane is not None:
-            near, origin = simulated_batch(system, batch)
-            y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
-            found = observed(system, y, batch, origin)
-        else:
-            found = self._other(system, batch, n)
-        return check_finite(found, batch)
+        if lane is None:
+            return self._other(system, batch, n)
+        near, origin = simulated_batch(system, batch)
+        y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
+        return observed(system, y, batch, origin)
 
     def ensemble(
         self, system: System, parameters: Mapping[str, Tensor], batch: Batch
@@ -139,7 +141,7 @@ class FusedSolver:
         found = []
         for r in range(len(next(iter(stacked.values())))):
             own = {name: value[r] for name, value in stacked.items()}
-            found.append(self._other(_replaced(system, own), batch, n))
+            found.append(self._other(replaced(system, own), batch, n))
         x = torch.stack([run.x for run in found], 1)
         speeds = [run.v for run in found if run.v is not None]
         return Trajectory(x, torch.stack(speeds, 1) if speeds else None)
@@ -207,7 +209,7 @@ def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor
     }
 
 
-def _replaced(system: System, parameters: Mapping[str, Tensor]) -> System:
+def replaced(system: System, parameters: Mapping[str, Tensor]) -> System:
     """A copy of the system that computes with other tensors in place of its parameters."""
     other = copy.deepcopy(system)
     for name, value in parameters.items():
