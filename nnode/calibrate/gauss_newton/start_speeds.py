@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton.crowd import CrowdTangentCost
+from nnode.calibrate.gauss_newton.crowd import CrowdCost
 from nnode.calibrate.gauss_newton.method import Curved, TangentCost
 from nnode.calibrate.options import StartSpeeds
 from nnode.data.sequence import Batch
@@ -138,6 +138,6 @@ def cost_of(
                 "trainer.start_speeds=fitted is for vehicles in lanes; take "
                 "trainer.start_speeds=given for people"
             )
-        return CrowdTangentCost(system, batch, solver, convention)
+        return CrowdCost(system, batch, solver, convention)
     kind = StartSpeedCost if starts is StartSpeeds.fitted else TangentCost
     return kind(system, batch, solver, convention)

@@ -42,7 +42,8 @@ class GaussNewton(Optimizer):
         if not tolerance >= 0:
             raise ValueError(f"tolerance={tolerance} must not be negative")
         trained = [p for p in system.parameters() if p.requires_grad]
-        super().__init__(trained, {"damping": damping, "converged": False, "starts": {}})
+        first = {"damping": damping, "converged": False, "starts": {}, "begun": False}
+        super().__init__(trained, first)
         self.system, self.tolerance = system, tolerance
         self._cost: Any = None
         self._batch: Batch | None = None
@@ -93,6 +94,8 @@ class GaussNewton(Optimizer):
         """
         cost, group = self._cost, self.param_groups[0]
         row = np.clip(cost.row(self.system), cost.low, cost.high)
+        if not group.get("begun", True):  # states of earlier versions have begun
+            row, group["begun"] = cost.begin(row), True
         curved = cost(row)
         now = float(curved.cost.mean())
         if not math.isfinite(now):
@@ -102,8 +105,8 @@ class GaussNewton(Optimizer):
             lambda trial: float(cost.costs(trial).mean()),
             now, row, gradient, hessian, group["damping"], cost.low, cost.high,
         )  # fmt: skip
+        cost.fill_(self.system, end)
         if value < now:
-            cost.fill_(self.system, end)
             group["damping"] = damping
         group["starts"] = cost.starts(end)
         group["converged"] = not now - value > self.tolerance * now

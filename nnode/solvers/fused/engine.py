@@ -141,7 +141,7 @@ class FusedSolver:
         found = []
         for r in range(len(next(iter(stacked.values())))):
             own = {name: value[r] for name, value in stacked.items()}
-            found.append(self._other(replaced(system, own), batch, n))
+            found.append(self._other(_replaced(system, own), batch, n))
         x = torch.stack([run.x for run in found], 1)
         speeds = [run.v for run in found if run.v is not None]
         return Trajectory(x, torch.stack(speeds, 1) if speeds else None)
@@ -209,7 +209,7 @@ def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor
     }
 
 
-def replaced(system: System, parameters: Mapping[str, Tensor]) -> System:
+def _replaced(system: System, parameters: Mapping[str, Tensor]) -> System:
     """A copy of the system that computes with other tensors in place of its parameters."""
     other = copy.deepcopy(system)
     for name, value in parameters.items():
