@@ -28,6 +28,11 @@ from nnode.solvers.base import simulated_batch, substeps
 
 #: Share of the cost below which a fall is rounding.
 _ROUNDING = 1e-14
+#: A direction is flat where the scaled curvature is this share of the largest one: the errors of
+#: its derivatives, 1e-9 and less, leave nothing of it.
+_FLAT = 1e-10
+#: Share of a parameter's unit vector in flat directions, which is 0 but for rounding, at most 1e-5.
+_PART = 1e-3
 
 
 @dataclass(frozen=True)
@@ -319,6 +324,10 @@ def sandwich(
         cluster: ``(B,)`` which cluster a sequence belongs to.
         free: ``(P,)`` True for parameters that are at no bound; others do not vary.
 
+    Returns:
+        The variance is infinite of a parameter that the cost does not depend on, alone or together
+        with others.
+
     Source:
         Liang & Zeger 1986, with the factor G / (G - 1) for G clusters.
     """
@@ -332,8 +341,12 @@ def sandwich(
         :, free
     ]
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
+    kept = values > _FLAT * values.max()
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     bread = inverse / np.outer(scale, scale)
     meat = scores.T @ scores * len(names) / (len(names) - 1)
     found[np.ix_(free, free)] = bread @ meat @ bread
+    flat = np.flatnonzero(free)[(vectors[:, ~kept] ** 2).sum(1) > _PART]
+    found[flat, flat] = math.inf
     return found
