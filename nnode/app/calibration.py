@@ -43,6 +43,9 @@ _LEVEL = 1e-3
 #: An epoch moved nothing where it lowered the cost by less than moving one parameter by this share
 #: does at first order.
 _MOVED = 1e-4
+#: Share of the first cost below which a cost is that of data without noise, and its logarithm has
+#: no minimum.
+_EXACT = 1e-6
 STALLED = (
     "the line search stalled: the last epoch found no lower cost, although the gradient is not 0; "
     "these parameters are no minimum. Start from other parameters, or take optimizer=gauss_newton"
@@ -293,7 +296,8 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
     (batch,) = stream(straight_loader(store, indices, 0), trainer.dtype)
     model = copy.deepcopy(model).cpu()
     try:
-        slope = sensitivity(model, trainer.solver, batch, trainer.options.cost)
+        least = _EXACT * costs[0]
+        slope = sensitivity(model, trainer.solver, batch, trainer.options.cost, least)
     except SimulationError:
         return "stopped"
     if slope <= _LEVEL:

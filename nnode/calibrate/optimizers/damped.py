@@ -20,7 +20,9 @@ from nnode.solvers.base import Solver
 
 
 class GaussNewton(Optimizer):
-    """A damped step of Gauss and Newton's on exact tangents, refused steps with more damping.
+    """A damped step of Gauss and Newton's, refused steps with more damping.
+
+    Derivatives are exact tangents of lanes, and differences of people.
 
     It is told by :meth:`attach` what is minimised, in place of a closure.
 
