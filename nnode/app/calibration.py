@@ -43,8 +43,8 @@ _LEVEL = 1e-3
 #: An epoch moved nothing where it lowered the cost by less than moving one parameter by this share
 #: does at first order.
 _MOVED = 1e-4
-#: Share of the first cost below which a cost is that of data without noise, and its logarithm has
-#: no minimum.
+#: Share of the first cost below which the data are fitted without any error, as those of a model's
+#: own simulation are: relative changes of such a cost say nothing.
 _EXACT = 1e-6
 STALLED = (
     "the line search stalled: the last epoch found no lower cost, although the gradient is not 0; "
@@ -296,11 +296,10 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
     (batch,) = stream(straight_loader(store, indices, 0), trainer.dtype)
     model = copy.deepcopy(model).cpu()
     try:
-        least = _EXACT * costs[0]
-        slope = sensitivity(model, trainer.solver, batch, trainer.options.cost, least)
+        slope = sensitivity(model, trainer.solver, batch, trainer.options.cost)
     except SimulationError:
         return "stopped"
-    if slope <= _LEVEL:
+    if slope <= _LEVEL or costs[-1] <= _EXACT * costs[0]:
         return "converged"
     return "stalled" if 1 - costs[-1] / costs[-2] < _MOVED * slope else "stopped"
 

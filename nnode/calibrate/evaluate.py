@@ -140,16 +140,12 @@ def _check_finite(error: Tensor, batch: Batch) -> None:
 
 
 def sensitivity(
-    system: System, solver: Solver, batch: Batch, convention: Convention = Convention.integral,
-    least: float = 0.0,
-) -> float:  # fmt: skip
+    system: System, solver: Solver, batch: Batch, convention: Convention = Convention.integral
+) -> float:
     """Largest relative change of the mean cost by the relative change of a parameter, |p g / J|.
 
     It is 0 at a minimum, whatever the parameters' units. Slopes that press a parameter against the
     bound where it is do not count.
-
-    Args:
-        least: J counts as this where it is smaller.
 
     Raises:
         SimulationError: the model cannot be simulated.
@@ -163,7 +159,7 @@ def sensitivity(
             continue
         bound = system.bounds().get(name, free)
         pressed = ((p <= bound.low) & (slope > 0)) | ((p >= bound.high) & (slope < 0))
-        share = (p * slope / cost.clamp(min=least)).masked_fill(pressed, 0.0).abs()
+        share = (p * slope / cost).masked_fill(pressed, 0.0).abs()
         most = max(most, float(share.detach().max()))
     return most
 
