@@ -15,10 +15,9 @@ from nnode.data.sequence import collate
 from nnode.errors import ConfigError, SimulationError
 from nnode.laws.steps import METHODS, STAGES, stepped
 from nnode.models import Linear, Traffic, build_model
-from nnode.solvers import FusedSolver, TorchdiffeqSolver, Trajectory
-from nnode.solvers.rates import Rates
+from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from tests.models.following import DT, behind, driven, model, numbers
-from tests.solvers.fused.compare import difference, gradient
+from tests.solvers.fused.compare import RungeKutta, difference, gradient
 
 #: A car that brakes with b m/s², whatever is ahead, and one that accelerates.
 BRAKE = {"parameters": {"b": "3 m/s²"}, "rate": {"v": "0*dv*b/gap - b"}}
@@ -129,29 +128,12 @@ def test_orders_of_accuracy_against_dop853() -> None:
         assert slopes[method] == pytest.approx(order, abs=0.3), (slopes, errors)
 
 
-class Loop:
-    """Runge and Kutta's classic method, written out; torchdiffeq's ``rk4`` is its 3/8 rule."""
-
-    def __call__(self, system: Any, batch: Any) -> Trajectory:
-        rates, y = Rates(system, batch, 1, "rk4"), system.initial(batch)
-        found = [y]
-        for k in range(batch.n_samples - 1):
-            t = torch.tensor(float(k), dtype=torch.float64)
-            k1 = rates(t, y)
-            k2 = rates(t + 0.5, y + k1 / 2)
-            k3 = rates(t + 0.5, y + k2 / 2)
-            k4 = rates(t + 1, y + k3)
-            y = y + (k1 + 2 * k2 + 2 * k3 + k4) / 6
-            found.append(y)
-        return Trajectory(*system.observe(torch.stack(found), batch))
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 def test_compiled_steps_and_their_gradient_are_those_of_a_loop(method: str) -> None:
     system = model("idm")
     batch = behind(lambda t: 6 * np.minimum(t, 1.2), [7.0, 9.0, 6.5], 2.5)
-    loop = Loop() if method == "rk4" else TorchdiffeqSolver(method, "discrete", DT)
+    loop = RungeKutta() if method == "rk4" else TorchdiffeqSolver(method, "discrete", DT)
     exact, wanted = gradient(system, loop, batch)
     found, own = gradient(system, FusedSolver(DT, method=method), batch)
     torch.testing.assert_close(found.x, exact.x, rtol=1e-12, atol=1e-11)
