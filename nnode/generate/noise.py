@@ -16,6 +16,7 @@ from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
 from nnode.generate.people import sample_people, takes_paces
 from nnode.laws.lane import Rule
+from nnode.laws.steps import STAGES
 from nnode.models import Crowd, Traffic
 from nnode.models.effects.base import IndividualEffect
 from nnode.models.effects.crowd_individual import GaitSway
@@ -146,8 +147,9 @@ def sample(
         samples: S.
         seed: of all that is drawn; batches that are to be independent need different ones.
         dt: step, s; None: the default of the model.
-        method: of stepping; None, or one with stages, is the model's own: the motion is driven
-            by noise, where stages gain nothing.
+        method: of stepping, ``semi_implicit`` or ``ballistic``; others are the model's own, and
+            ballistic where that has stages: the motion is driven by noise, where stages gain
+            nothing.
 
     Returns:
         ``(K, S * B, N, D)``, sample by sample.
@@ -174,9 +176,9 @@ def sample(
     _give_drivers(noisy, many, batch.names, rng)
     # Euler's step of this time constant is exact for the given one
     noisy.terms.append(Push(step / (1 - kept)))
-    rates = Rates(
-        noisy, many, n, method if method in ("semi_implicit", "ballistic") else noisy.step
-    )
+    if method not in ("semi_implicit", "ballistic"):
+        method = "ballistic" if STAGES[noisy.step] != "euler" else noisy.step
+    rates = Rates(noisy, many, n, method)
     y = noisy.initial(many, step)
 
     def normal() -> Tensor:
