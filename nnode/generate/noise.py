@@ -147,9 +147,9 @@ def sample(
         samples: S.
         seed: of all that is drawn; batches that are to be independent need different ones.
         dt: step, s; None: the default of the model.
-        method: of stepping, ``semi_implicit`` or ``ballistic``; others are the model's own, and
-            ballistic where that has stages: the motion is driven by noise, where stages gain
-            nothing.
+        method: of stepping, ``semi_implicit``, ``ballistic`` or ``rk4``; others are the model's
+            own. The push stays the same during a step, also between the stages of ``rk4``:
+            without noise the motion is that of the solver.
 
     Returns:
         ``(K, S * B, N, D)``, sample by sample.
@@ -176,8 +176,8 @@ def sample(
     _give_drivers(noisy, many, batch.names, rng)
     # Euler's step of this time constant is exact for the given one
     noisy.terms.append(Push(step / (1 - kept)))
-    if method not in ("semi_implicit", "ballistic"):
-        method = "ballistic" if STAGES[noisy.step] != "euler" else noisy.step
+    if method not in ("semi_implicit", "ballistic", "rk4"):
+        method = noisy.step
     rates = Rates(noisy, many, n, method)
     y = noisy.initial(many, step)
 
@@ -187,8 +187,16 @@ def sample(
     y[..., -1] = noise.sigma * normal()
     kick = noise.sigma * math.sqrt(1 - kept**2)
 
+    still = torch.ones_like(y[0, 0])
+    still[-1] = 0.0
+
     def change(step: Tensor, y: Tensor) -> Tensor:
         found: Tensor = rates(step, y)
+        if STAGES[method] == "rk4":
+            second = rates(step + 0.5, y + still * found / 2)
+            third = rates(step + 0.5, y + still * second / 2)
+            last = rates(step + 1, y + still * third)
+            found = found + still * ((found + 2 * second + 2 * third + last) / 6 - found)
         found[..., -1] += kick * normal()
         return found
 
