@@ -256,12 +256,17 @@ class LaneSource:
                 "    first_pull(room, (agents - 1) * w, w, q, t, dt, drives, total)\n"
             )
         else:
-            text += (
-                "    n = padded((agents - 1) * w)\n"
-                "    gather(room, 0, n, w)\n"
-                "    follow_pull(room, 0, n, q, t, dt, drives, total)\n"
-                "    first_pull(room, (agents - 1) * w, padded(w), q, t, dt, drives, total)\n"
-            )
+            text += "    n = padded((agents - 1) * w)\n    gather(room, 0, n, w)\n"
+            # followers' rows are computed in whole chunks, which reach into the first row: where
+            # adjoints are replaced, and not added to, those of the first row wait in rows I
+            waiting = [row for row in mine if row not in kept]
+            at = "np.uint64((agents - 1) * w)"
+            for row in waiting:
+                text += f"    copy(room[_I_{row[2:]} + {at}:], room[_{row} + {at}:], w)\n"
+            text += "    follow_pull(room, 0, n, q, t, dt, drives, total)\n"
+            for row in waiting:
+                text += f"    copy(room[_{row} + {at}:], room[_I_{row[2:]} + {at}:], w)\n"
+            text += "    first_pull(room, (agents - 1) * w, padded(w), q, t, dt, drives, total)\n"
         return text
 
     def _ahead_back(self) -> str:

@@ -1,19 +1,25 @@
-"""Which configuration a checkpoint of somebody else may choose."""
+"""What a checkpoint chooses of the configuration that is composed today."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 
-from nnode.app.cli.saved import GROUPS, saved_groups
+from nnode.app.cli.saved import GROUPS, merge_saved, refuse_changes, saved_groups
 from nnode.app.cli.typed import group_defaults
 from nnode.app.export import groups_of_run
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.errors import CheckpointError, ConfigError
+from nnode.models import build_model
 from nnode.program import choices, configuration
+from tests.app.conftest import composed
 
 UP = "../" * 12 + "proc/self/cwd/theirs"
 
@@ -81,3 +87,25 @@ def test_defaults_are_read_of_such_files_alone(tmp_path: Path) -> None:
     (tmp_path / "theirs.yaml").write_text("defaults: [table_schema]\n")
     with pytest.raises(ConfigError, match=r"is unknown, expected one of .*table"):
         group_defaults("data", str(tmp_path / "theirs"))
+
+
+def test_a_law_stays_as_its_checkpoint_describes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What its description does not say, as the method of stepping of an older one, does not come
+    from today's."""
+    config = composed("train", "model=idm")
+    monkeypatch.setattr(
+        HydraConfig, "get",
+        lambda: SimpleNamespace(
+            runtime=SimpleNamespace(choices={"model": "idm"}), overrides=SimpleNamespace(task=[])
+        ),
+    )  # fmt: skip
+    saved: dict[str, Any] = {
+        "groups": {"model": "idm"},
+        "model": OmegaConf.to_container(config.model, resolve=True, enum_to_str=True),
+    }
+    assert saved["model"]["law"].pop("step") == "rk4"
+    merged = merge_saved(config, saved, ("model",))
+    assert "step" not in merged.model.law
+    now: Any = OmegaConf.to_container(merged.model, resolve=True, enum_to_str=True)
+    assert build_model(now).step == "ballistic"
+    refuse_changes({"model": now}, saved, ())

@@ -9,6 +9,33 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.models import System
 from nnode.solvers import Solver, Trajectory
+from nnode.solvers.rates import Rates
+
+
+class RungeKutta:
+    """Runge and Kutta's classic method, written out; torchdiffeq's ``rk4`` is its 3/8 rule.
+
+    Args:
+        substeps: in a sampling interval.
+    """
+
+    def __init__(self, substeps: int = 1) -> None:
+        self.substeps = substeps
+
+    def __call__(self, system: System, batch: Batch) -> Trajectory:
+        rates = Rates(system, batch, self.substeps, "rk4")
+        y = system.initial(batch, batch.dt / self.substeps)
+        found = [y]
+        for step in range(self.substeps * (batch.n_samples - 1)):
+            t = torch.tensor(float(step), dtype=y.dtype)
+            k1 = rates(t, y)
+            k2 = rates(t + 0.5, y + k1 / 2)
+            k3 = rates(t + 0.5, y + k2 / 2)
+            k4 = rates(t + 1, y + k3)
+            y = y + (k1 + 2 * k2 + 2 * k3 + k4) / 6
+            if (step + 1) % self.substeps == 0:
+                found.append(y)
+        return Trajectory(*system.observe(torch.stack(found), batch))
 
 
 def single(items: list[Sequence]) -> Batch:
