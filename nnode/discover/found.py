@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from nnode.discover.residuals.engine import Simulation
 from nnode.discover.result import Diagnosis
 from nnode.models import System
 
@@ -24,6 +25,8 @@ class Found:
         maps: ``before`` and ``after``: :class:`nnode.discover.report.deviation.Deviation` of
             ``base`` and ``extended``, where the diagnosis has them; they are computed where it has
             not.
+        simulated: of each entry of ``diagnosis.sealed`` the simulations whose errors it holds,
+            with ``base`` and with ``extended``; None where nothing of the sequence is compared.
     """
 
     diagnosis: Diagnosis
@@ -33,3 +36,4 @@ class Found:
     open: list[int]
     sealed: list[int]
     maps: dict[str, Any] = field(default_factory=dict)
+    simulated: list[tuple[Simulation | None, Simulation | None]] = field(default_factory=list)

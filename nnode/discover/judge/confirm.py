@@ -22,7 +22,7 @@ from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.residuals.engine import Engine, row_of
+from nnode.discover.residuals.engine import Engine, Simulation, row_of
 from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
@@ -75,6 +75,10 @@ class Comparing:
     def squares(self, system: System) -> np.ndarray:
         """``(S,)`` mean square errors of positions, m²."""
         return self._whole.squares(system, row_of(system)).means()
+
+    def simulated(self, system: System) -> list[Simulation | None]:
+        """The simulations whose errors are :meth:`squares`."""
+        return self._whole.simulated(system, row_of(system))
 
     def scores(self, system: System) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the

@@ -44,6 +44,24 @@ class Squares:
         return np.divide(total, number, out=np.full(len(total), np.nan), where=number > 0)
 
 
+@dataclass
+class Simulation:
+    """A sequence and its simulation, of which :class:`Squares` are the squared distances.
+
+    Attributes:
+        sequence: at the times at which positions are compared.
+        x: ``(K, N, D)`` simulated positions, m. NaN: given to the simulation, as a leader is.
+        restart: samples after which the simulation starts again from the measurement; None: it
+            runs through.
+        skip: samples at the start of the simulation that are given and not compared.
+    """
+
+    sequence: Sequence
+    x: np.ndarray
+    restart: int | None = None
+    skip: int = 0
+
+
 class Engine(Protocol):
     """The residuals of models on some sequences.
 
@@ -119,6 +137,11 @@ class Engine(Protocol):
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions as they are, for the costs that are reported."""
+        ...
+
+    def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
+        """The simulations whose errors are :meth:`squares`, of each sequence; None where nothing
+        of it is compared. Of engines that compare whole sequences, and of those of people."""
         ...
 
     def variables(self) -> list[Variable]:

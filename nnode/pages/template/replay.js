@@ -177,7 +177,8 @@ class Replay {
     pen.fillStyle = "#1a1a1a";
     pen.textAlign = "left";
     const away = p.ghost ? this.away(p.x, this.time) : NaN;
-    const said = !p.ghost ? "" : Number.isNaN(away) ? "nobody there" : `${away.toFixed(2)} m away`;
+    const now = !p.ghost ? "" : Number.isNaN(away) ? "nobody there" : `${away.toFixed(2)} m away`;
+    const said = [p.note, now].filter(Boolean).join("; ");
     // narrow panels beside each other have room for two lines
     const lines = p.top === 32 ? [p.title, said] : ["", p.title + (said && `: ${said}`)];
     lines.forEach((line, i) => pen.fillText(line, p.left + 2, p.top - 19 + 14 * i, p.wide - 4));

@@ -53,7 +53,7 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     report = json.loads(path.read_text(), parse_constant=no_constant)
     assert report["verdict"] == "named"
     known = {"before": 2.0, "after": 1.0, "noise_floor": None, "closed": None}
-    assert report["gap"] == {**known, "plain": None, "plain_after": None}
+    assert report["gap"] == {**known, "plain": None, "plain_after": None, "definition": ""}
     (effect,) = report["effects"]
     assert effect["name"] == "speed_zone"
     assert set(effect) >= {"coefficients", "where", "alternatives", "formula", "source", "p_value"}

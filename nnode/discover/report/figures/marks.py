@@ -107,8 +107,8 @@ def sealed_costs(
         ax.set_yscale("log")
         ax.tick_params(which="minor", labelsize=SMALL_FONT, width=0.6, color=GREY)
     handles = [
-        Line2D([], [], linestyle="", label="as it was given, calibrated", **BEFORE),
-        Line2D([], [], linestyle="", label="with the effects", **AFTER),
+        Line2D([], [], linestyle="", label="without effects", **BEFORE),
+        Line2D([], [], linestyle="", label="with effects", **AFTER),
     ]
     if np.isfinite(floor) and floor > 0:
         ax.axhline(floor, color="black", linestyle="--", linewidth=0.9)
