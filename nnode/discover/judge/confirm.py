@@ -73,8 +73,11 @@ class Comparing:
         return found
 
     def squares(self, system: System) -> np.ndarray:
-        """``(S,)`` mean square errors of positions, m²."""
-        return self._whole.squares(system, row_of(system)).means()
+        """``(S,)`` mean square errors of positions, m²; NaN where nothing is compared."""
+        found = self._whole.squares(system, row_of(system)).means()
+        # the last ones may be too short to be compared
+        missing = len(self._sequences) - len(found)
+        return np.pad(found, (0, missing), constant_values=np.nan)
 
     def simulated(self, system: System) -> list[Simulation | None]:
         """The simulations whose errors are :meth:`squares`."""

@@ -317,7 +317,8 @@ def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> lis
     for name in individual(found.extended):
         more += (
             f" {name} knows the agents of the open sequences; for all others it does not act, so "
-            "that errors on sealed sequences are those without it."
+            "that the errors that the command `evaluate` gives on sealed sequences are those "
+            "without it."
         )
     words = (
         "The extended model is a model like any other: errors beside baselines on the sealed "

@@ -26,7 +26,7 @@ class Replay {
       return row.map((step) => (step === null ? NaN : (place += step) / 100));
     });
     const measured = tracks(raw.measured);
-    const simulated = raw.simulated.map((s) => ({ title: s.title, x: tracks(s.x) }));
+    const simulated = raw.simulated.map((s) => ({ title: s.title, note: s.note, x: tracks(s.x) }));
     this.scene = { ...raw, measured, simulated, number: measured.length / raw.dims };
     this.end = (measured[0].length - 1) * raw.dt;
     this.slider.max = this.end;

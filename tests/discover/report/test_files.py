@@ -99,7 +99,10 @@ def test_an_estimate_has_the_digits_that_its_interval_leaves(
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("named", "lacks speed_zone: with it, the error on sealed sequences goes from 5 to 1 m²"),
+        (
+            "named",
+            "with it, the mean square error on sealed sequences goes from 5 to 1 m²",
+        ),
         ("none", "Nothing is missing from the model stand-in that these data could show"),
         ("unknown", "Beyond speed_zone the model stand-in lacks something that is not in the"),
         ("indistinguishable", "cannot tell whether it is speed_zone or rather inertia"),

@@ -14,6 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.inputs import Inputs
+from nnode.discover.judge.sealed import defined
 from nnode.discover.report.captions import Figures
 from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
@@ -172,9 +173,9 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
     people = {case.inputs.sequences[0].name: [0.1, 0.0, -0.1, 0.0]}
     add_effects(case.found.extended, [{"name": "driver_heterogeneity", "people": people}])
     (own,) = case.found.diagnosis.agents
-    words = plain(case, agents=[replace(own, named=True, reason="")])
-    assert any("driver_heterogeneity has a number for every agent" in text for text in words)
-    assert any("with numbers from its first part" in text for text in words)
+    gap = replace(case.found.diagnosis.gap, definition=defined("traffic", True))
+    words = plain(case, agents=[replace(own, named=True, reason="")], gap=gap)
+    assert any("each agent's number is taken from the first 40 %" in text for text in words)
     assert any("for all others it does not act" in text for text in words)
 
 
