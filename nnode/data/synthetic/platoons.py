@@ -31,8 +31,8 @@ class SlowZone:
 
     v0: float = 28.0
     L: float = 6.0
-    alpha: float = 0.7
-    a: float = 300.0
+    alpha: float = 0.65
+    a: float = 350.0
     b: float = 450.0
     drivers: float = 0.05
     noise: float = 0.1
@@ -45,7 +45,7 @@ def platoon_table(
     truth: SlowZone | None = None,
     platoons: int = 30,
     cars: int = 5,
-    duration: float = 30.0,
+    duration: float = 25.0,
     dt: float = 0.2,
 ) -> Path:
     """Simulate independent platoons on one stretch of road and write them as CSV.
@@ -102,7 +102,7 @@ def platoon_table(
         {
             "sequence": np.repeat(np.arange(1, platoons + 1), samples * cars),
             "time": np.repeat(clock.round(6), cars),
-            "agent": np.tile(np.arange(1, cars + 1), platoons * samples),
+            "agent": _agents(platoons, samples, cars),
             "x": measured.transpose(1, 0, 2).ravel().round(3),
         }
     )
@@ -110,6 +110,12 @@ def platoon_table(
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(table.to_csv(index=False, lineterminator="\n").encode("ascii"))
     return path
+
+
+def _agents(platoons: int, samples: int, cars: int) -> np.ndarray:
+    """One number per car of the whole table, ``(platoons * samples * cars,)``."""
+    number = 1 + np.arange(platoons * cars).reshape(platoons, 1, cars)
+    return np.broadcast_to(number, (platoons, samples, cars)).ravel()
 
 
 def _advanced(

@@ -94,12 +94,19 @@ def _sealed(found: Found) -> FigureBlock:
     d = found.diagnosis
     columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
     names, before, after = columns
+    if not d.effects:
+        return FigureBlock(
+            "sealed",
+            sealed_costs([str(n) for n in names], before, None, d.gap.noise_floor),
+            "Mean square error of every sealed sequence.",
+            f"Marks of {len(names)} sequences, from the largest error to the smallest.",
+        )
     better = sum(a < b for a, b in zip(after, before, strict=True))
     return FigureBlock(
         "sealed",
         sealed_costs([str(n) for n in names], before, after, d.gap.noise_floor),
-        f"Every sealed sequence before and after. {better} of {len(names)} are better with the "
-        "effects.",
+        f"Mean square error of every sealed sequence. {better} of {len(names)} errors are smaller "
+        "with effects.",
         f"Paired marks of {len(names)} sequences; {better} lie lower after than before.",
     )
 

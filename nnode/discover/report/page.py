@@ -92,7 +92,7 @@ def page_blocks(
         *_places(d, drawn, unit),
         *_rest(d, drawn, unit),
         *_usage(d, commands, folder, found),
-        *_decided(d),
+        *_decided(d, drawn),
         *_data(d, drawn),
         *_laws(d),
         *_clusters(d),
@@ -153,8 +153,6 @@ def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
             f"neither calibration nor search used them. {d.gap.definition} {_gap_words(d)}".strip()
         ),
         tables.gap_table(d),
-        *drawn.gap,
-        *([tables.sealed_table(d)] if d.sealed else []),
     ]
 
 
@@ -181,8 +179,8 @@ def _coefficients(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     return blocks
 
 
-def _decided(d: Diagnosis) -> list[Block]:
-    """What the names rest on."""
+def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
+    """What the verdict rests on."""
     blocks: list[Block] = []
     if d.notes:
         blocks.append(Text("\n".join(f"- {note}" for note in d.notes)))
@@ -199,6 +197,9 @@ def _decided(d: Diagnosis) -> list[Block]:
             ),
             tables.screen_table(d),
         ]
+    blocks += drawn.gap
+    if d.sealed:
+        blocks.append(tables.sealed_table(d))
     return [Heading("How it was decided"), *blocks] if blocks else []
 
 

@@ -137,7 +137,11 @@ def agents_table(d: Diagnosis) -> TableBlock:
 def later_table(d: Diagnosis) -> TableBlock:
     """Who predicts the last part of sealed sequences."""
     rows = [
-        {"effect": one.name, "who predicts": who, "mean square error (m²)": amount(error)}
+        {
+            "effect": one.name,
+            "who predicts": "the model without effects" if who == "base" else who,
+            "mean square error (m²)": amount(error),
+        }
         for one in d.agents
         for who, error in one.later.items()
     ]
@@ -244,7 +248,8 @@ def sealed_table(d: Diagnosis) -> TableBlock:
     return TableBlock(
         "sealed",
         pd.DataFrame(rows).head(LISTED),
-        f"Mean square error of each sealed sequence; the errors above are the means of these.{cut}",
+        "Mean square error of each sealed sequence. The errors before and after are their means."
+        f"{cut}",
         full=full,
     )
 
