@@ -21,7 +21,7 @@ demo: setup
 	@echo "== crowd: people in a corridor, forces as networks"
 	$(BIN)/python scripts/train.py experiment=demo_crowd data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/crowd
 	@echo "== diagnosis: the linear law on platoons; hidden: a slow zone (speeds x 0.65 from 350 to 450 m),"
-	@echo "   drivers whose speeds differ by 5 %, noise of 0.1 m; a third of the platoons is held back"
+	@echo "   drivers whose speeds differ by 5 %, noise of 0.1 m; 30 % of the platoons are held back"
 	$(BIN)/python scripts/discover.py model=lin model.leader=measured data=table data.domain=traffic \
 	  data.path=$(DEMO)/raw/platoons.csv 'discover.compare=[lin,log]' hydra.run.dir=$(DEMO)/diagnosis
 	@echo "== results"

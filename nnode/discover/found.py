@@ -5,9 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from nnode.discover.residuals.engine import Simulation
+import numpy as np
+
+from nnode.data.sequence import Sequence
 from nnode.discover.result import Diagnosis
 from nnode.models import System
+
+
+@dataclass
+class Simulation:
+    """A sequence and the simulation that its mean square error is computed from.
+
+    Attributes:
+        sequence: at the times at which positions are compared.
+        x: ``(K, N, D)`` simulated positions, m. NaN: given to the simulation, as a leader is.
+        restart: samples after which the simulation starts again from the measurement; None: it
+            runs through.
+        skip: samples at the start of the simulation that are given and not compared.
+    """
+
+    sequence: Sequence
+    x: np.ndarray
+    restart: int | None = None
+    skip: int = 0
 
 
 @dataclass

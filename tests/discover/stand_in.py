@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Sequence
-from nnode.discover.found import Found
+from nnode.discover.found import Found, Simulation
 from nnode.discover.judge.sealed import defined
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report.deviation import simulate
-from nnode.discover.residuals.engine import Simulation
 from nnode.discover.result import (
     Absence,
     Agents,

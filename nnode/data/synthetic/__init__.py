@@ -40,7 +40,7 @@ def demo_data(folder: Path | str, seed: int = 0) -> dict[str, Path]:
     traffic = folder / "esimas" / "sequence_datademo.mat"
     crowd = folder / "juelich" / "demo_corridor.txt"
     return {
-        "esimas": traffic_recording(traffic, seed=seed, **TRAFFIC),
+        "esimas": traffic_recording(traffic, seed=seed, v0=TRAFFIC["v0"], L=TRAFFIC["L"]),
         # several times longer than anyone stays, so that a block of it can be held out
         "juelich": crowd_recording(crowd, seed=seed, people=45, duration=36.0),
         "table": platoon_table(folder / "platoons.csv", seed=seed),

@@ -19,7 +19,8 @@ from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.walk import Tables, Walk
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows, WindowScene
-from nnode.discover.residuals.engine import Simulation, Squares, fill, of_residuals
+from nnode.discover.found import Simulation
+from nnode.discover.residuals.engine import Squares, fill, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.models.effects.base import Effect, IndividualEffect, Probe
 from nnode.models.system import Crowd, System

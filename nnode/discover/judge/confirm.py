@@ -21,8 +21,9 @@ import numpy as np
 from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
+from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.residuals.engine import Engine, Simulation, row_of
+from nnode.discover.residuals.engine import Engine, row_of
 from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nnode.data.sequence import Sequence
+from nnode.discover.found import Simulation
 from nnode.discover.judge.confirm import Comparing, engine_of
-from nnode.discover.residuals.engine import Simulation, row_of
+from nnode.discover.residuals.engine import row_of
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import DataError, SimulationError
 from nnode.models.system import Crowd, System

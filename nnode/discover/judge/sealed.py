@@ -12,11 +12,12 @@ import numpy as np
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.indirect_inference import unbiased
+from nnode.discover.found import Simulation
 from nnode.discover.judge.confirm import Comparing, engine_of, too_few
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.judge.verdict import named
 from nnode.discover.name.search import Search, Step, without_steps
-from nnode.discover.residuals.engine import Engine, Simulation
+from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
 from nnode.discover.rules import rules

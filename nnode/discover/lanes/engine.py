@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
+from nnode.discover.found import Simulation
 from nnode.discover.lanes.along import Along
 from nnode.discover.lanes.motion import formula_of
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
@@ -23,7 +24,6 @@ from nnode.discover.lanes.runs import side_by_side
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
 from nnode.discover.residuals.engine import (
-    Simulation,
     Squares,
     fill,
     names_of,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from nnode.data.sequence import Batch, Sequence
+from nnode.discover.found import Simulation
 from nnode.models.effects import Effect, IndividualEffect, Probe
 from nnode.models.system import System
 from nnode.models.term import State
@@ -42,24 +43,6 @@ class Squares:
         total = np.bincount(self.sequence, np.nan_to_num(self.value, nan=np.inf))
         number = np.bincount(self.sequence)
         return np.divide(total, number, out=np.full(len(total), np.nan), where=number > 0)
-
-
-@dataclass
-class Simulation:
-    """A sequence and its simulation, of which :class:`Squares` are the squared distances.
-
-    Attributes:
-        sequence: at the times at which positions are compared.
-        x: ``(K, N, D)`` simulated positions, m. NaN: given to the simulation, as a leader is.
-        restart: samples after which the simulation starts again from the measurement; None: it
-            runs through.
-        skip: samples at the start of the simulation that are given and not compared.
-    """
-
-    sequence: Sequence
-    x: np.ndarray
-    restart: int | None = None
-    skip: int = 0
 
 
 class Engine(Protocol):
