@@ -288,7 +288,7 @@ def test_drivers_and_noise_of_platoons_are_as_asked_for(tmp_path: Path) -> None:
 def test_estimates_stand_beside_the_truth(tmp_path: Path) -> None:
     truth = SlowZone()
     parameters = {
-        name: {"estimate": value, "lower": None, "upper": None, "unit": unit}
+        name: {"value": value, "low": None, "high": None, "unit": unit}
         for name, value, unit in (("lin.v0", 24.9, "m/s"), ("lin.L", 6.1, "m"))
     }
     effect = {

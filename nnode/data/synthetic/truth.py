@@ -29,7 +29,7 @@ def beside_truth(folder: Path | str) -> str:
     lines = ["calibration of the linear law on the traffic recording"]
     for name, value in TRAFFIC.items():
         row = calibrated[f"lin.{name}"]
-        lines.append(_row(name, row["unit"], value, row["estimate"], row["lower"], row["upper"]))
+        lines.append(_row(name, row["unit"], value, row["value"], row["low"], row["high"]))
     return "\n".join([*lines, *_diagnosis(report, SlowZone(), folder / "diagnosis")])
 
 
