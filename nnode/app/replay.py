@@ -124,7 +124,7 @@ def write_replay(
     real = [store[i] for i in shown]
     found = simulated_by(simulate, real, dtype=dtype, device=device)
     led = getattr(model, "leader", "constant") == "measured"
-    scenes = [Scene(s, {name: x.x}, led) for s, x in zip(real, found, strict=True)]
+    scenes = [Scene(s, {name: x.x}, led=led) for s, x in zip(real, found, strict=True)]
     zones = [zone for one in effects_of(model) if (zone := _zone(one)) is not None]
     block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), zones, len(indices))
     return write_player(block, path, title=f"{name}, measured and simulated")

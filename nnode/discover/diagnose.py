@@ -196,7 +196,7 @@ def _diagnosed(
     ]
     changed = bool(found.steps or own)
     extended = sealed.with_numbers(engine, final, own) if changed else base_system
-    gap, each = sealed.gap(extended, own)
+    gap, each, simulated = sealed.gap(extended, own)
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
     effects_found = [
@@ -242,6 +242,7 @@ def _diagnosed(
         searched=searched,
         open=division.open,
         sealed=division.sealed,
+        simulated=simulated,
     )
 
 

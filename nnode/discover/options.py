@@ -31,7 +31,7 @@ class DiscoverOptions:
     structure: bool = (
         True  # look for what has no name; without, it is faster and nothing is unknown
     )
-    step: float | None = None  # s, of the simulations that figures show; null takes the domain's
+    step: float | None = None  # s, of the simulations that maps show; null takes the domain's
     page: bool = True  # report.html with figures, and figures in TensorBoard
     replay: bool = True  # sealed sequences in a player on the page
     rules: Rules = field(default_factory=Rules)  # levels and shares; their reasons stand there

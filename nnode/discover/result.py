@@ -159,6 +159,7 @@ class Gap:
             where agents' own numbers were named.
         noise_floor: of the measurement.
         closed: (before - after) / (before - noise_floor).
+        definition: of the error, in words; that of each sequence is the same, not yet averaged.
     """
 
     before: float
@@ -167,6 +168,7 @@ class Gap:
     closed: float
     plain: float = float("nan")
     plain_after: float = float("nan")
+    definition: str = ""
 
 
 @dataclass

@@ -57,11 +57,16 @@ class Scene:
         sequence: as measured.
         simulated: ``(K, N, D)`` m by title, in the order of :data:`COLOURS`. Where it is no number
             nothing is shown.
+        notes: words by title that the player adds to it, as the error of the simulation.
+        restart: samples after which all simulations start again from the measurement; None: they
+            run through.
         led: whether the leader follows its measured path; the error that is shown leaves it out.
     """
 
     sequence: Sequence
     simulated: dict[str, np.ndarray]
+    notes: dict[str, str] = field(default_factory=dict)
+    restart: int | None = None
     led: bool = False
 
 
@@ -148,7 +153,10 @@ def _scene(scene: Scene) -> dict[str, Any]:
         "dt": round(every * s.dt, 6) if s.n_samples > 1 else 1.0,
         "dims": s.x.shape[2],
         "measured": packed(s.x[keep]),
-        "simulated": [{"title": t, "x": packed(x[keep])} for t, x in scene.simulated.items()],
+        "simulated": [
+            {"title": t, "note": scene.notes.get(t, ""), "x": packed(x[keep])}
+            for t, x in scene.simulated.items()
+        ],
     }
     if scene.led:
         found["led"] = 1

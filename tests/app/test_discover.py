@@ -142,7 +142,7 @@ def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:
     assert metrics["trained_on"] == 0
     assert sorted(metrics["costs"]) == sorted(report["split"]["sealed"])
     assert metrics["parameters"]["speed_zone.alpha"] == pytest.approx(0.65)
-    # the mean square error over all vehicles, of a simulation with another step
+    # the mean square error over the followers, of a simulation with another step
     assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
 
 

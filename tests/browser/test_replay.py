@@ -48,7 +48,7 @@ def corridor() -> Scene:
     s = Sequence(name="walk", recording="w", time=time, x=x, walls=WALLS)
     return Scene(
         s,
-        {"as it was given": x + np.array([0.0, 0.3]), "with the effects": x + np.array([0.0, 0.1])},
+        {"without effects": x + np.array([0.0, 0.3]), "with effects": x + np.array([0.0, 0.1])},
     )
 
 

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import ast
+import json
 import math
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 
 import nnode.data.synthetic
 from nnode.data.synthetic import (
     Forces,
+    SlowZone,
     crowd_recording,
     demo_data,
+    platoon_table,
     social_force,
     traffic_recording,
 )
-from nnode.errors import ConfigError
+from nnode.data.synthetic.truth import TRAFFIC, beside_truth
+from nnode.errors import ConfigError, DataError
 
 
 def platoons(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -244,3 +250,79 @@ def test_the_generators_are_independent_of_models_and_solvers() -> None:
     ours = {name for name in imported if name.startswith("nnode")}
     assert all(name.startswith(("nnode.errors", "nnode.data.synthetic")) for name in ours)
     assert not {name for name in imported if name.split(".")[0] in ("torch", "torchdiffeq")}
+
+
+def test_platoons_follow_the_law_of_the_table(tmp_path: Path) -> None:
+    truth = SlowZone(drivers=0.0, noise=0.0)
+    table = pd.read_csv(platoon_table(tmp_path / "p.csv", seed=2, truth=truth, platoons=3, dt=0.02))
+    assert list(table.columns) == ["sequence", "time", "agent", "x"]
+    inside = 0
+    for _, part in table.groupby("sequence"):
+        x = part.pivot(index="time", columns="agent", values="x")
+        place, step = np.array(x), np.diff(x.index).mean()
+        speed = (place[2:, :-1] - place[:-2, :-1]) / (2 * step)
+        here, gap = place[1:-1, :-1], np.diff(place, axis=1)[1:-1]
+        zone = (here >= truth.a) & (here <= truth.b)
+        expected = np.where(zone, truth.alpha, 1.0) * truth.v0 * (1 - truth.L / gap)
+        # not within a step of the zone's ends, where speeds jump
+        clear = (np.abs(here - truth.a) > 1) & (np.abs(here - truth.b) > 1)
+        # positions are written to the millimetre
+        np.testing.assert_allclose(speed[clear], expected[clear], atol=0.06)
+        inside += int((zone & clear).sum())
+    assert inside > 100
+
+
+def test_drivers_and_noise_of_platoons_are_as_asked_for(tmp_path: Path) -> None:
+    still = SlowZone(drivers=0.0, noise=0.0)
+    clean, noisy = (
+        pd.read_csv(platoon_table(tmp_path / f"{n}.csv", seed=4, truth=truth, platoons=8))
+        for n, truth in (("a", still), ("b", replace(still, noise=0.1)))
+    )
+    error = noisy["x"] - clean["x"]
+    assert error.std() == pytest.approx(0.1, abs=5 * 0.1 / math.sqrt(2 * len(error)))
+    assert clean["agent"].nunique() == 8 * 5  # nobody is in two platoons
+    same = [platoon_table(tmp_path / n, seed=4, platoons=2).read_bytes() for n in ("c", "d")]
+    assert same[0] == same[1]
+
+
+def test_estimates_stand_beside_the_truth(tmp_path: Path) -> None:
+    truth = SlowZone()
+    parameters = {
+        name: {"value": value, "low": None, "high": None, "unit": unit}
+        for name, value, unit in (("lin.v0", 24.9, "m/s"), ("lin.L", 6.1, "m"))
+    }
+    effect = {
+        "name": "speed_zone",
+        "coefficients": {"alpha": {"value": 0.66, "low": 0.6, "high": 0.7, "unit": "1"}},
+    }
+    report = {
+        "verdict": "named",
+        "effects": [effect],
+        "split": {"open": ["a", "b"], "sealed": ["c"]},
+        "places": [
+            {"variable": "position", "low": 351, "high": 449, "deviation": -4.0, "error": 0.1}
+        ],
+        "base": {"lin.v0": {"after": 28.2, "unit": "m/s"}, "lin.L": {"after": 6.0, "unit": "m"}},
+        "gap": {"before": 30.0, "after": 0.25, "noise_floor": 0.011},
+    }
+    with pytest.raises(DataError, match="run `make demo` first"):
+        beside_truth(tmp_path)
+    for name, content in (
+        ("traffic/result", {"parameters": parameters}),
+        ("diagnosis/report", report),
+    ):
+        path = tmp_path / f"{name}.json"
+        path.parent.mkdir()
+        path.write_text(json.dumps(content))
+    told = beside_truth(tmp_path)
+    for words in (
+        f"v0 (m/s)                     truth {TRAFFIC['v0']:g}     estimate 24.9",
+        "3 platoons, among them 1 held back",
+        "effects named:      speed_zone (verdict: named)",
+        "between 351 and 449 m, by -4.00 ± 0.10 m/s (the slow zone lies between 350 and 450 m)",
+        f"speed_zone.alpha             truth {truth.alpha:g}   estimate 0.66 [0.6, 0.7]",
+        "driver_heterogeneity.sigma   truth 0.05   estimate not found",
+        "30 m² before, 0.25 m² after; noise 0.011 m² (truth: 0.01 m²)",
+        str(tmp_path / "diagnosis" / "report.html"),
+    ):
+        assert words in told, words

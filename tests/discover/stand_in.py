@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Sequence
-from nnode.discover.found import Found
+from nnode.discover.found import Found, Simulation
+from nnode.discover.judge.sealed import defined
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report.deviation import simulate
 from nnode.discover.result import (
@@ -103,7 +104,8 @@ def diagnose(
         gain=0.63,
         confirmed=0.01,
     )
-    costs = _costs((base, extended), [sequences[i] for i in sealed])
+    simulated = _simulated((base, extended), [sequences[i] for i in sealed])
+    costs = np.array([[_cost(one) for one in pair] for pair in simulated])
     before, after = costs.mean(0)
     floor = 0.0025 if traffic else 0.0002
     at = np.linspace(0, 1000, 12)
@@ -156,7 +158,13 @@ def diagnose(
             unknown=Structure(
                 ["position", "gap"], 0.07, "0.02 x", {"at": list(at), "deviation": list(near)}
             ),
-            gap=Gap(before, after, floor, (before - after) / (before - floor)),
+            gap=Gap(
+                before,
+                after,
+                floor,
+                (before - after) / (before - floor),
+                definition=defined(system.domain, False),
+            ),
             base={"lin.v0": {"before": 24.0, "after": V0, "unit": "m/s"}} if traffic else {},
             split={
                 "open": [s.name for i, s in enumerate(sequences) if i not in sealed],
@@ -174,6 +182,7 @@ def diagnose(
         searched=extended,
         open=[i for i in range(len(sequences)) if i not in sealed],
         sealed=sealed,
+        simulated=simulated,
     )
 
 
@@ -213,9 +222,22 @@ def calibrated(system: System) -> System:
     return base
 
 
-def _costs(systems: tuple[System, ...], sequences: list[Sequence]) -> np.ndarray:
-    columns = []
+def _simulated(
+    systems: tuple[System, System], sequences: list[Sequence]
+) -> list[tuple[Simulation | None, Simulation | None]]:
+    columns: list[list[Simulation | None]] = []
     for system in systems:
-        pairs = zip(simulate(system, sequences), sequences, strict=True)
-        columns.append([np.nan if x is None else np.mean((x - s.x) ** 2) for x, s in pairs])
-    return np.array(columns).T
+        column: list[Simulation | None] = []
+        for x, s in zip(simulate(system, sequences), sequences, strict=True):
+            if x is not None and s.x.shape[2] == 1:
+                x[:, -1] = np.nan  # the leader is given
+            column.append(None if x is None else Simulation(s, x, skip=1))
+        columns.append(column)
+    return list(zip(*columns, strict=True))
+
+
+def _cost(one: Simulation | None) -> float:
+    if one is None:
+        return float("nan")
+    away = (one.x - one.sequence.x)[one.skip :]
+    return float(np.nanmean((away**2).sum(-1)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.walk import Tables, Walk
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows, WindowScene
+from nnode.discover.found import Simulation
 from nnode.discover.residuals.engine import Squares, fill, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.models.effects.base import Effect, IndividualEffect, Probe
@@ -103,13 +104,37 @@ class CrowdEngine:
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions, without what start states explain."""
-        whitening = self._settled(system, row)
-        found = whitening.projected(self._differences(system, row[None]).numpy())[0]
         which = self.windows.person[:, 0]
-        squares = found.reshape(len(which), -1, 2)
-        squares = (squares**2).sum(-1)
+        squares = (self._away(system, row) ** 2).sum(-1)
         each = squares.shape[1]
         return Squares(squares.ravel(), self.windows.sequence[which].repeat(each))
+
+    def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
+        """Windows one after the other, each from the start state that suits the model best."""
+        away, length = self._away(system, row), self.windows.length
+        found: list[Simulation | None] = [None] * len(self.sequences)
+        for i in self.windows.used:
+            s, first, stride = self.sequences[i], *self.windows.compared[i]
+            windows = np.flatnonzero(self.windows.sequence == i)
+            keep = first + stride * np.arange(length * len(windows))
+            goal = s.x[-1] if s.destination is None else s.destination
+            part = replace(
+                s, time=s.time[keep], x=s.x[keep], v=None if s.v is None else s.v[keep],
+                destination=goal,
+            )  # fmt: skip
+            x = part.x.copy()
+            for number, window in enumerate(windows):
+                people = self.windows.person[:, 0] == window
+                who = self.windows.person[people, 1]
+                x[number * length : (number + 1) * length, who] -= away[people].swapaxes(0, 1)
+            found[i] = Simulation(part, x, restart=length)
+        return found
+
+    def _away(self, system: System, row: Tensor) -> np.ndarray:
+        """``(P, L, 2)`` m: measured minus simulated positions, without what starts explain."""
+        whitening = self._settled(system, row)
+        found: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
+        return found.reshape(len(found), -1, 2)
 
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""

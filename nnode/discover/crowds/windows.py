@@ -99,6 +99,7 @@ class Windows:
         sequence, number: ``(W,)`` position of a window's sequence, and its own within it.
         step: of the simulation, s. sub: steps between two residuals.
         used: positions of the sequences that are long enough.
+        compared: of these the first sample that is compared, and the stride from each to the next.
         variance: m², of the noise of one measured coordinate.
 
     Raises:
@@ -126,9 +127,11 @@ class Windows:
         self.length = length
         half = np.arange(2 * self.sub * (length - 1) + 1) * self.step / 2
         pieces, measured, sequence, number = [], [], [], []
+        self.compared: dict[int, tuple[int, int]] = {}
         for i in self.used:
             item, windows = sequences[i], count[i] // length
             spare = (count[i] - windows * length) // 2
+            self.compared[i] = (spare * stride, stride)
             for w in range(windows):
                 first = (spare + w * length) * stride
                 path = smoother.path(item, first * dt + half)

@@ -21,6 +21,7 @@ import numpy as np
 from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
+from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.engine import Engine, row_of
 from nnode.discover.residuals.fit import sums
@@ -73,8 +74,15 @@ class Comparing:
         return found
 
     def squares(self, system: System) -> np.ndarray:
-        """``(S,)`` mean square errors of positions, m²."""
-        return self._whole.squares(system, row_of(system)).means()
+        """``(S,)`` mean square errors of positions, m²; NaN where nothing is compared."""
+        found = self._whole.squares(system, row_of(system)).means()
+        # the last ones may be too short to be compared
+        missing = len(self._sequences) - len(found)
+        return np.pad(found, (0, missing), constant_values=np.nan)
+
+    def simulated(self, system: System) -> list[Simulation | None]:
+        """The simulations whose errors are :meth:`squares`."""
+        return self._whole.simulated(system, row_of(system))
 
     def scores(self, system: System) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nnode.data.sequence import Sequence
+from nnode.discover.found import Simulation
 from nnode.discover.judge.confirm import Comparing, engine_of
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
@@ -40,12 +41,14 @@ class Later:
         leaning: ``(G,)`` of the others of :data:`MODELS` towards own numbers, by cluster, see
             :meth:`Comparing.leaning`.
         floor: of the measurement, m².
+        simulated: whose errors the costs of ``base`` and of own numbers are.
     """
 
     used: list[int]
     costs: dict[str, np.ndarray]
     leaning: dict[str, np.ndarray]
     floor: float
+    simulated: tuple[list[Simulation | None], list[Simulation | None]]
 
 
 def later(
@@ -86,6 +89,7 @@ def later(
             if name != MODELS[1]
         }
         found["base"] = comparing.squares(base)
+        simulated = comparing.simulated(base), comparing.simulated(each[MODELS[1]])
     except (DataError, SimulationError):
         return None
     if domain == "crowd":
@@ -93,7 +97,7 @@ def later(
         found["constant velocity"] = comparing.squares(Crowd([]))
     else:
         found |= _straight(early, last)
-    return Later(used, found, leaning, comparing.floor)
+    return Later(used, found, leaning, comparing.floor, simulated)
 
 
 def _parts(sequences: list[Sequence]) -> tuple[list[Sequence], list[Sequence], list[int]]:

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.data.sequence import Sequence, collate
+from nnode.discover.found import Simulation
 from nnode.discover.lanes.along import Along
 from nnode.discover.lanes.motion import formula_of
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
@@ -272,6 +273,16 @@ class TrafficEngine:
         """Squared errors of the followers' positions."""
         away = self.deviations(system, row[None])[0][self.seen].numpy()
         return Squares(away**2, self.sequence)
+
+    def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
+        """Whole sequences behind their leaders; of engines without windows."""
+        away = self.deviations(system, row[None])[0].numpy()
+        found: list[Simulation | None] = []
+        for i, s in enumerate(self.sequences):
+            x = s.x[..., 0] - away[: s.n_samples, i, : s.n_agents]
+            x[:, -1] = np.nan
+            found.append(Simulation(s, x[..., None], skip=1))
+        return found
 
     def variables(self) -> list[Variable]:
         """What deviations of vehicles may depend on."""

@@ -22,7 +22,7 @@ from nnode.discover.report.figures.marks import (
     place_curves,
     sealed_costs,
 )
-from nnode.discover.report.figures.paths import film_strip, pair, rmse, trajectories
+from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.discover.report.files import amount, individual, interval
 from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
 from nnode.models import System
@@ -42,6 +42,7 @@ UNITS = {"traffic": "m/s", "crowd": "m/s²"}
 class Figures:
     """What a page shows, by the section it belongs to."""
 
+    map: list[FigureBlock] = field(default_factory=list)
     effects: list[FigureBlock] = field(default_factory=list)
     gap: list[FigureBlock] = field(default_factory=list)
     faults: list[FigureBlock] = field(default_factory=list)
@@ -73,7 +74,9 @@ def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
         drawn.gap.append(_sealed(found))
     if inputs.faulty:
         drawn.faults.append(_faults(inputs))
-    drawn.places += _places(inputs, found, options)
+    drawn.places += _places(found)
+    maps = _map_figures(inputs, found, options)
+    drawn.map, drawn.places = maps[:1], [*drawn.places, *maps[1:]]
     if d.unknown is not None and d.unknown.curve:
         first = d.unknown.variables[0] if d.unknown.variables else "the first variable"
         drawn.unknown.append(
@@ -84,7 +87,7 @@ def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
                 f"Curve of the missing term by {first}.",
             )
         )
-    drawn.paths += _paths(inputs, found, options)
+    drawn.paths += _paths(found, options)
     return drawn
 
 
@@ -92,12 +95,19 @@ def _sealed(found: Found) -> FigureBlock:
     d = found.diagnosis
     columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
     names, before, after = columns
+    if not d.effects:
+        return FigureBlock(
+            "sealed",
+            sealed_costs([str(n) for n in names], before, None, d.gap.noise_floor),
+            "Mean square error of every sealed sequence.",
+            f"Marks of {len(names)} sequences, from the largest error to the smallest.",
+        )
     better = sum(a < b for a, b in zip(after, before, strict=True))
     return FigureBlock(
         "sealed",
         sealed_costs([str(n) for n in names], before, after, d.gap.noise_floor),
-        f"Every sealed sequence before and after. {better} of {len(names)} are better with the "
-        "effects.",
+        f"Mean square error of every sealed sequence. {better} of {len(names)} errors are smaller "
+        "with effects.",
         f"Paired marks of {len(names)} sequences; {better} lie lower after than before.",
     )
 
@@ -113,7 +123,7 @@ def _faults(inputs: Inputs) -> FigureBlock:
     )
 
 
-def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[FigureBlock]:
+def _places(found: Found) -> list[FigureBlock]:
     unit = unit_of(found.base)
     blocks = []
     curves = [place for place in found.diagnosis.places if place.curve][:PLACES]
@@ -131,28 +141,36 @@ def _places(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Figu
                 ),
             )
         )
+    return blocks
+
+
+def _map_figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[FigureBlock]:
+    """Maps of deviations by place, and by the nearest agent; none where nothing was simulated."""
     maps, unit = _maps(inputs, found, options), UNITS[inputs.domain]
     if not len(next(iter(maps.values())).time):
-        return blocks
+        return []
     said = ", ".join(f"{name}: {_spread(map_)} {unit} rms" for name, map_ in maps.items())
+    own = "".join(
+        f" {effect} knows the agents of the open sequences and acts on them alone."
+        for effect in individual(found.extended)
+    )
     if inputs.domain == "traffic":
         space, beside = time_space_maps(maps), approach_maps(maps)
         words = (
-            "Measured minus simulated speed in time and space; platoons are simulated for two "
-            f"seconds at a time. Grey: nobody was there.{_laid(inputs)}",
+            "Measured minus simulated speed in time and space, in all sequences; platoons are "
+            f"simulated for two seconds at a time. Grey: nobody was there.{_laid(inputs)}{own}",
             "The same by gap and by how fast the vehicle ahead draws away.",
         )
     else:
         space = plane_maps(maps, inputs.sequences[0].walls)
         beside = neighbour_maps(maps)
         words = (
-            "Mean of measured minus simulated acceleration by place; everyone is simulated for "
-            "one second at a time. Walls are black.",
+            "Mean of measured minus simulated acceleration by place, in all sequences; everyone is "
+            f"simulated for one second at a time. Walls are black.{own}",
             "The same by where the nearest person is, seen in one's own way: the triangle walks "
             "to the right.",
         )
     return [
-        *blocks,
         FigureBlock("map", space, words[0], f"Map of the deviations by place. {said}."),
         FigureBlock("map_beside", beside, words[1], f"Map by the nearest agent. {said}."),
     ]
@@ -179,33 +197,29 @@ def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, D
     }
 
 
-def _paths(
-    inputs: Inputs, found: Found, options: DiscoverOptions
-) -> list[FigureBlock | ReplayBlock]:
-    every = scenes(inputs, found, options)
+def _paths(found: Found, options: DiscoverOptions) -> list[FigureBlock | ReplayBlock]:
+    every = scenes(found)
     if not every:
         return []
     s = every[0].sequence
-    simulated = pair(*every[0].simulated.values(), led=every[0].led)
-    errors = ", ".join(f"{one.title} {amount(rmse(s, one), 2)} m" for one in simulated)
+    simulated = as_drawn(every[0])
+    errors = ", ".join(one.heading for one in simulated)
     name, plain = (f"the sealed sequence {n}" for n in (markdown(s.name), s.name))
-    unknown = "".join(
-        f" Its agents' numbers are not known, so that {effect} does not act here."
-        for effect in individual(found.extended)
-    )
+    which = "whose error falls most" if found.diagnosis.effects else "with the largest error"
     moving = [player(found, every)] if options.replay else []
     return [
         *moving,
         FigureBlock(
             "trajectories",
             trajectories(s, simulated),
-            f"Measured and simulated paths of {name}, on which nothing was calibrated.{unknown}",
-            f"Paths of {plain}; root mean square error: {errors}.",
+            f"Measured and simulated paths of {name}, the one {which}. The simulations are those "
+            "that its errors were computed from.",
+            f"Paths of {plain}; {errors}.",
         ),
         FigureBlock(
             "moments",
             film_strip(s, simulated),
             f"Moments of {name}: open marks are measured, filled ones simulated, lines join them.",
-            f"Moments of {plain}; root mean square error: {errors}.",
+            f"Moments of {plain}; {errors}.",
         ),
     ]

@@ -113,24 +113,30 @@ def ranked(laws: Laws) -> str:
 def sentence(diagnosis: Diagnosis) -> str:
     """The verdict in one sentence, one for a law that comes nearer, and one for the faults of the
     measurement."""
-    text, laws = _verdict(diagnosis), diagnosis.laws_again or diagnosis.laws
+    return " ".join([verdict(diagnosis), *remarks(diagnosis)])
+
+
+def remarks(diagnosis: Diagnosis) -> list[str]:
+    """What must be known beside the verdict: a law that comes nearer, faults of the measurement."""
+    found, laws = [], diagnosis.laws_again or diagnosis.laws
     if laws is not None and laws.best not in ("", diagnosis.model):
         beside = f" with {_listed(laws.effects)}" if laws.effects else ""
-        text += f" Of the laws that were compared, {laws.best}{beside} comes nearer."
+        found.append(f"Of the laws that were compared, {laws.best}{beside} comes nearer.")
     faults = diagnosis.data_faults
     if faults:
         where = len({fault.sequence for fault in faults})
-        text += (
-            f" Beside that the measurement holds {_count(len(faults), 'fault')} in "
+        found.append(
+            f"Beside that the measurement holds {_count(len(faults), 'fault')} in "
             f"{_count(where, 'sequence')}, which were left out."
         )
-    return text
+    return found
 
 
-def _verdict(d: Diagnosis) -> str:
+def verdict(d: Diagnosis) -> str:
+    """The verdict in one sentence."""
     names = _listed([effect.name for effect in d.effects])
     gain = (
-        f"the error on sealed sequences goes from {amount(d.gap.before)} to "
+        f"the mean square error on sealed sequences goes from {amount(d.gap.before)} to "
         f"{amount(d.gap.after)} m² ({closed(d)} of what can be closed above the noise floor of "
         f"{amount(d.gap.noise_floor)} m²)"
     )

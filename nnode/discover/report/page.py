@@ -23,7 +23,9 @@ from nnode.discover.report.files import (
     in_unit,
     individual,
     interval,
+    remarks,
     sentence,
+    verdict,
 )
 from nnode.discover.result import Diagnosis
 from nnode.machine import how_made
@@ -65,7 +67,7 @@ def draw(
     title = f"Diagnosis of {found.diagnosis.model} on {config['data']['name']}"
 
     def write() -> dict[str, Path]:
-        subtitle = sentence(found.diagnosis)
+        subtitle = verdict(found.diagnosis)
         page, *others = write_page(blocks, folder, title=title, subtitle=subtitle, stem="report")
         pictures = [path for path in others if path.suffix == ".png"]
         events = write_events(found, pictures, config, folder / TENSORBOARD)
@@ -79,18 +81,36 @@ def page_blocks(
 ) -> list[Block]:
     """The page in the order of the diagnosis, the verdict first."""
     d = found.diagnosis
+    unit = unit_of(found.base)
     return [
-        *_laws(d),
-        *_verdict(d, drawn, found),
-        *_data(d, drawn),
+        *_first(d),
+        *_map(drawn),
+        *_gap(d, drawn),
+        *_coefficients(d, drawn, found),
         *_agents(d),
         *_model(d),
-        *_places(d, drawn, unit_of(found.base)),
-        *_rest(d, drawn, unit_of(found.base)),
         *_shown(d, drawn),
+        *_places(d, drawn, unit),
+        *_rest(d, drawn, unit),
         *_usage(d, commands, folder, found),
+        *_decided(d, drawn),
+        *_data(d, drawn),
+        *_laws(d),
+        *_clusters(d),
         _provenance(d, inputs),
     ]
+
+
+def _first(d: Diagnosis) -> list[Block]:
+    """What a reader must know beside the verdict."""
+    words = remarks(d)
+    return [Text(" ".join(words))] if words else []
+
+
+def _map(drawn: Figures) -> list[Block]:
+    if not drawn.map:
+        return []
+    return [Heading("Where the model deviates from the data"), *drawn.map]
 
 
 def _laws(d: Diagnosis) -> list[Block]:
@@ -128,24 +148,51 @@ def _laws(d: Diagnosis) -> list[Block]:
     ]
 
 
-def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
+def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
+    """The errors on sealed sequences: one definition for the whole page."""
+    sealed, opened = len(d.split.get("sealed", [])), len(d.split.get("open", []))
+    return [
+        Heading("The error on sealed sequences"),
+        Text(
+            f"{sealed} of {sealed + opened} sequences were sealed: they were held back, and "
+            f"neither calibration nor search used them. {d.gap.definition} {_gap_words(d)}".strip()
+        ),
+        tables.gap_table(d),
+    ]
+
+
+def _gap_words(d: Diagnosis) -> str:
+    if not d.effects:
+        return "No effect was added, so both errors are those of the calibrated model."
+    return f"The effects close {closed(d)} of the gap between the model and the noise."
+
+
+def _coefficients(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
-    if d.notes:
-        blocks.append(Text("\n".join(f"- {markdown(note)}" for note in d.notes)))
     if has_network(found.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
-        blocks += [tables.coefficients_table(d.effects), *drawn.effects, tables.effects_table(d)]
+        blocks += [tables.coefficients_table(d.effects), *drawn.effects]
     else:
         blocks.append(Text("No effect of the catalogue was added to the model."))
-    if any(effect.alternatives for effect in d.effects):
-        blocks.append(tables.alternatives_table(d))
     if d.leads:
         blocks += [
             Heading("Found, not confirmed", 3),
             Text(f"A lead to follow, not a finding: {d.confirmation.reason}."),
             tables.coefficients_table(d.leads, "leads"),
         ]
+    return blocks
+
+
+def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
+    """What the verdict rests on."""
+    blocks: list[Block] = []
+    if d.notes:
+        blocks.append(Text("\n".join(f"- {markdown(note)}" for note in d.notes)))
+    if d.effects:
+        blocks.append(tables.effects_table(d))
+    if any(effect.alternatives for effect in d.effects):
+        blocks.append(tables.alternatives_table(d))
     if d.verdict == "not_testable" and d.screen.leads:
         blocks += [
             Heading("What one would look at first", 3),
@@ -155,42 +202,23 @@ def _verdict(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
             ),
             tables.screen_table(d),
         ]
-    blocks += [
-        Heading("What is independent of what", 3),
-        Text(_independence(d)),
-        tables.clusters_table(d),
-        Heading("What it changes on sealed sequences", 3),
-        Text(
-            f"{len(d.split.get('sealed', []))} of "
-            f"{len(d.split.get('sealed', [])) + len(d.split.get('open', []))} sequences were "
-            f"sealed: nothing looked at them before this comparison. {_gap_words(d)}"
-        ),
-        tables.gap_table(d),
-        *drawn.gap,
-    ]
-    return blocks
+    blocks += drawn.gap
+    if d.sealed:
+        blocks.append(tables.sealed_table(d))
+    return [Heading("How it was decided"), *blocks] if blocks else []
 
 
-def _independence(d: Diagnosis) -> str:
+def _clusters(d: Diagnosis) -> list[Block]:
     c = d.clusters
-    return (
-        f"One cluster are {c.why}; {c.simultaneous}. Every interval, test and fold goes by "
-        f"cluster. With {c.open} open {'cluster' if c.open == 1 else 'clusters'} no two-sided "
-        f"p-value can be below {amount(d.screen.floor, 2)}."
-    )
-
-
-def _gap_words(d: Diagnosis) -> str:
-    if not d.effects:
-        return "As nothing was added, the error is what the calibrated model leaves."
-    words = f"The effects close {closed(d)} of the gap between the model and the noise."
-    for one in d.agents:
-        if one.named:
-            words += (
-                f" {one.name} has a number for every agent: the errors are those of the last part "
-                "of each sequence, with numbers from its first part."
-            )
-    return words
+    return [
+        Heading("What is independent of what"),
+        Text(
+            f"One cluster are {c.why}; {c.simultaneous}. Every interval, test and fold goes by "
+            f"cluster. With {c.open} open {'cluster' if c.open == 1 else 'clusters'} no two-sided "
+            f"p-value can be below {amount(d.screen.floor, 2)}."
+        ),
+        tables.clusters_table(d),
+    ]
 
 
 def _agents(d: Diagnosis) -> list[Block]:
@@ -236,7 +264,7 @@ def _model(d: Diagnosis) -> list[Block]:
 
 
 def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
-    blocks: list[Block] = [Heading("Where model and measurement part")]
+    blocks: list[Block] = [Heading("Deviations by variable")]
     if d.places:
         words = [
             f"- {p.variable} in [{amount(p.low)}, {amount(p.high)}]{in_unit(p.unit)}: "
@@ -295,7 +323,8 @@ def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> lis
     for name in individual(found.extended):
         more += (
             f" {name} knows the agents of the open sequences; for all others it does not act, so "
-            "that errors on sealed sequences are those without it."
+            "that the errors that the command `evaluate` gives on sealed sequences are those "
+            "without it."
         )
     words = (
         "The extended model is a model like any other: errors beside baselines on the sealed "

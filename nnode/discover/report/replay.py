@@ -3,68 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
-from nnode.data.sequence import Sequence
 from nnode.discover.found import Found
-from nnode.discover.inputs import Inputs
-from nnode.discover.options import DiscoverOptions
-from nnode.discover.report.deviation import simulate, smooth_velocity
+from nnode.discover.report.files import amount
 from nnode.discover.result import Diagnosis, NamedEffect
 from nnode.pages.replay import ReplayBlock, Scene, Zone
 
-#: Seconds of a crowd's sequence that are shown: later, small errors have grown to other ways.
-SHOWN = 4.0
-#: Sealed sequences that are simulated for the player.
+#: Sealed sequences in the player.
 SCENES = 16
 #: What the two models are called, here and in the figures.
-BEFORE, AFTER = "as it was given", "with the effects"
+BEFORE, AFTER = "without effects", "with effects"
 
 
-def telling(found: Found, sequences: list[Sequence]) -> list[Sequence]:
-    """The sealed sequences, first the one that shows most: where most was gained, else missed."""
-    rows = {str(row["name"]): row for row in found.diagnosis.sealed}
+def telling(found: Found) -> list[int]:
+    """Rows of ``diagnosis.sealed``, first the one whose error falls most, or without effects the
+    one with the largest error. Rows without two finite errors are left out."""
+    rows = found.diagnosis.sealed
 
-    def shown(s: Sequence) -> float:
-        row = rows.get(s.name)
-        if row is None:
-            return -np.inf
-        after = row["after"] if found.diagnosis.effects else 0.0
-        gain = float(row["before"]) - float(after)
-        return gain if np.isfinite(gain) else -np.inf
+    def gain(i: int) -> float:
+        after = rows[i]["after"] if found.diagnosis.effects else 0.0
+        return float(rows[i]["before"]) - float(after)
 
-    return sorted((sequences[i] for i in found.sealed), key=shown, reverse=True)
+    finite = [i for i, row in enumerate(rows) if np.isfinite([row["before"], row["after"]]).all()]
+    return sorted(finite, key=gain, reverse=True)
 
 
-def scenes(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[Scene]:
-    """Sealed sequences as measured and as simulated before and after, the most telling first.
+def scenes(found: Found) -> list[Scene]:
+    """Sealed sequences and the simulations that their errors were computed from, without and with
+    effects, in the order of :func:`telling`.
 
     The still figure has the first one; a crowd's player begins with the one with most people.
-    Those that a model cannot be simulated on are left out.
     """
-    chosen = telling(found, inputs.sequences)[: SCENES if options.replay else 1]
-    if inputs.domain == "crowd":
-        chosen = [_begin(s) for s in chosen]
-    models = {BEFORE: found.base}
-    if found.diagnosis.effects:
-        models[AFTER] = found.extended
-    paths = {name: simulate(model, chosen, options.step) for name, model in models.items()}
     every = []
-    for i, s in enumerate(chosen):
-        there = {name: x for name, each in paths.items() if (x := each[i]) is not None}
-        if len(there) == len(paths):
-            every.append(Scene(s, there, getattr(found.base, "leader", "") == "measured"))
+    for i in telling(found)[:SCENES]:
+        before, after = found.simulated[i]
+        if before is None or after is None:
+            continue
+        row, paths = found.diagnosis.sealed[i], {BEFORE: before.x}
+        errors = {BEFORE: float(row["before"])}
+        if found.diagnosis.effects:
+            paths[AFTER], errors[AFTER] = after.x, float(row["after"])
+        notes = {title: f"error {amount(error)} m²" for title, error in errors.items()}
+        every.append(Scene(before.sequence, paths, notes, before.restart))
     return every
-
-
-def _begin(s: Sequence) -> Sequence:
-    keep = 1 + round(SHOWN / s.dt)
-    goal = s.x[-1] if s.destination is None else s.destination
-    return replace(
-        s, time=s.time[:keep], x=s.x[:keep], v=smooth_velocity(s)[:keep], destination=goal
-    )
 
 
 def player(found: Found, every: list[Scene]) -> ReplayBlock:
@@ -75,14 +58,26 @@ def player(found: Found, every: list[Scene]) -> ReplayBlock:
     return ReplayBlock(
         "replay",
         every,
-        "Sealed sequences, on which nothing was calibrated, as measured and as simulated from "
-        "their first moment on. Outlines are where agents were measured; arrows, the residuals, "
-        f"go there from where they are simulated.{named}",
+        "Sealed sequences, on which nothing was calibrated, as measured and in the simulations "
+        "that the errors on this page were computed from. Outlines are where agents were measured; "
+        "arrows, the residuals, go there from where they are simulated. Agents without a "
+        "simulated position are given to the simulation and do not count in the error. The "
+        "distance is the root mean square over the agents at the moment that is shown; the error "
+        f"is the mean of its square over the sequence.{_again(every)}{named}",
         f"Player of {len(every)} sealed sequences: agents as measured, and as simulated by "
         f"{len(every[0].simulated)} models.",
         shaded,
         sealed,
     )
+
+
+def _again(every: list[Scene]) -> str:
+    """What must be said of simulations that start again."""
+    first = every[0]
+    if first.restart is None:
+        return ""
+    seconds = first.restart * first.sequence.dt
+    return f" Simulations start again from the measurement every {seconds:.2g} s."
 
 
 def zones(d: Diagnosis) -> list[Zone]:

@@ -17,12 +17,6 @@ from nnode.pages.page import TableBlock
 LISTED = 30
 
 
-_SIMULATED = {
-    "traffic": ", simulated as a whole",
-    "crowd": ", of everyone simulated for a short while among the measured paths of the others",
-}
-
-
 def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> TableBlock:
     return TableBlock(name, pd.DataFrame(rows), caption, **more)
 
@@ -47,9 +41,10 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
 
 
 _ERRORS = {
-    "traffic": "The mean square errors are those of whole paths in clusters that calibrations to "
-    "nothing else left out.",
-    "crowd": "The mean square errors are those of everyone simulated for a short while.",
+    "traffic": "The errors are mean squares over whole paths in open clusters that calibrations to "
+    "nothing else left out: not those of the sealed sequences.",
+    "crowd": "The errors are mean squares in the open clusters that the calibration saw: not those "
+    "of the sealed sequences.",
 }
 
 
@@ -61,7 +56,7 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
             "parameters": one.parameters,
             "held-out cost above the best (%)": amount(100 * one.behind),
             "p": amount(one.p_value, 2),
-            "mean square error (m²)": amount(one.error),
+            "error on left-out open clusters (m²)": amount(one.error),
             "calibrated": ", ".join(
                 f"{name.partition('.')[2] or name} {amount(value)}{in_unit(unit)}"
                 for name, (value, unit) in one.values.items()
@@ -142,7 +137,11 @@ def agents_table(d: Diagnosis) -> TableBlock:
 def later_table(d: Diagnosis) -> TableBlock:
     """Who predicts the last part of sealed sequences."""
     rows = [
-        {"effect": one.name, "who predicts": who, "mean square error (m²)": amount(error)}
+        {
+            "effect": one.name,
+            "who predicts": "the model without effects" if who == "base" else who,
+            "mean square error (m²)": amount(error),
+        }
         for one in d.agents
         for who, error in one.later.items()
     ]
@@ -171,8 +170,9 @@ def effects_table(d: Diagnosis) -> TableBlock:
         "effects",
         rows,
         "In the order in which they were added. *p*: how often pure chance scores as high, with "
-        "regard to all effects that were looked for. *Held-out gain*: share of the error that "
-        "the effect removed, when it was added, on sequences it was not calibrated on.",
+        "regard to all effects that were looked for. *Held-out gain*: share of the "
+        "squared residuals, without their autocorrelation, that the effect removed when it was "
+        "added, on open sequences it was not calibrated on.",
     )
 
 
@@ -217,10 +217,10 @@ def gap_table(d: Diagnosis) -> TableBlock:
     rows = [
         {"": what, "mean square error (m²)": amount(value)}
         for what, value in (
-            (f"{d.model}, calibrated", d.gap.before),
-            ("with the effects", d.gap.after),
-            (f"{d.model}, calibrated to whole paths alone", d.gap.plain),
-            ("with the effects, calibrated so", d.gap.plain_after),
+            (f"{d.model} without effects", d.gap.before),
+            *([(f"{d.model} with effects", d.gap.after)] if d.effects else []),
+            (f"{d.model} without effects, calibrated to whole paths alone", d.gap.plain),
+            *([(f"{d.model} with effects, calibrated so", d.gap.plain_after)] if d.effects else []),
             ("noise of the measurement", d.gap.noise_floor),
         )
         if not math.isnan(value)
@@ -228,8 +228,29 @@ def gap_table(d: Diagnosis) -> TableBlock:
     return _table(
         "gap",
         rows,
-        f"Mean square error of positions on the sealed sequences{_SIMULATED[d.domain]}. The noise "
-        "of the measurement is what no model can explain.",
+        "Mean square error on the sealed sequences. The noise of the measurement is what no model "
+        "can explain.",
+    )
+
+
+def sealed_table(d: Diagnosis) -> TableBlock:
+    """The errors of the single sealed sequences."""
+    rows = [
+        {
+            "sequence": row["name"],
+            "without effects (m²)": amount(row["before"]),
+            **({"with effects (m²)": amount(row["after"])} if d.effects else {}),
+        }
+        for row in d.sealed
+    ]
+    full = pd.DataFrame(d.sealed).rename(columns={"name": "sequence"})
+    cut = f" The first {LISTED} of {len(rows)}; the file has all." if len(rows) > LISTED else ""
+    return TableBlock(
+        "sealed",
+        pd.DataFrame(rows).head(LISTED),
+        "Mean square error of each sealed sequence. The errors before and after are their means."
+        f"{cut}",
+        full=full,
     )
 
 
@@ -240,7 +261,7 @@ def base_table(d: Diagnosis) -> TableBlock:
         {
             "parameter": short[name],
             "alone": amount(values.get("before"), 4),
-            "with the effects": amount(values.get("after"), 4),
+            "with effects": amount(values.get("after"), 4),
             "unit": _unit(values.get("unit", "")),
         }
         for name, values in d.base.items()

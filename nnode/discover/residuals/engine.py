@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from nnode.data.sequence import Batch, Sequence
+from nnode.discover.found import Simulation
 from nnode.models.effects import Effect, IndividualEffect, Probe
 from nnode.models.system import System
 from nnode.models.term import State
@@ -119,6 +120,11 @@ class Engine(Protocol):
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions as they are, for the costs that are reported."""
+        ...
+
+    def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
+        """The simulations whose errors are :meth:`squares`, of each sequence; None where nothing
+        of it is compared. Of engines that compare whole sequences, and of those of people."""
         ...
 
     def variables(self) -> list[Variable]:

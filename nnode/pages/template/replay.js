@@ -26,7 +26,7 @@ class Replay {
       return row.map((step) => (step === null ? NaN : (place += step) / 100));
     });
     const measured = tracks(raw.measured);
-    const simulated = raw.simulated.map((s) => ({ title: s.title, x: tracks(s.x) }));
+    const simulated = raw.simulated.map((s) => ({ title: s.title, note: s.note, x: tracks(s.x) }));
     this.scene = { ...raw, measured, simulated, number: measured.length / raw.dims };
     this.end = (measured[0].length - 1) * raw.dt;
     this.slider.max = this.end;
@@ -178,7 +178,8 @@ class Replay {
     pen.fillStyle = "#1a1a1a";
     pen.textAlign = "left";
     const away = p.ghost ? this.away(p.x, this.time) : NaN;
-    const said = !p.ghost ? "" : Number.isNaN(away) ? "nobody there" : `${away.toFixed(2)} m away`;
+    const now = !p.ghost ? "" : Number.isNaN(away) ? "nobody there" : `${away.toFixed(2)} m away`;
+    const said = [p.note, now].filter(Boolean).join("; ");
     // narrow panels beside each other have room for two lines
     const lines = p.top === 32 ? [p.title, said] : ["", p.title + (said && `: ${said}`)];
     lines.forEach((line, i) => pen.fillText(line, p.left + 2, p.top - 19 + 14 * i, p.wide - 4));

@@ -53,7 +53,7 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     report = json.loads(path.read_text(), parse_constant=no_constant)
     assert report["verdict"] == "named"
     known = {"before": 2.0, "after": 1.0, "noise_floor": None, "closed": None}
-    assert report["gap"] == {**known, "plain": None, "plain_after": None}
+    assert report["gap"] == {**known, "plain": None, "plain_after": None, "definition": ""}
     (effect,) = report["effects"]
     assert effect["name"] == "speed_zone"
     assert set(effect) >= {"coefficients", "where", "alternatives", "formula", "source", "p_value"}
@@ -99,7 +99,10 @@ def test_an_estimate_has_the_digits_that_its_interval_leaves(
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("named", "lacks speed_zone: with it, the error on sealed sequences goes from 5 to 1 m²"),
+        (
+            "named",
+            "with it, the mean square error on sealed sequences goes from 5 to 1 m²",
+        ),
         ("none", "Nothing is missing from the model stand-in that these data could show"),
         ("unknown", "Beyond speed_zone the model stand-in lacks something that is not in the"),
         ("indistinguishable", "cannot tell whether it is speed_zone or rather inertia"),

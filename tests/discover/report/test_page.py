@@ -14,8 +14,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.inputs import Inputs
+from nnode.discover.judge.sealed import defined
 from nnode.discover.report.captions import Figures
-from nnode.discover.report.files import sentence
+from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
 from nnode.discover.report.replay import telling, zones
 from nnode.discover.result import Coefficient, Confirmation, DataFault
@@ -59,17 +60,21 @@ def written(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Case) -> None:
     page = (written / "report.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
-    verdict = sentence(traffic.found.diagnosis)
-    assert page.index(verdict) < page.index("What is missing</h2>")
+    told = verdict(traffic.found.diagnosis)
+    assert page.index(told) < page.index("Where the model deviates from the data</h2>")
     order = [
+        "Where the model deviates from the data",
+        "The error on sealed sequences",
         "What is missing",
-        "Faults of the measurement",
         "Do agents differ?",
         "The model's own parameters",
-        "Where model and measurement part",
-        "What is left",
         "A sealed sequence",
+        "Deviations by variable",
+        "What is left",
         "Using the extended model",
+        "How it was decided",
+        "Faults of the measurement",
+        "What is independent of what",
         "How this page was made",
     ]
     heads = re.findall(r"<h2[^>]*>([^<]*)</h2>", page.replace("&#39;", "'"))
@@ -81,6 +86,7 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
         "car 1 jumps",
         "made by hand",
         "5 sequences were sealed",
+        traffic.found.diagnosis.gap.definition,
         "3 open clusters no two-sided p-value can be below 0.001.",
         "driver_heterogeneity: not named: the last part of the sealed sequences",
     ):
@@ -167,9 +173,9 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
     people = {case.inputs.sequences[0].name: [0.1, 0.0, -0.1, 0.0]}
     add_effects(case.found.extended, [{"name": "driver_heterogeneity", "people": people}])
     (own,) = case.found.diagnosis.agents
-    words = plain(case, agents=[replace(own, named=True, reason="")])
-    assert any("driver_heterogeneity has a number for every agent" in text for text in words)
-    assert any("with numbers from its first part" in text for text in words)
+    gap = replace(case.found.diagnosis.gap, definition=defined("traffic", True))
+    words = plain(case, agents=[replace(own, named=True, reason="")], gap=gap)
+    assert any("each agent's number is taken from the first 40 %" in text for text in words)
     assert any("for all others it does not act" in text for text in words)
 
 
@@ -179,9 +185,11 @@ def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
     rows = [{"name": names[0], "before": 5.0, "after": 4.5},
             {"name": names[1], "before": 4.0, "after": 1.0}]  # fmt: skip
     found.diagnosis = replace(found.diagnosis, sealed=rows)
-    assert [s.name for s in telling(found, traffic.inputs.sequences)] == names[::-1]
+    assert telling(found) == [1, 0]
     found.diagnosis = replace(found.diagnosis, effects=[])
-    assert [s.name for s in telling(found, traffic.inputs.sequences)] == names
+    assert telling(found) == [0, 1]
+    rows[0]["before"] = float("inf")  # a simulation that blew up is not shown
+    assert telling(found) == [1]
 
 
 def test_the_named_place_is_shaded_and_else_where_they_part(traffic: Case) -> None:

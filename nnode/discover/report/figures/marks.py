@@ -87,29 +87,28 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
 
 
 def sealed_costs(
-    names: Sequence[str], before: Sequence[float], after: Sequence[float], floor: float
+    names: Sequence[str], before: Sequence[float], after: Sequence[float] | None, floor: float
 ) -> Figure:
     """Mean square error of every sealed sequence, before and after, m².
 
     Args:
+        after: None where no effect was added.
         floor: of the measurement's noise, m².
     """
     order = np.argsort(before)[::-1]
-    b, a = np.asarray(before, float)[order], np.asarray(after, float)[order]
+    b, a = (np.asarray(one, float)[order] for one in (before, before if after is None else after))
     place = np.arange(len(order))
     figure = new_figure(7.2, 3.2)
     ax = figure.subplots()
     ax.vlines(place, np.minimum(b, a), np.maximum(b, a), color=GREY, linewidth=1)
-    ax.plot(place, b, linestyle="", markersize=5.5, **BEFORE)
-    ax.plot(place, a, linestyle="", markersize=5.5, **AFTER)
+    shown = [("without effects", b, BEFORE), ("with effects", a, AFTER)][: 1 + (after is not None)]
+    for _, values, style in shown:
+        ax.plot(place, values, linestyle="", markersize=5.5, **style)
     positive = np.concatenate([b, a])
     if (positive > 0).all():
         ax.set_yscale("log")
         ax.tick_params(which="minor", labelsize=SMALL_FONT, width=0.6, color=GREY)
-    handles = [
-        Line2D([], [], linestyle="", label="as it was given, calibrated", **BEFORE),
-        Line2D([], [], linestyle="", label="with the effects", **AFTER),
-    ]
+    handles = [Line2D([], [], linestyle="", label=label, **style) for label, _, style in shown]
     if np.isfinite(floor) and floor > 0:
         ax.axhline(floor, color="black", linestyle="--", linewidth=0.9)
         handles.append(

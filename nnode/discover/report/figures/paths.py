@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from nnode.data.sequence import Sequence
 from nnode.discover.report.figures.maps import draw_walls
 from nnode.discover.report.figures.marks import AFTER, BEFORE
+from nnode.pages.replay import Scene
 from nnode.plots.style import GREY, SMALL_FONT, dress, new_figure
 
 #: Moments of a film strip.
@@ -28,31 +29,30 @@ class Simulated:
 
     Attributes:
         title: of its panel.
-        x: ``(K, N, D)`` m.
+        x: ``(K, N, D)`` m; NaN where nothing is simulated.
         style: colour and marker.
-        led: whether the leader follows its measured path.
+        note: added to the title, as the error of the simulation.
+        restart: samples after which the simulation starts again from the measurement.
     """
 
     title: str
     x: np.ndarray
     style: dict[str, Any]
-    led: bool = False
+    note: str = ""
+    restart: int | None = None
+
+    @property
+    def heading(self) -> str:
+        """Title and note."""
+        return f"{self.title}: {self.note}" if self.note else self.title
 
 
-def pair(
-    before: np.ndarray, after: np.ndarray | None = None, *, led: bool = False
-) -> list[Simulated]:
-    """The two simulations as they are drawn; one where nothing was added to the model."""
-    found = [Simulated("as it was given", before, BEFORE, led)]
-    return found if after is None else [*found, Simulated("with the effects", after, AFTER, led)]
-
-
-def rmse(sequence: Sequence, simulated: Simulated) -> float:
-    """Root mean square distance of a simulation from the measurement, m, over all samples after
-    the first, and without a leader that follows its measured path: as ``nnode evaluate`` does."""
-    free = slice(-1) if simulated.led else slice(None)
-    away = (simulated.x - sequence.x)[1:, free]
-    return float(np.sqrt((away**2).sum(-1).mean()))
+def as_drawn(scene: Scene) -> list[Simulated]:
+    """The simulations of a scene as they are drawn: the first without effects."""
+    return [
+        Simulated(title, x, style, scene.notes.get(title, ""), scene.restart)
+        for (title, x), style in zip(scene.simulated.items(), (BEFORE, AFTER), strict=False)
+    ]
 
 
 def trajectories(sequence: Sequence, simulated: list[Simulated]) -> Figure:
@@ -76,7 +76,7 @@ def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
         top.plot(s.time, one.x[..., 0], color=colour, linewidth=0.9)
         below.axhline(0, color=GREY, linewidth=0.8)
         below.plot(s.time, (one.x - s.x)[..., 0], color=colour, linewidth=0.9)
-        dress(top, y="position (m)", title=f"{one.title}: {rmse(s, one):.2g} m rms")
+        dress(top, y="position (m)", title=one.heading)
         dress(below, x="clock time (s)", y="simulated −\nmeasured (m)")
         for ax in (top, below):
             ax.label_outer()
@@ -91,13 +91,16 @@ def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
         colour = one.style["color"]
         draw_walls(ax, s.walls)
         ax.plot(s.x[..., 0], s.x[..., 1], color=GREY, linewidth=2.2, alpha=0.55)
-        ax.plot(one.x[..., 0], one.x[..., 1], color=colour, linewidth=0.9)
-        ends = np.stack([s.x[-1], one.x[-1]], 1)
-        ax.add_collection(LineCollection(list(ends), colors="black", linewidths=0.7))
+        starts = range(0, s.n_samples, one.restart or s.n_samples)
+        for first in starts:
+            part = slice(first, first + (one.restart or s.n_samples))
+            ax.plot(*one.x[part].transpose(2, 0, 1), color=colour, linewidth=0.9)
+            ends = np.stack([s.x[part][-1], one.x[part][-1]], 1)
+            ax.add_collection(LineCollection(list(ends), colors="black", linewidths=0.7))
         ax.plot(*s.x[-1].T, linestyle="", markersize=4, **_MEASURED)
         ax.plot(*one.x[-1].T, linestyle="", markersize=4, **one.style)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        dress(ax, x="x (m)", y="y (m)", title=f"{one.title}: {rmse(s, one):.2g} m rms")
+        dress(ax, x="x (m)", y="y (m)", title=one.heading)
         ax.label_outer()
     figure.legend(handles=_handles(simulated, True), **_LEGEND)
     return figure
@@ -158,7 +161,7 @@ def _moment(ax: Axes, s: Sequence, one: Simulated, k: int) -> None:
     if s.x.shape[2] == 1:
         # cars are shown from a car that drives along in their midst, the scale that of all moments
         frame = s.x.mean((1, 2))
-        half = max(np.abs(x[..., 0] - frame[:, None]).max() for x in (s.x, one.x))
+        half = max(np.nanmax(np.abs(x[..., 0] - frame[:, None])) for x in (s.x, one.x))
         ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
         ax.set_yticks([0, 1], ["simulated", "measured"])
         real, model = (
