@@ -219,8 +219,8 @@ def test_what_is_asked_too_early_or_does_not_exist_is_refused(tidy: pd.DataFrame
         nnode.Calibrator().set_params(optimiser="lbfgs")
     with pytest.raises(DataError, match="agent"):
         nnode.fit(tidy.drop(columns="agent"), "traffic")
-    with pytest.raises(DataError, match="row 8: column 'x' holds nothing"):
-        nnode.Calibrator().fit(tidy.assign(x=tidy.x.where(tidy.index != 7)))
+    with pytest.raises(DataError, match="row 8: column 'x' holds 'here'"):
+        nnode.Calibrator().fit(tidy.assign(x=tidy.x.astype(object).where(tidy.index != 7, "here")))
     for nothing in (3, [], np.zeros((3, 2))):
         with pytest.raises(DataError, match="expected a data frame"):
             nnode.Calibrator().fit(nothing)
