@@ -46,7 +46,7 @@ def scenes(found: Found) -> list[Scene]:
         if found.diagnosis.effects:
             paths[AFTER], errors[AFTER] = after.x, float(row["after"])
         notes = {title: f"error {amount(error)} m²" for title, error in errors.items()}
-        every.append(Scene(before.sequence, paths, notes, before.restart))
+        every.append(Scene(before.sequence, paths, notes=notes, restart=before.restart))
     return every
 
 

@@ -69,7 +69,7 @@ def test_trajectories_and_moments_of_a_platoon() -> None:
     s = platoon()
     late = s.x - 0.5 * s.time[:, None, None]
     late[:, -1] = np.nan  # the leader is given
-    both = as_drawn(Scene(s, {"without": late, "with": s.x}, {"without": "error 1.3 m²"}))
+    both = as_drawn(Scene(s, {"without": late, "with": s.x}, notes={"without": "error 1.3 m²"}))
     figure = trajectories(s, both)
     assert [ax.get_title() for ax in figure.axes[:2]] == ["without: error 1.3 m²", "with"]
     assert len(figure.axes) == 4
