@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -11,16 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.figure import Figure
 
 from nnode.app.training import straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
+from nnode.calibrate.evaluate import sensitivity
 from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import Source
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.files import xarray
 from nnode.models import System
 from nnode.models.term import short_names
@@ -31,7 +34,22 @@ if TYPE_CHECKING:
 
     from nnode.calibrate.gauss_newton.pooling import Own
 
+log = logging.getLogger(__name__)
+
 _BOUND = {"low": "lower", "high": "upper"}
+#: Relative change of a cost by relative change of a parameter below which a minimum is reached. Of
+#: ``sf`` on Jülich data it is 1e-6 to 5e-6 at minima, and 28 to 1500 where L-BFGS stalls.
+_LEVEL = 1e-3
+#: An epoch moved nothing where it lowered the cost by less than moving one parameter by this share
+#: does at first order.
+_MOVED = 1e-4
+#: Share of the first cost below which the data are fitted without any error, as those of a model's
+#: own simulation are: relative changes of such a cost say nothing.
+_EXACT = 1e-6
+STALLED = (
+    "the line search stalled: the last epoch found no lower cost, although the gradient is not 0; "
+    "these parameters are no minimum. Start from other parameters, or take optimizer=gauss_newton"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +76,9 @@ class Calibration:
         pooling: how they came about, and costs of second halves, which they were not calibrated on.
         start_speeds: ``kind``, measured, smoothed or fitted; of fitted ones ``sequences``, first
             speeds (m/s) by vehicle, and their root mean square ``change`` from the data's.
+        status: ``converged``; ``stalled``: the line search of L-BFGS found no lower cost although
+            the gradient says that there is one; ``stopped``: at the last epoch, or of a method that
+            does not say.
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
@@ -78,6 +99,7 @@ class Calibration:
     own: pd.DataFrame | None
     pooling: dict[str, Any]
     start_speeds: dict[str, Any]
+    status: str
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
@@ -94,6 +116,10 @@ class Calibration:
         if np.isfinite(self.cost_heldout):
             before, after = self.heldout_start, self.cost_heldout
             lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        if self.status == "stalled":
+            lines.append(STALLED)
+        if self.clusters == 1:
+            lines.append("there are no intervals: all training sequences are one cluster")
         if "change" in self.start_speeds:
             lines.append(
                 f"first speeds of training sequences are fitted: {self.start_speeds['change']:.3g} "
@@ -171,6 +197,7 @@ class Calibration:
                 "cost_train": self.cost,
                 "cost_heldout": heldout,
                 "epoch": self.epoch,
+                "status": self.status,
                 **{name: row["estimate"] for name, row in rows.items()},
                 "seconds": round(self.seconds, 1),
             },
@@ -221,6 +248,9 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
     found, own, speeds = _by_tangents(trainer, model, store)
+    status = _status(trainer, model, store)
+    if status == "stalled":
+        log.warning("%s", STALLED)
     known = found.get("parameters", {})
     # an epoch of an older checkpoint that was resumed may know its parameters by other names
     rows = {
@@ -246,10 +276,32 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         own=None if own is None else own.table,
         pooling=own.facts if own else {},
         start_speeds=speeds,
+        status=status,
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
     )
+
+
+def _status(trainer: Trainer, model: System, store: Source) -> str:
+    """How a training ended, see :class:`Calibration`."""
+    if isinstance(trainer.optimizer, GaussNewton):
+        return "converged" if trainer.optimizer.converged else "stopped"
+    costs = [row["cost/train"] for row in trainer.history]
+    if not isinstance(trainer.optimizer, torch.optim.LBFGS) or len(costs) < 2:
+        return "stopped"
+    indices = [
+        i for i, e in enumerate(store.index) if e["name"] in trainer.provenance.split["train"]
+    ]
+    (batch,) = stream(straight_loader(store, indices, 0), trainer.dtype)
+    model = copy.deepcopy(model).cpu()
+    try:
+        slope = sensitivity(model, trainer.solver, batch, trainer.options.cost)
+    except SimulationError:
+        return "stopped"
+    if slope <= _LEVEL or costs[-1] <= _EXACT * costs[0]:
+        return "converged"
+    return "stalled" if 1 - costs[-1] / costs[-2] < _MOVED * slope else "stopped"
 
 
 def _by_tangents(
@@ -264,11 +316,11 @@ def _by_tangents(
     # compiled code takes a second to import
     from nnode.calibrate.gauss_newton.intervals import intervals
     from nnode.calibrate.gauss_newton.pooling import own_parameters
-    from nnode.calibrate.gauss_newton.start_speeds import COSTS
+    from nnode.calibrate.gauss_newton.start_speeds import cost_of
     from nnode.solvers.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
-    make = partial(COSTS[options.start_speeds], solver=trainer.solver, convention=options.cost)
+    make = partial(cost_of, options.start_speeds, solver=trainer.solver, convention=options.cost)
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))

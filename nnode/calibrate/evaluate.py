@@ -15,7 +15,7 @@ from nnode.errors import SimulationError
 from nnode.laws.lane import Rule
 from nnode.models import Crowd, FollowTheLeader, Relaxation, System, Traffic
 from nnode.models.own_law import FormulaForce
-from nnode.models.term import Term
+from nnode.models.term import Interval, Term
 from nnode.solvers.base import Solver, Trajectory
 
 #: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
@@ -137,6 +137,31 @@ def _check_finite(error: Tensor, batch: Batch) -> None:
             f"{float(error[k, b, n].sqrt()):.3g} m away at {k * batch.dt:g} s after the start; "
             "check the sequence, start from other parameters, or take a smaller solver.dt"
         )
+
+
+def sensitivity(
+    system: System, solver: Solver, batch: Batch, convention: Convention = Convention.integral
+) -> float:
+    """Largest relative change of the mean cost by the relative change of a parameter, |p g / J|.
+
+    It is 0 at a minimum, whatever the parameters' units. Slopes that press a parameter against the
+    bound where it is do not count.
+
+    Raises:
+        SimulationError: the model cannot be simulated.
+    """
+    cost = sequence_costs(solver(system, batch), batch, convention).mean()
+    own = {name: p for name, p in system.named_parameters() if p.requires_grad}
+    slopes = torch.autograd.grad(cost, list(own.values()), allow_unused=True)
+    free, most = Interval(), 0.0
+    for (name, p), slope in zip(own.items(), slopes, strict=True):
+        if slope is None:
+            continue
+        bound = system.bounds().get(name, free)
+        pressed = ((p <= bound.low) & (slope > 0)) | ((p >= bound.high) & (slope < 0))
+        share = (p * slope / cost).masked_fill(pressed, 0.0).abs()
+        most = max(most, float(share.detach().max()))
+    return most
 
 
 def _times(batch: Batch) -> Tensor:

@@ -12,7 +12,7 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
-from nnode.laws.crowd import CrowdRule
+from nnode.laws.crowd import CrowdLaw, CrowdRule
 from nnode.laws.lane import Lane
 from nnode.models.crowd_formula import crowd_of
 from nnode.models.formula import Law, begins, lane_of, rates_of, starts_of
@@ -285,8 +285,13 @@ class Crowd(System):
         self.neighbours = neighbours
 
     @property
+    def formula(self) -> CrowdLaw | None:
+        """The model's formula; None where a term is code without one."""
+        return crowd_of(self._terms())
+
+    @property
     def names_places(self) -> bool:
-        law = crowd_of(self._terms())
+        law = self.formula
         return law is None or law.names_places
 
     def scene(self, batch: Batch) -> Scene:

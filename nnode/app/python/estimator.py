@@ -59,8 +59,8 @@ class Calibrator:
         start_speeds: ``given``, or ``fitted`` beside the parameters to each training sequence; see
             :mod:`nnode.calibrate.gauss_newton.start_speeds`.
         optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the
-            command does, Gauss and Newton's method for the field's laws, else L-BFGS (where the
-            command has the paper's stochastic descent).
+            command does, Gauss and Newton's method for the field's laws; also for ``sf``, and
+            L-BFGS for all others (where the command has the paper's stochastic descent).
         solver: ``fused`` (compiled) or ``torchdiffeq``; None: fused.
         method: of stepping; None: the solver's choice.
         dt: s, step; None: the solver's choice.
@@ -205,7 +205,9 @@ class Calibrator:
 
     def _config(self, given: Sequences) -> DictConfig:
         """The same configuration as the command's."""
-        field = isinstance(self.model, str) and self.model in FIELD
+        field = isinstance(self.model, str) and (
+            self.model in FIELD or (self.model == "sf" and self.solver in (None, "fused"))
+        )
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
         trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}

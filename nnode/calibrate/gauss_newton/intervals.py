@@ -34,16 +34,20 @@ def intervals(cost: TangentCost, row: np.ndarray, cluster: np.ndarray) -> dict[s
         cluster: ``(B,)`` which cluster a sequence belongs to.
 
     Returns:
-        ``parameters``: address to ``value``, ``low``, ``high``, ``at_bound`` and ``identified``;
+        ``parameters``: address to ``value``, ``low``, ``high``, ``at_bound`` and ``identified``,
+        None where there is one cluster, and the cost depends on the parameter;
         ``correlation``: address to address to correlation; ``clusters``: their number. Weights of
         networks are not listed.
     """
     low, high = at_bounds(cost, row)
     free = ~(low | high)
     weights = np.full(len(cost.batch), 1 / len(cost.batch))
-    covariance = sandwich(cost(row), weights, cluster, free)
+    curved = cost(row)
+    covariance = sandwich(curved, weights, cluster, free)
     spread = np.sqrt(np.diag(covariance))
     number = len(np.unique(cluster))
+    # with one cluster nothing tells how sure the others are
+    lost = ~free | np.isinf(np.diag(sandwich(curved, weights, np.arange(len(weights)), free)))
     factor = float(students_t.ppf(0.5 + LEVEL / 2, max(number - 1, 1)))
     listed = [i for i, name in enumerate(cost.names) if cost.physical(name)]
     parameters: dict[str, Any] = {}
@@ -57,7 +61,7 @@ def intervals(cost: TangentCost, row: np.ndarray, cluster: np.ndarray) -> dict[s
             "low": float(max(row[i] - wide, cost.low[i])) if known else None,
             "high": float(min(row[i] + wide, cost.high[i])) if known else None,
             "at_bound": "low" if low[i] else "high" if high[i] else None,
-            "identified": bool(known and 2 * wide < scale),
+            "identified": bool(known and 2 * wide < scale) if number > 1 or lost[i] else None,
         }
     apart = np.outer(spread, spread)
     apart = np.where((apart > 0) & np.isfinite(apart), apart, np.nan)

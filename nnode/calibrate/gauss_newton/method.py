@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,11 @@ from nnode.solvers.base import simulated_batch, substeps
 
 #: Share of the cost below which a fall is rounding.
 _ROUNDING = 1e-14
+#: A direction is flat where the scaled curvature is this share of the largest one: the errors of
+#: its derivatives, 1e-9 and less, leave nothing of it.
+_FLAT = 1e-10
+#: Share of a parameter's unit vector in flat directions, which is 0 but for rounding, at most 1e-5.
+_PART = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,8 +65,18 @@ class TangentCost(Problem):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        system, batch = self.system, self.batch
-        lane = lanes.supports(system, batch)
+        system = self.system
+        self._places = {s: at for s, at in self._owned().items() if at[0] in self._own}
+        self.names = list(self._places)
+        limits, free = system.bounds(), Interval()
+        bounds = [limits.get(name, free) for name, _, _ in self._places.values()]
+        self.low = np.array([b.low for b in bounds])
+        self.high = np.array([b.high for b in bounds])
+        self.start = np.clip(self.row(system), self.low, self.high)
+
+    def _owned(self) -> dict[str, Any]:
+        """Symbols of the formula's parameters to where they are in the model."""
+        lane = lanes.supports(self.system, self.batch)
         added = [] if lane is None else list(lane.rates)[lane.order :]
         if lane is None or any(state not in lane.starts for state in added):
             raise ConfigError(
@@ -69,13 +85,7 @@ class TangentCost(Problem):
                 "nnode.calibrate.least_squares, which takes differences"
             )
         self.lane = lane
-        self._places = {s: at for s, at in lane.owned.items() if at[0] in self._own}
-        self.names = list(self._places)
-        limits, free = system.bounds(), Interval()
-        bounds = [limits.get(name, free) for name, _, _ in self._places.values()]
-        self.low = np.array([b.low for b in bounds])
-        self.high = np.array([b.high for b in bounds])
-        self.start = np.clip(self.row(system), self.low, self.high)
+        return lane.owned
 
     def row(self, system: System) -> np.ndarray:
         """``(P,)`` the parameters of a system of the same model."""
@@ -89,6 +99,10 @@ class TangentCost(Problem):
         for value, (name, place, _) in zip(row, self._places.values(), strict=True):
             own[name].view(-1)[place] = float(value)
         return system
+
+    def begin(self, row: np.ndarray) -> np.ndarray:
+        """A better start of a minimisation, if there is one."""
+        return row
 
     def starts(self, rows: np.ndarray) -> dict[str, list[float]]:
         """First speeds (m/s) that were fitted, by sequence and vehicle; none here."""
@@ -310,6 +324,10 @@ def sandwich(
         cluster: ``(B,)`` which cluster a sequence belongs to.
         free: ``(P,)`` True for parameters that are at no bound; others do not vary.
 
+    Returns:
+        The variance is infinite of a parameter that the cost does not depend on, alone or together
+        with others.
+
     Source:
         Liang & Zeger 1986, with the factor G / (G - 1) for G clusters.
     """
@@ -323,8 +341,12 @@ def sandwich(
         :, free
     ]
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
+    kept = values > _FLAT * values.max()
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     bread = inverse / np.outer(scale, scale)
     meat = scores.T @ scores * len(names) / (len(names) - 1)
     found[np.ix_(free, free)] = bread @ meat @ bread
+    flat = np.flatnonzero(free)[(vectors[:, ~kept] ** 2).sum(1) > _PART]
+    found[flat, flat] = math.inf
     return found

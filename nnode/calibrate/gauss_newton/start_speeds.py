@@ -8,9 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.gauss_newton.crowd import CrowdCost
 from nnode.calibrate.gauss_newton.method import Curved, TangentCost
 from nnode.calibrate.options import StartSpeeds
+from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
+from nnode.models.system import System
+from nnode.solvers.fused.engine import FusedSolver
 
 #: First speeds: steps at most, the share of the cost below which a fall ends them, and the
 #: difference by which their derivatives are taken, m/s.
@@ -119,8 +124,20 @@ class StartSpeedCost(TangentCost):
         return np.linalg.pinv(bend, rcond=1e-10, hermitian=True)
 
 
-#: The cost by ``trainer.start_speeds``.
-COSTS: dict[StartSpeeds, type[TangentCost]] = {
-    StartSpeeds.given: TangentCost,
-    StartSpeeds.fitted: StartSpeedCost,
-}
+def cost_of(
+    starts: StartSpeeds, system: System, batch: Batch, solver: FusedSolver, convention: Convention
+) -> TangentCost:
+    """The cost by ``trainer.start_speeds``, of a lane or of people.
+
+    Raises:
+        ConfigError: a model without exact tangents, or people whose first speeds are to be fitted.
+    """
+    if system.domain == "crowd":
+        if starts is StartSpeeds.fitted:
+            raise ConfigError(
+                "trainer.start_speeds=fitted is for vehicles in lanes; take "
+                "trainer.start_speeds=given for people"
+            )
+        return CrowdCost(system, batch, solver, convention)
+    kind = StartSpeedCost if starts is StartSpeeds.fitted else TangentCost
+    return kind(system, batch, solver, convention)

@@ -72,7 +72,7 @@ class ConsensusOptions(OptimizerOptions):
 
 @dataclass
 class GaussNewtonOptions(OptimizerOptions):
-    """Damped Gauss-Newton on exact tangents; lanes with solver=fused, all sequences at once."""
+    """Damped Gauss-Newton; formulas of lanes or people, solver=fused, all sequences at once."""
 
     name: str = "gauss_newton"
     damping: float = 1e-3  # of the first step, relative to each parameter's curvature

@@ -20,7 +20,9 @@ from nnode.solvers.base import Solver
 
 
 class GaussNewton(Optimizer):
-    """A damped step of Gauss and Newton's on exact tangents, refused steps with more damping.
+    """A damped step of Gauss and Newton's, refused steps with more damping.
+
+    Derivatives are exact tangents of lanes, and differences of people.
 
     It is told by :meth:`attach` what is minimised, in place of a closure.
 
@@ -42,7 +44,8 @@ class GaussNewton(Optimizer):
         if not tolerance >= 0:
             raise ValueError(f"tolerance={tolerance} must not be negative")
         trained = [p for p in system.parameters() if p.requires_grad]
-        super().__init__(trained, {"damping": damping, "converged": False, "starts": {}})
+        first = {"damping": damping, "converged": False, "starts": {}, "begun": False}
+        super().__init__(trained, first)
         self.system, self.tolerance = system, tolerance
         self._cost: Any = None
         self._batch: Batch | None = None
@@ -61,19 +64,18 @@ class GaussNewton(Optimizer):
         """Say what the next step lowers.
 
         Raises:
-            ConfigError: another solver than the compiled one, or a model that is no formula of a
-                lane.
+            ConfigError: another solver than the compiled one, or a model that is no formula.
         """
         if self._batch is batch:
             return
         self._batch = batch
         # compiled code takes a second to import
-        from nnode.calibrate.gauss_newton.start_speeds import COSTS
+        from nnode.calibrate.gauss_newton.start_speeds import cost_of
         from nnode.solvers.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
-        self._cost = COSTS[starts](self.system, self.started(batch), solver, convention)
+        self._cost = cost_of(starts, self.system, self.started(batch), solver, convention)
 
     def started(self, batch: Batch) -> Batch:
         """A batch with the first speeds that were fitted to its sequences, if any were."""
@@ -94,6 +96,8 @@ class GaussNewton(Optimizer):
         """
         cost, group = self._cost, self.param_groups[0]
         row = np.clip(cost.row(self.system), cost.low, cost.high)
+        if not group.get("begun", True):  # states of earlier versions have begun
+            row, group["begun"] = cost.begin(row), True
         curved = cost(row)
         now = float(curved.cost.mean())
         if not math.isfinite(now):
@@ -103,8 +107,8 @@ class GaussNewton(Optimizer):
             lambda trial: float(cost.costs(trial).mean()),
             now, row, gradient, hessian, group["damping"], cost.low, cost.high,
         )  # fmt: skip
+        cost.fill_(self.system, end)
         if value < now:
-            cost.fill_(self.system, end)
             group["damping"] = damping
         group["starts"] = cost.starts(end)
         group["converged"] = not now - value > self.tolerance * now

@@ -99,15 +99,17 @@ class FusedSolver:
             DataError: the batch is of another domain, or has no sampling interval.
             SimulationError: a simulated state is not a finite number.
         """
+        return check_finite(self.unchecked(system, batch), batch)
+
+    def unchecked(self, system: System, batch: Batch) -> Trajectory:
+        """The same, with states that are not finite among them."""
         n = self._substeps(system, batch)
         lane = lanes.supports(system, batch)
-        if lane is not None:
-            near, origin = simulated_batch(system, batch)
-            y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
-            found = observed(system, y, batch, origin)
-        else:
-            found = self._other(system, batch, n)
-        return check_finite(found, batch)
+        if lane is None:
+            return self._other(system, batch, n)
+        near, origin = simulated_batch(system, batch)
+        y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
+        return observed(system, y, batch, origin)
 
     def ensemble(
         self, system: System, parameters: Mapping[str, Tensor], batch: Batch
