@@ -23,6 +23,8 @@ from nnode.program import typed
 
 #: Stands before what is printed of each level.
 _SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
+#: Commands that take the same options of the data.
+_NEXT = ("train", "discover")
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,9 +133,33 @@ def summary(found: Examination, lines: list[str]) -> str:
     text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
     if found.source.convert:
         text += ["", "no reader takes the file as it is; in Python:", *found.source.convert]
-    text += ["", "to read it:", "  python scripts/prepare_data.py " + " ".join(lines)]
-    text += ["the same options go to python scripts/train.py and python scripts/discover.py"]
+    words = " ".join(lines)
+    text += ["", "to read it:", f"  python scripts/prepare_data.py {words}"]
+    text += ["to calibrate a model, and to diagnose it:"]
+    text += [f"  python scripts/{name}.py {_model(found)} {words}" for name in _NEXT]
+    text += ["in Python:", *(f"  {line}" for line in python_lines(found))]
     return "\n".join(text)
+
+
+def _model(found: Examination) -> str:
+    """The domain's simplest model of an acceleration or a force."""
+    return "model=sf" if found.scale.domain == "crowd" else "model=idm"
+
+
+def python_lines(found: Examination) -> list[str]:
+    """Lines of Python that read the file and calibrate a model, with all that is told."""
+    group, *_ = command(found)
+    own = plain_options(type(found.source.options)())
+    values = plain_options(found.source.options)
+    kept = {k: v for k, v in values.items() if v != own[k] and k not in ("name", "path")}
+    path = values.get("path") or ""
+    told = [repr(path)] if path else []
+    told += [f"data={group.partition('=')[2]!r}", *(f"{k}={v!r}" for k, v in kept.items())]
+    return [
+        "import nnode",
+        f"data = nnode.sequences({', '.join(told)})",
+        f"nnode.fit(data, model={_model(found).partition('=')[2]!r})",
+    ]
 
 
 def _units(found: Examination) -> str:
@@ -190,10 +216,10 @@ def _usage(found: Examination, lines: list[str]) -> str:
             f"No reader takes the file as it is. In Python:\n\n```python\n{made}\n```\n\nThen:\n\n"
         )
     words = " \\\n    ".join(lines)
-    return typed(
-        f"{text}```sh\npython scripts/prepare_data.py {words}\n```\n\nThe same options go to "
-        "`python scripts/train.py` and `python scripts/discover.py`."
-    )
+    commands = [f"python scripts/prepare_data.py {words}"]
+    commands += [f"python scripts/{name}.py {_model(found)} {words}" for name in _NEXT]
+    shell, python = "\n".join(commands), "\n".join(python_lines(found))
+    return typed(f"{text}```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```")
 
 
 def _columns(found: Examination) -> list[Block]:

@@ -88,13 +88,19 @@ def unknown_choice(group: str, chosen: str, there: Iterable[str]) -> ConfigError
     return ConfigError(text)
 
 
-def unknown_option(override: str, config: DictConfig | None, name: str) -> ConfigError:
+def unknown_option(
+    override: str,
+    config: DictConfig | None,
+    name: str,
+    more: str = ", --help explains them",
+) -> ConfigError:
     """The error of an option that a command does not have.
 
     Args:
         override: as it was typed.
         config: what the command's choices have; None: unknown.
         name: of the command.
+        more: stands behind what there is.
     """
     key, _, value = override.lstrip("+~").partition("=")
     text = f"{name} has no option {key}"
@@ -115,7 +121,7 @@ def unknown_option(override: str, config: DictConfig | None, name: str) -> Confi
         every = {one.rpartition(".")[2]: one for one in reversed([*_keys(config)])}
         near = _near(rest.rpartition(".")[2], every, cutoff=0.75)
     whose = at.rstrip(".") or name
-    return ConfigError(f"{text}; {whose} has {', '.join(own)}, --help explains them{near}")
+    return ConfigError(f"{text}; {whose} has {', '.join(own)}{more}{near}")
 
 
 def wrong_value(override: str, said: str, config: DictConfig | None) -> ConfigError:

@@ -117,6 +117,67 @@ def _table(
 ) -> Examination:
     table = raw.table
     assert table is not None
+    seen = scaled(raw, found, domain, rate)
+    rate = rate or raw.rate
+    every = seen.scales
+    source = source_of(raw, found, seen.scale, seen.tracks)
+    examined = Examination(raw.path, raw, found, every, seen.known, seen.tracks, [], source)
+    needed: dict[str, str] = {
+        m: found[m].column for m in ("agent", seen.clock, "x", "y", "x_follower", "x_leader")
+        if m in found
+    }  # fmt: skip
+    examined.findings += find.cells(table, needed)
+    examined.findings += find.rows(table, seen.agent[: len(table)], seen.time[: len(table)])
+    examined.findings += _unsure(every, rate)
+    examined.findings += _rivals(found)
+    sequences = [] if source.convert else _tried(source, examined.findings)
+    return _judged(examined, sequences, rate)
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """The rows of a table in the units that are most probable.
+
+    Attributes:
+        scales: combinations of units, the most probable first.
+        known: medians in the file's own units.
+        tracks: rows in SI units.
+        agent, time: of every row, in the file's own units.
+        clock: the meaning of the column that times are from, ``time`` or ``frame``.
+    """
+
+    scales: list[Scale]
+    known: Medians
+    tracks: Tracks
+    agent: np.ndarray
+    time: np.ndarray
+    clock: str
+
+    @property
+    def scale(self) -> Scale:
+        """The units that are taken."""
+        return self.scales[0]
+
+
+def scaled(
+    raw: Raw,
+    found: Mapping[str, Meaning],
+    domain: Domain | None,
+    rate: float | None,
+    told: Mapping[str, str] | None = None,
+) -> Scaled:
+    """Rows of a table, and its units.
+
+    Args:
+        found: column by meaning.
+        domain, rate: see :func:`examine`.
+        told: units by ``position``, ``time``, ``speed``, as the user tells them.
+
+    Raises:
+        DataError: a column that is needed was not recognised, or nothing moves.
+    """
+    table = raw.table
+    assert table is not None
     pairs = {"x_follower", "x_leader"} <= set(found)
     clock = next((m for m in ("time", "frame") if m in found), None)
     lacking = [] if clock else ["a time or a frame"]
@@ -124,10 +185,10 @@ def _table(
     lacking += [] if pairs or "agent" in found else ["an agent"]
     if lacking or clock is None:
         listed = ", ".join(map(str, table.frame.columns[:20]))
-        told = ", ".join(f"{m.column} as {meaning}" for meaning, m in found.items())
+        taken = ", ".join(f"{m.column} as {meaning}" for meaning, m in found.items())
         raise DataError(
             f"{raw.path}: no column was recognised as {' nor as '.join(lacking)}; it has {listed} "
-            f"(taken: {told or 'none'}); name the columns agent, time, x (and y), see docs/data.md"
+            f"(taken: {taken or 'none'}); name the columns agent, time, x (and y), see docs/data.md"
         )
     time = numbers(table.frame, found[clock].column)
     files = _agents(raw, found, pairs)
@@ -148,6 +209,7 @@ def _table(
                 units[what] = found[meaning].unit
     if raw.unit:
         units["position"] = raw.unit
+    units |= told or {}
     if clock == "frame":
         units["time"] = "frame"
     rate = rate or raw.rate
@@ -159,17 +221,18 @@ def _table(
     )  # fmt: skip
     scale = every[0]
     si = tracks.scaled(scale.metres, scale.seconds, scale.per_second)
-    source = source_of(raw, found, scale, si)
-    examined = Examination(raw.path, raw, found, every, known[scale.domain], si, [], source)
-    needed: dict[str, str] = {
-        m: found[m].column for m in ("agent", clock, "x", "y", "x_follower", "x_leader")
-        if m in found
-    }  # fmt: skip
-    examined.findings += find.cells(table, needed)
-    examined.findings += find.rows(table, files[: len(table)], time[: len(table)])
-    examined.findings += _unsure(every, rate)
-    sequences = [] if source.convert else _tried(source, examined.findings)
-    return _judged(examined, sequences, rate)
+    return Scaled(every, known[scale.domain], si, files, time, clock)
+
+
+def _rivals(found: Mapping[str, Meaning]) -> Iterator[Finding]:
+    """Meanings that more than one column may have."""
+    for meaning, one in found.items():
+        if one.rivals:
+            yield Finding(
+                "columns", "warning",
+                f"{meaning} may be {one.column} or {' or '.join(one.rivals)}, which hold different "
+                f"values; {one.column} is taken",
+            )  # fmt: skip
 
 
 def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Reader of a tidy table: one row per sequence, time and agent, in SI units."""
+"""Reader of a tidy table: one row per sequence, time and agent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from nnode.data.exits import destinations, exits_of, read_exits
 from nnode.data.options import TableOptions
 from nnode.data.readers.columns import Table, opened
-from nnode.data.readers.recordings import check_known, table_path, wanted
+from nnode.data.readers.recordings import check_known, one_of, table_path, wanted
+from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 
@@ -43,7 +44,7 @@ def read_table(
     Args:
         source: CSV or Parquet, or a table that is open, with the columns that
             :class:`TableOptions` lists.
-        options: ``domain`` and ``recording`` are read.
+        options: ``domain``, ``recording``, columns and units are read.
         walls: CSV or Parquet with a segment per row, x1, y1, x2, y2 (m).
 
     Returns:
@@ -60,7 +61,8 @@ def read_table(
     crowd = _is_crowd(options)
     table = opened(source)
     path = table.path
-    names = table.choose(_REQUIRED, _OPTIONAL)
+    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
+    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
         raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
@@ -74,10 +76,11 @@ def read_table(
             "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
         )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
-    time = table.numbers(names["time"])
-    values = {name: table.numbers(names[name]) for name in (*axes, *goals) if name in names}
+    time = table.numbers(names["time"]) * seconds_per_unit(options)
+    places = [name for name in (*axes, *goals) if name in names]
+    values = {name: table.numbers(names[name]) * metres for name in places}
     if "length" in names:
-        values["length"] = table.numbers(names["length"], empty=True)
+        values["length"] = table.numbers(names["length"], empty=True) * metres
     words = {k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names}
     recording = (
         table.names(names["recording"])

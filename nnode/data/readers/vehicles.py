@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.options import LaneOptions, VehicleTableOptions
+from nnode.data.options import LaneOptions, TableOptions, VehicleTableOptions
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.recordings import one_of, positive, table_path
@@ -22,7 +24,7 @@ SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 _LATEST = 2.0**52
 
 _REQUIRED = ("vehicle", "time", "x")
-_OPTIONAL = ("lane", "speed", "length", "kind")
+_OPTIONAL = ("lane", "speed", "length", "kind", "recording")
 
 
 def vehicle_files(options: LaneOptions) -> dict[str, Path]:
@@ -47,15 +49,39 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> list[Se
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     check_cutting(options)
     table = opened(source)
-    return cut_vehicles({table.path.stem: _rows(table, options)}, options)
+    rows = _rows(table, options)
+    column = table.choose(_REQUIRED, _OPTIONAL, options.columns).get("recording")
+    if column is None:
+        return cut_vehicles({table.path.stem: rows}, options)
+    recording = table.names(column)
+    return cut_vehicles({name: _part(rows, recording == name) for name in pd.unique(recording)},
+                        options)  # fmt: skip
+
+
+def _part(rows: Vehicles, chosen: np.ndarray) -> Vehicles:
+    """Some of the rows."""
+    number = np.flatnonzero(chosen)
+    cells = ("vehicle", "time", "x", "lane", "speed", "length", "kind")
+    own: dict[str, Any] = {
+        key: None if getattr(rows, key) is None else getattr(rows, key)[number] for key in cells
+    }
+    return Vehicles(path=rows.path, row=lambda i: rows.row(int(number[i])), **own)
+
+
+def seconds_per_unit(options: VehicleTableOptions | TableOptions) -> float:
+    """Seconds in a unit of a table's times.
+
+    Raises:
+        ConfigError: an unknown unit, or frames without their rate.
+    """
+    scale = one_of("time_unit", options.time_unit, {"s": 1.0, "ms": 1e-3, "frame": np.nan})
+    if options.time_unit == "frame":
+        scale = 1.0 / positive("frame_rate", options.frame_rate)
+    return scale
 
 
 def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
-    units = {"s": 1.0, "ms": 1e-3, "frame": np.nan}
-    scale = one_of("time_unit", options.time_unit, units)
-    if options.time_unit == "frame":
-        scale = 1.0 / positive("frame_rate", options.frame_rate)
-    time = table.numbers(column) * scale
+    time = table.numbers(column) * seconds_per_unit(options)
     far = np.flatnonzero(~(np.abs(time) < _LATEST * options.dt))
     if far.size:
         raise DataError(
