@@ -148,7 +148,7 @@ def _parted(bare: str | None) -> tuple[list[str], list[str]]:
         ConfigError: a word without a name, and no option that it could be meant for.
     """
     overrides, flags = [], []
-    for before, word in pairwise(sys.argv):
+    for before, word in pairwise(["", *sys.argv[1:]]):
         if before in _VALUED:
             if _VALUED[before] and word not in _VALUED[before]:
                 raise ConfigError(f"{before} {word}: expected one of {', '.join(_VALUED[before])}")
@@ -166,7 +166,7 @@ def _parted(bare: str | None) -> tuple[list[str], list[str]]:
         else:
             overrides.append(f"{bare}={literal(word)}")
             bare = None
-    if sys.argv[-1] in _VALUED.keys() - {"-i", "--info"} and len(sys.argv) > 1:
+    if len(sys.argv) > 1 and sys.argv[-1] in _VALUED.keys() - {"-i", "--info"}:
         raise ConfigError(f"{sys.argv[-1]} lacks its value; --help shows examples")
     return overrides, flags
 
