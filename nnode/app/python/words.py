@@ -35,7 +35,8 @@ def python_words() -> Iterator[None]:
 
 def as_arguments(text: str) -> str:
     """Words in which options are written as in a shell, with options as arguments."""
-    return _GROUP.sub(r"data='\1'", _OPTION.sub(_argument, text))
+    text = _OPTION.sub(_argument, text.replace("no option data.", "no option "))
+    return _GROUP.sub(r"data='\1'", text)
 
 
 def _argument(found: re.Match[str]) -> str:
