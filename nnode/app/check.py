@@ -15,16 +15,18 @@ from nnode.app.cli.typed import changes, group_defaults, plain_options
 from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.check.findings import Finding
 from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
-from nnode.data.sequence import Domain
-from nnode.errors import ConfigError
+from nnode.data.clusters import index_of
+from nnode.data.prepare import judge
+from nnode.data.sequence import Domain, Sequence
+from nnode.data.split import split
+from nnode.discover.inputs import LEAST
+from nnode.errors import ConfigError, NNodeError
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
 from nnode.program import typed
 
 #: Stands before what is printed of each level.
 _SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
-#: Commands that take the same options of the data.
-_NEXT = ("train", "discover")
 
 
 @dataclass(frozen=True, repr=False)
@@ -136,9 +138,37 @@ def summary(found: Examination, lines: list[str]) -> str:
     words = " ".join(lines)
     text += ["", "to read it:", f"  python scripts/prepare_data.py {words}"]
     text += ["to calibrate a model, and to diagnose it:"]
-    text += [f"  python scripts/{name}.py {_model(found)} {words}" for name in _NEXT]
+    text += [f"  {line}" for line in _next(found, words)]
     text += ["in Python:", *(f"  {line}" for line in python_lines(found))]
     return "\n".join(text)
+
+
+def _next(found: Examination, words: str) -> list[str]:
+    """Commands that go on with the data, as far as these suffice for them."""
+    kept = _kept(found)
+    held = [] if _heldout(found, kept) else ["data.split.heldout=0"]
+    lines = [" ".join([f"python scripts/train.py {_model(found)} {words}", *held])]
+    if len(kept) >= LEAST:
+        lines.append(f"python scripts/discover.py {_model(found)} {words}")
+    else:
+        lines.append(f"# a diagnosis needs at least {LEAST} sequences, there are {len(kept)}")
+    return lines
+
+
+def _kept(found: Examination) -> list[Sequence]:
+    """The sequences that are left when faulty ones are sorted out."""
+    try:
+        return judge(found.source.options, {}, found.sequences).kept if found.sequences else []
+    except NNodeError:
+        return []
+
+
+def _heldout(found: Examination, kept: list[Sequence]) -> bool:
+    """Whether some of the sequences can be held out."""
+    try:
+        return bool(split(index_of(kept), found.source.options.split).heldout) if kept else True
+    except NNodeError:
+        return False
 
 
 def _model(found: Examination) -> str:
@@ -149,6 +179,7 @@ def _model(found: Examination) -> str:
 def python_lines(found: Examination) -> list[str]:
     """Lines of Python that read the file and calibrate a model, with all that is told."""
     group, *_ = command(found)
+    held = "" if _heldout(found, _kept(found)) else ", heldout=0"
     own = plain_options(type(found.source.options)())
     values = plain_options(found.source.options)
     kept = {k: v for k, v in values.items() if v != own[k] and k not in ("name", "path")}
@@ -158,7 +189,7 @@ def python_lines(found: Examination) -> list[str]:
     return [
         "import nnode",
         f"data = nnode.sequences({', '.join(told)})",
-        f"nnode.fit(data, model={_model(found).partition('=')[2]!r})",
+        f"nnode.fit(data, model={_model(found).partition('=')[2]!r}{held})",
     ]
 
 
@@ -217,7 +248,7 @@ def _usage(found: Examination, lines: list[str]) -> str:
         )
     words = " \\\n    ".join(lines)
     commands = [f"python scripts/prepare_data.py {words}"]
-    commands += [f"python scripts/{name}.py {_model(found)} {words}" for name in _NEXT]
+    commands += _next(found, words)
     shell, python = "\n".join(commands), "\n".join(python_lines(found))
     return typed(f"{text}```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```")
 

@@ -12,25 +12,13 @@ from typing import Any
 
 import pandas as pd
 
-from nnode.data.check.columns import Meaning, meanings, numbers, plain
-from nnode.data.check.examine import FAIR, LIKELY, SURE, Scaled, scaled, sure
+from nnode.data.check.columns import Meaning, meanings, plain
+from nnode.data.check.examine import FAIR, LIKELY, SURE, sure
 from nnode.data.check.raw import Raw, read_raw
+from nnode.data.check.rows import Scaled, in_memory, scaled
 from nnode.data.check.scale import Scale
-from nnode.data.check.source import (
-    JOINT,
-    joint,
-    native_source,
-    people_of,
-    people_rate,
-    source_of,
-)
-from nnode.data.options import (
-    DataOptions,
-    PairOptions,
-    TableOptions,
-    VehicleTableOptions,
-    WalkwayOptions,
-)
+from nnode.data.check.source import native_source, source_of
+from nnode.data.options import DataOptions, PairOptions, TableOptions, VehicleTableOptions
 from nnode.data.readers.columns import Table
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError, DataError, NNodeError
@@ -118,15 +106,7 @@ def recognised(
     line = _line(raw, found, seen, read.group)
     if not memory and not read.convert:
         return Recognised(read.group, read.options, None, line)
-    options, table = replace(read.options, path=""), raw.table  # type: ignore[call-arg]
-    if isinstance(options, WalkwayOptions):
-        options = replace(options, frame_rate=people_rate(seen.tracks), unit=None)
-        table = Table(people_of(raw, found, seen.scale, people_rate(seen.tracks)))
-    elif isinstance(options, PairOptions) and (seen.scale.seconds != 1 or seen.clock == "frame"):
-        clock = numbers(table.frame, found[seen.clock].column)
-        table = Table(table.frame.assign(time=seen.scale.seconds * clock))
-    elif isinstance(options, VehicleTableOptions) and JOINT in options.columns.values():
-        table = Table(table.frame.assign(**{JOINT: joint(raw, found)}))
+    options, table = in_memory(raw, found, seen, read)
     return Recognised(read.group, options, table, line)
 
 
