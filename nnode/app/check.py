@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import cast
@@ -16,7 +16,7 @@ from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.check.findings import Finding
 from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
 from nnode.data.clusters import index_of
-from nnode.data.prepare import judge
+from nnode.data.identity import identify
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.split import split
 from nnode.discover.inputs import LEAST
@@ -157,10 +157,10 @@ def _next(found: Examination, words: str) -> list[str]:
 
 def _kept(found: Examination) -> list[Sequence]:
     """The sequences that are left when faulty ones are sorted out."""
-    try:
-        return judge(found.source.options, {}, found.sequences).kept if found.sequences else []
-    except NNodeError:
-        return []
+    domain, kept = found.scale.domain, found.sequences
+    agents, _ = identify(kept, domain, found.source.options.agents) if kept else ([], [])
+    unique = [replace(s, agents=own) for s, own in zip(kept, agents, strict=True)]
+    return [s for s in unique if s.name not in found.faults]
 
 
 def _heldout(found: Examination, kept: list[Sequence]) -> bool:

@@ -84,7 +84,15 @@ FORMS: list[tuple[Form, int | None]] = [
     (tidy, 5), (of_platoons, 5), (in_feet, 5), (with_semicolons, 5), (vehicles, 1),
     (recordings, None), (pairs, 1), (crowd, None), (crowd_of_runs, None), (pedpy, None),
 ]  # fmt: skip
-NAMES = [form.__name__ for form, _ in FORMS]
+#: Those that every run of the tests takes; the others take half a minute each.
+QUICK = ("of_platoons", "recordings", "pairs")
+CASES = [
+    pytest.param(
+        form, number, id=form.__name__,
+        marks=[] if form.__name__ in QUICK else [pytest.mark.thorough],
+    )
+    for form, number in FORMS
+]  # fmt: skip
 
 
 def commands(printed: str) -> list[list[str]]:
@@ -107,7 +115,7 @@ def blocks(printed: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize(("form", "number"), FORMS, ids=NAMES)
+@pytest.mark.parametrize(("form", "number"), CASES)
 def test_commands_and_python_that_are_printed_run(
     script: Script, tmp_path: Path, form: Form, number: int | None
 ) -> None:
@@ -123,13 +131,13 @@ def test_commands_and_python_that_are_printed_run(
     for name, *words in (prepare, train):
         ran = script(name, *words, f"hydra.run.dir={tmp_path / name}")
         assert ran.returncode == 0, ran.stderr
-    read, _, fit = python.splitlines()[-2], python.splitlines()[-1], python
+    read = python.splitlines()[-2]
     held: dict[str, nnode.Sequences] = {}
     exec(compile(f"import nnode\n{read}", "read", "exec"), held)
     store = Store(tmp_path / "prepare_data")
     assert [s.name for s in held["data"]] == [entry["name"] for entry in store.index]
     assert number in (None, len(store))
-    exec(compile(fit.replace("nnode.fit(", "nnode.fit(epochs=2, data="), "fit", "exec"), {})
+    exec(compile(python.replace("nnode.fit(", "nnode.fit(epochs=2, data="), "fit", "exec"), {})
 
 
 @pytest.mark.thorough
@@ -159,11 +167,9 @@ def test_what_is_told_in_python_reads_what_is_recognised(tmp_path: Path) -> None
         assert len(frame) == len(file) > 0
         for a, b in zip(frame, file, strict=True):
             assert a.x == pytest.approx(b.x, abs=1e-9)
-        if not (convert := nnode.check(path, frame_rate=rate.get("frame_rate")).examination.source
-                .convert):  # fmt: skip
+        found = nnode.check(path, frame_rate=rate.get("frame_rate")).examination
+        if not found.source.convert:
             told: dict[str, nnode.Sequences] = {}
-            found = nnode.check(path, frame_rate=rate.get("frame_rate")).examination
             exec(compile("\n".join(python_lines(found)[:2]), "told", "exec"), told)
             for a, b in zip(told["data"], file, strict=True):
                 assert a.x == pytest.approx(b.x, abs=1e-9)
-        del convert
