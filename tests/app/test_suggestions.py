@@ -173,3 +173,21 @@ def test_what_is_told_in_python_reads_what_is_recognised(tmp_path: Path) -> None
             exec(compile("\n".join(python_lines(found)[:2]), "told", "exec"), told)
             for a, b in zip(told["data"], file, strict=True):
                 assert a.x == pytest.approx(b.x, abs=1e-9)
+
+
+def test_a_command_recognises_columns_and_units(script: Script, tmp_path: Path) -> None:
+    for form in (of_platoons, in_feet):
+        path = form(tmp_path)
+        run = tmp_path / form.__name__
+        words = ["data=table", f"data.path={path}", f"hydra.run.dir={run}"]
+        done = script("prepare_data", *words, "data.domain=traffic")
+        assert done.returncode == 0, done.stderr
+        assert "recognised agent = car, time = t" in done.stdout
+        for ours, theirs in zip(Store(run), nnode.sequences(platoons()), strict=True):
+            assert ours.x == pytest.approx(theirs.x, abs=1e-9)
+    done = script(
+        "prepare_data", "data=vehicles", f"data.path={of_platoons(tmp_path)}",
+        f"hydra.run.dir={tmp_path / 'no'}",
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "has no columns of data=vehicles; python scripts/check.py" in done.stderr

@@ -38,7 +38,7 @@ def test_what_a_message_names_is_taken() -> None:
         with pytest.raises(DataError, match=r"faults='keep' keeps faulty ones"):
             call(broken)  # type: ignore[operator]
     assert len(nnode.sequences(broken, faults="keep")) == 3
-    assert nnode.fit(broken, "traffic", epochs=1, faults="keep").n_iter == 1
+    assert nnode.fit(broken, "traffic", epochs=1, heldout=0, faults="keep").n_iter == 1
     with pytest.raises(ConfigError, match=r"no option fault; .*did you mean faults\?"):
         nnode.fit(table, "traffic", fault="keep")
 
