@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 import time
 from types import TracebackType
 from typing import Any, Self
@@ -15,19 +16,25 @@ log = logging.getLogger(__name__)
 
 #: Seconds between lines where no terminal shows the bar.
 LINE_EVERY = 10.0
+#: Seconds between looks whether a line is due.
+_LOOK_EVERY = 0.5
 
 
 class OnTerminal:
     """Shows a bar where standard error is a terminal, for as long as the context lasts.
 
+    Elsewhere the log gets a line about every ten seconds, also during a long step.
+
     Args:
         columns: of the bar.
-        forks: whether the work forks processes; the bar then moves only when it is told to,
-            without a thread of its own.
+        forks: whether the work forks processes; the bar then moves, and a line is written, only
+            when the work reports its state, without a thread.
     """
 
     def __init__(self, *columns: ProgressColumn, forks: bool = False) -> None:
         self._bar: Progress | None = None
+        self._ended, self._lines = threading.Event(), threading.Lock()
+        self._beat: threading.Thread | None = None
         self._forks = forks
         #: handlers of the log that write to the terminal, above the bar for as long as it is there
         self._moved: list[tuple[logging.StreamHandler[Any], Any]] = []
@@ -43,6 +50,9 @@ class OnTerminal:
         self._start = self._last_line = time.monotonic()
 
     def __enter__(self) -> Self:
+        if not self._bar and not self._forks:
+            self._beat = threading.Thread(target=self._report, name="progress", daemon=True)
+            self._beat.start()
         if self._bar:
             self._bar.start()
             if not self._forks:
@@ -61,6 +71,9 @@ class OnTerminal:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._ended.set()
+        if self._beat is not None:
+            self._beat.join()
         for handler, stream in self._moved:
             handler.setStream(stream)
         if self._bar:
@@ -68,11 +81,25 @@ class OnTerminal:
 
     def line_is_due(self) -> bool:
         """Whether the last line is so long ago that another one may be written; it then counts."""
-        now = time.monotonic()
-        due = now - self._last_line >= LINE_EVERY
-        if due:
-            self._last_line = now
-        return due
+        with self._lines:
+            now = time.monotonic()
+            due = now - self._last_line >= LINE_EVERY
+            if due:
+                self._last_line = now
+            return due
+
+    def line(self) -> str:
+        """How far the work is, in words."""
+        raise NotImplementedError
+
+    def log_if_due(self) -> None:
+        """Write a line to the log where the last one is long ago."""
+        if self.line_is_due():
+            log.info("%s", self.line())
+
+    def _report(self) -> None:
+        while not self._ended.wait(_LOOK_EVERY):
+            self.log_if_due()
 
 
 class Stages(OnTerminal):
@@ -122,8 +149,12 @@ class Stages(OnTerminal):
             self._bar.update(self._task, completed=self.done, text=self.text())
             if self._forks:
                 self._bar.refresh()
-        elif self.line_is_due():
-            log.info("%s: %s", self.title, self.text())
+        else:
+            self.log_if_due()
+
+    def line(self) -> str:
+        """Title, stage and time left."""
+        return f"{self.title}: {self.text()}"
 
     def text(self) -> str:
         """Stage and time left."""

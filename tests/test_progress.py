@@ -7,13 +7,17 @@ import os
 import pty
 import re
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks.torture.child import Child
 from nnode import progress
+from nnode.calibrate.progress import Reporter
 from nnode.progress import Stages
+from nnode.study.progress import TaskProgress
 
 
 @pytest.fixture
@@ -50,6 +54,26 @@ def test_elsewhere_a_line_comes_seldom_and_nothing_before_ten_seconds(
         "work: a, about 29 s left",
     ]
     assert capfd.readouterr() == ("", "")
+
+
+def test_elsewhere_a_line_comes_during_a_long_step_as_well(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.05)
+    monkeypatch.setattr(progress, "_LOOK_EVERY", 0.01)
+    for work in (Stages("work", {"a": 1.0}), Reporter(7), TaskProgress("study", 3, 1, 2.0)):
+        caplog.clear()
+        with caplog.at_level(logging.INFO), work:
+            if isinstance(work, Stages):
+                work.begin("a")
+            time.sleep(0.5)
+        assert 2 <= len(caplog.records) <= 11
+        assert caplog.records[0].message in (
+            "work: a",
+            "training: step 0 of 7",
+            "study: 1 of 3 tasks",
+        )
+    assert not [one for one in threading.enumerate() if one.name == "progress"]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")

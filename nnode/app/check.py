@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import cast
@@ -15,9 +15,13 @@ from nnode.app.cli.typed import changes, group_defaults, plain_options
 from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.check.findings import Finding
 from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
+from nnode.data.clusters import index_of
+from nnode.data.identity import identify
 from nnode.data.readers.columns import floats, quoted
-from nnode.data.sequence import Domain
-from nnode.errors import ConfigError, printable
+from nnode.data.sequence import Domain, Sequence
+from nnode.data.split import split
+from nnode.discover.inputs import LEAST
+from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
 from nnode.program import typed
@@ -132,9 +136,62 @@ def summary(found: Examination, lines: list[str]) -> str:
     text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
     if found.source.convert:
         text += ["", "no reader takes the file as it is; in Python:", *found.source.convert]
-    text += ["", "to read it:", "  python scripts/prepare_data.py " + " ".join(lines)]
-    text += ["the same options go to python scripts/train.py and python scripts/discover.py"]
+    words = " ".join(lines)
+    text += ["", "to read it:", f"  python scripts/prepare_data.py {words}"]
+    text += ["to calibrate a model, and to diagnose it:"]
+    text += [f"  {line}" for line in _next(found, words)]
+    text += ["in Python:", *(f"  {line}" for line in python_lines(found))]
     return "\n".join(printable(line) for line in text)
+
+
+def _next(found: Examination, words: str) -> list[str]:
+    """Commands that go on with the data, as far as these suffice for them."""
+    kept = _kept(found)
+    held = [] if _heldout(found, kept) else ["data.split.heldout=0"]
+    lines = [" ".join([f"python scripts/train.py {_model(found)} {words}", *held])]
+    if len(kept) >= LEAST:
+        lines.append(f"python scripts/discover.py {_model(found)} {words}")
+    else:
+        lines.append(f"# a diagnosis needs at least {LEAST} sequences, there are {len(kept)}")
+    return lines
+
+
+def _kept(found: Examination) -> list[Sequence]:
+    """The sequences that are left when faulty ones are sorted out."""
+    domain, kept = found.scale.domain, found.sequences
+    agents, _ = identify(kept, domain, found.source.options.agents) if kept else ([], [])
+    unique = [replace(s, agents=own) for s, own in zip(kept, agents, strict=True)]
+    return [s for s in unique if s.name not in found.faults]
+
+
+def _heldout(found: Examination, kept: list[Sequence]) -> bool:
+    """Whether some of the sequences can be held out."""
+    try:
+        return bool(split(index_of(kept), found.source.options.split).heldout) if kept else True
+    except NNodeError:
+        return False
+
+
+def _model(found: Examination) -> str:
+    """The domain's simplest model of an acceleration or a force."""
+    return "model=sf" if found.scale.domain == "crowd" else "model=idm"
+
+
+def python_lines(found: Examination) -> list[str]:
+    """Lines of Python that read the file and calibrate a model, with all that is told."""
+    group, *_ = command(found)
+    held = "" if _heldout(found, _kept(found)) else ", heldout=0"
+    own = plain_options(type(found.source.options)())
+    values = plain_options(found.source.options)
+    kept = {k: v for k, v in values.items() if v != own[k] and k not in ("name", "path")}
+    path = values.get("path") or ""
+    told = [repr(path)] if path else []
+    told += [f"data={group.partition('=')[2]!r}", *(f"{k}={v!r}" for k, v in kept.items())]
+    return [
+        "import nnode",
+        f"data = nnode.sequences({', '.join(told)})",
+        f"nnode.fit(data, model={_model(found).partition('=')[2]!r}{held})",
+    ]
 
 
 def _units(found: Examination) -> str:
@@ -191,10 +248,10 @@ def _usage(found: Examination, lines: list[str]) -> str:
             f"No reader takes the file as it is. In Python:\n\n```python\n{made}\n```\n\nThen:\n\n"
         )
     words = " \\\n    ".join(lines)
-    return typed(
-        f"{text}```sh\npython scripts/prepare_data.py {words}\n```\n\nThe same options go to "
-        "`python scripts/train.py` and `python scripts/discover.py`."
-    )
+    commands = [f"python scripts/prepare_data.py {words}"]
+    commands += _next(found, words)
+    shell, python = "\n".join(commands), "\n".join(python_lines(found))
+    return typed(f"{text}```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```")
 
 
 def _columns(found: Examination) -> list[Block]:

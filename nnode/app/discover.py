@@ -18,8 +18,15 @@ from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
 from nnode.app.nearest_law import Job, candidates, diagnosed, unwatched
-from nnode.app.python.inputs import Table, data_of, model_options, table_options
+from nnode.app.python.inputs import (
+    Table,
+    data_of,
+    model_options,
+    refuse_reading,
+    table_options,
+)
 from nnode.app.python.report import Report
+from nnode.app.python.words import python_words
 from nnode.app.training import brief
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
@@ -107,11 +114,13 @@ def diagnose_table(
     folder: str | Path | None = None,
     seed: int = 0,
     options: DiscoverOptions | None = None,
+    **reading: Any,
 ) -> Report:
-    """Diagnose a model on a tidy table.
+    """Diagnose a model on a table.
 
     Args:
-        data: CSV or Parquet, or a data frame, see ``docs/data.md``; or :func:`nnode.sequences`.
+        data: CSV or Parquet, or a data frame, whose columns and units are recognised, see
+            :func:`nnode.sequences`; or those sequences.
         domain: ``traffic`` or ``crowd``; None: as the columns show.
         model: a name as in ``conf/model``, or options of the model; ``term`` says which, what is
             left out has its default.
@@ -121,22 +130,42 @@ def diagnose_table(
             draws nothing.
         seed: of the diagnosis; wins over that of ``options``.
         options: further options of the diagnosis.
+        reading: how the table is read, as :func:`nnode.sequences` takes it: ``columns={...}``,
+            ``position_unit="ft"``, ``faults="error"``, ...
 
     Raises:
         NNodeError: see :func:`discover`.
     """
+    with python_words():
+        return _diagnosed_table(
+            data, domain, model, walls, leader, None if folder is None else Path(folder), seed,
+            options, reading,
+        )  # fmt: skip
+
+
+def _diagnosed_table(
+    data: Table | Sequences,
+    domain: str | None,
+    model: str | Mapping[str, Any],
+    walls: str | Path | None,
+    leader: str,
+    place: Path | None,
+    seed: int,
+    options: DiscoverOptions | None,
+    reading: Mapping[str, Any],
+) -> Report:
     own = model_options(model, leader)
     chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
-    place = None if folder is None else Path(folder)
-    groups = {"model": str(own["name"]), "data": "table"}
+    source: Any = data
     if isinstance(data, Sequences):
+        refuse_reading(None, {"walls": walls, **reading})
         told = data_of(data)
-        groups["data"] = str(told.name)
     else:
-        told = table_options(data, domain, walls, place)
+        source, told = table_options(data, domain, walls, place, reading)
+    groups = {"model": str(own["name"]), "data": str(told.name)}
 
     def read() -> Inputs:
-        return inputs_of(Sequences.of(data, with_faulty(told)), told)
+        return inputs_of(Sequences.of(source, with_faulty(told)), told)
 
     job = _job(own, told, plain_options(told), groups, chosen, read)
     done = diagnosed(job, unwatched)

@@ -30,6 +30,7 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import NOT_PREPARATION, open_data
 from nnode.errors import ConfigError
 from nnode.files import write_json
+from nnode.progress import Stages
 
 PARTS = ("auto", "heldout", "train", "unseen", "all")
 
@@ -114,11 +115,15 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
         return evaluate(simulate, batches, convention)
 
     name = checkpoint.config["model"]["name"]
-    found = measure(lambda batch: solver(model, batch))
-    others = {
-        key: measure(simulate)
-        for key, simulate in baselines(model, solver, checkpoint.free_speed).items()
-    }
+    baselines_of = baselines(model, solver, checkpoint.free_speed)
+    shares = {name: 1.0, **{f"baseline {key}": 0.5 for key in baselines_of}}
+    with Stages("evaluating", shares) as stages:
+        stages.begin(name)
+        found = measure(lambda batch: solver(model, batch))
+        others = {}
+        for key, simulate in baselines_of.items():
+            stages.begin(f"baseline {key}")
+            others[key] = measure(simulate)
     write_json(
         folder / "metrics.json",
         {
@@ -140,10 +145,12 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     if config.replay:
         from nnode.app.replay import write_replay  # loads Matplotlib, which takes a second
 
-        path = write_replay(
-            folder / "replay.html", store, indices, lambda batch: solver(model, batch), model, name,
-            dtype=dtype, device=device,
-        )  # fmt: skip
+        with Stages("drawing", {"drawing": 1.0}) as stages:
+            stages.begin("drawing")
+            path = write_replay(
+                folder / "replay.html", store, indices, lambda batch: solver(model, batch), model,
+                name, dtype=dtype, device=device,
+            )  # fmt: skip
         print(f"replay: {path}")
 
 

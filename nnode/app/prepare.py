@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.app.cli.recognised import with_recognised
 from nnode.data.clusters import clusters, relation
 from nnode.data.dataset import noise_of
 from nnode.data.options import DataOptions
@@ -20,6 +21,7 @@ def prepare_data(config: DictConfig, folder: Path) -> None:
     Raises:
         NNodeError: see :func:`nnode.data.prepare.prepare`.
     """
+    config = with_recognised(config)
     options: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     store = prepare(options, folder, draw=plot_faults)
     reasons: dict[str, int] = {}

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
+import pandas as pd
 import torch
 
-from nnode.app.python.inputs import Table, table_options
+from nnode.app.python.inputs import Table
 from nnode.calibrate.evaluate import Simulate
-from nnode.data.readers.table import TABLE, WALLS, read_table, table_files
+from nnode.data.options import TableOptions
+from nnode.data.readers.columns import Table as DataTable
+from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store
 from nnode.discover.report.replay import zone_of
@@ -60,12 +62,11 @@ def replay(
             cannot be written to.
     """
     tables = dict(simulated) if isinstance(simulated, Mapping) else {"simulated": simulated}
-    with TemporaryDirectory(prefix="nnode-replay-") as folder:
-        real = _read(measured, domain, walls, Path(folder))
-        models = {
-            title: {s.name.rpartition("/")[2]: s for s in _read(table, domain, None, Path(folder))}
-            for title, table in tables.items()
-        }
+    real = _read(measured, domain, walls)
+    models = {
+        title: {s.name.rpartition("/")[2]: s for s in _read(table, domain, None)}
+        for title, table in tables.items()
+    }
     scenes = []
     for s in real:
         name = s.name.rpartition("/")[2]
@@ -83,10 +84,10 @@ def replay(
     return write_player(block, Path(path), title="Measured and simulated")
 
 
-def _read(table: Table, domain: str, walls: str | Path | None, folder: Path) -> list[Sequence]:
-    options = table_options(table, domain, walls, folder)
-    files = table_files(options)
-    return read_table(files[TABLE], options, files.get(WALLS))
+def _read(table: Table, domain: str, walls: str | Path | None) -> list[Sequence]:
+    own = DataTable(table) if isinstance(table, pd.DataFrame) else Path(table).expanduser()
+    bounds = None if walls is None else Path(walls).expanduser()
+    return read_table(own, TableOptions(domain=domain, path=""), bounds)
 
 
 def _at(found: Sequence, measured: Sequence) -> np.ndarray:

@@ -23,6 +23,7 @@ from nnode.data.prepare import open_data
 from nnode.data.store import Store
 from nnode.files import csv_text, write_json, write_text
 from nnode.program import typed
+from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +90,9 @@ def train(config: DictConfig, folder: Path) -> None:
         raise Interrupted(f"{stop}\nresume with: {command}", stop.signal) from None
     if not world.first:
         return
-    result = calibrated(trainer, store, time.monotonic() - start)
+    with Stages("results", {"costs and intervals": 1.0}) as stages:
+        stages.begin("costs and intervals")
+        result = calibrated(trainer, store, time.monotonic() - start)
     paths = {
         "tensorboard": folder / "tensorboard",
         "best checkpoint": trainer.best_path,

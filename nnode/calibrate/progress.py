@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 
 from rich.progress import (
@@ -13,8 +12,6 @@ from rich.progress import (
 )
 
 from nnode.progress import OnTerminal
-
-log = logging.getLogger(__name__)
 
 
 class Reporter(OnTerminal):
@@ -35,7 +32,7 @@ class Reporter(OnTerminal):
             TextColumn("{task.fields[note]}"),
         )
         self.total, self.done, self.what = total, done, what
-        self._first = done
+        self._first, self._note = done, ""
         if self._bar:
             self._task = self._bar.add_task(what, total=total, completed=done, rate=0.0, note="")
 
@@ -45,14 +42,15 @@ class Reporter(OnTerminal):
         rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
         if self._bar:
             self._bar.update(self._task, completed=self.done, rate=rate, note=note)
-        elif self.line_is_due():
-            left = (self.total - self.done) / max(rate, 1e-9)
-            log.info(
-                "%s: step %d of %d, %.1f steps/s, %.0f s left  %s",
-                self.what,
-                self.done,
-                self.total,
-                rate,
-                left,
-                note,
-            )
+        else:
+            self._note = note
+            self.log_if_due()
+
+    def line(self) -> str:
+        """Steps, their rate, and the time left."""
+        text = f"{self.what}: step {self.done} of {self.total}"
+        if self.done == self._first:
+            return text
+        rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
+        left = (self.total - self.done) / max(rate, 1e-9)
+        return f"{text}, {rate:.1f} steps/s, {left:.0f} s left  {self._note}"

@@ -326,12 +326,12 @@ class Trainer:
         try:
             self._guard = InterruptGuard()
             with self._guard if self.folder is not None else nullcontext():
-                if fresh:
-                    self._start(logbook)
                 reporter = None
                 if self.world.first:
                     reporter = Reporter(options.max_epochs * per_epoch, self.step)
                 with reporter or nullcontext():
+                    if fresh:
+                        self._start(logbook)
                     while self.epoch < options.max_epochs and not self._stalled():
                         sampler.set_epoch(self.epoch)
                         sampler.set_start(self.batch)

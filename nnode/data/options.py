@@ -152,12 +152,14 @@ class VehicleTableOptions(LaneOptions):
     """A table with one row per vehicle and time (CSV or Parquet).
 
     ``columns`` names the table's columns by what they mean: ``vehicle``, ``time``, ``x``, and
-    where they exist ``lane``, ``speed``, ``length``, ``kind``. A column that bears the name of
-    its meaning need not be listed; null leaves an optional one out.
+    where they exist ``lane``, ``speed``, ``length``, ``kind``, ``recording``. Vehicles of two
+    recordings never meet. A column that bears the name of its meaning need not be listed; null
+    leaves an optional one out.
     """
 
     name: str = "vehicles"
-    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind where they exist
+    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind, recording where they
+    # exist
     columns: dict[str, str | None] = field(default_factory=dict)
     position_unit: str = "m"  # m | ft | cm | km
     length_unit: str | None = None  # null: the unit of the positions
@@ -283,16 +285,21 @@ class WalkwayOptions(JuelichOptions):
 
 @dataclass
 class TableOptions(DataOptions):
-    """A user's own tidy table (CSV or Parquet), one row per sequence, time and agent, SI units.
+    """A user's own tidy table (CSV or Parquet), one row per sequence, time and agent.
 
-    Columns: ``sequence``, ``time``, ``agent``, ``x``, and where they exist ``y``, ``length``,
-    ``kind``, ``group``, ``dest_x``, ``dest_y``, ``recording``.
+    ``columns`` names the table's columns by what they mean: ``sequence``, ``time``, ``agent``,
+    ``x``, and where they exist ``y``, ``length``, ``kind``, ``group``, ``dest_x``, ``dest_y``,
+    ``recording``. A column that bears the name of its meaning need not be listed; null leaves an
+    optional one out.
     """
 
     name: str = "table"
     path: str = MISSING  # the table; relative to data.source where that is given
-    time_unit: str = "s"  # s | ms | us | ns; dates and durations need none
     walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left
     # {name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}, m: destinations on exit lines,
     # in place of the columns dest_x, dest_y
     exits: Any = None
+    columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    position_unit: str = "m"  # m | ft | cm | km, of positions, lengths and destinations
+    time_unit: str = "s"  # s | ms | us | ns | frame; dates and durations need none
+    frame_rate: float | None = None  # 1/s, with time_unit=frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as ListLike
@@ -12,10 +13,10 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 from platformdirs import user_cache_path
 
 from nnode.data._arrow import to_table
+from nnode.data.check.recognise import Recognised, recognised
 from nnode.data.clusters import clusters, index_of
 from nnode.data.options import (
     DataOptions,
@@ -23,9 +24,11 @@ from nnode.data.options import (
     PairOptions,
     TableOptions,
     VehicleTableOptions,
+    WalkwayOptions,
 )
 from nnode.data.prepare import FORMATS, judge
 from nnode.data.readers.columns import Table
+from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE
 from nnode.data.readers.recordings import reading, table_path
 from nnode.data.readers.table import TABLE, WALLS
 from nnode.data.sequence import Domain, Sequence, check_interval
@@ -33,6 +36,8 @@ from nnode.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from xarray import Dataset
+
+log = logging.getLogger(__name__)
 
 #: Units of the columns of :meth:`Sequences.to_dataframe`.
 UNITS = {"time": "s", "x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "length": "m"}
@@ -87,16 +92,15 @@ class Sequences:
 
         Args:
             source: sequences; a data frame; the path of a table; None: what the options name.
-            options: of the data; by default those of the format that the columns show: a tidy
-                table (``sequence, time, agent, x``), pairs (``time, x_follower, x_leader``) or
-                vehicles (``vehicle, time, x``), all in SI units, see ``docs/data.md``.
+            options: of the data; by default as names and numbers show, see
+                :func:`nnode.data.check.recognise.recognised` and ``docs/data.md``.
 
         Raises:
             NNodeError: what is no such table; with the row, or what was expected.
         """
         if isinstance(source, cls):
             return source
-        if not isinstance(source, pd.DataFrame | str | Path) and source is not None:
+        if not isinstance(source, pd.DataFrame | Table | str | Path) and source is not None:
             if not isinstance(source, Iterable):
                 raise DataError(
                     f"expected a data frame, the path of a table, or sequences, found "
@@ -104,14 +108,23 @@ class Sequences:
                 )
             return cls(source)
         if options is None:
-            with reading(source if isinstance(source, str | Path) else "the table"):
-                options = seen_options(source)
-        if source is not None and not isinstance(source, pd.DataFrame):
+            if source is None:
+                raise ConfigError(
+                    "there is no table: give one, or name a data set, as in data='esimas'"
+                )
+            if isinstance(source, Table):
+                source = source.frame
+            with reading("the table" if isinstance(source, pd.DataFrame) else source):
+                found = recognised(source)
+            say_recognised(found)
+            source, options = found.table, found.options
+        if source is not None and not isinstance(source, pd.DataFrame | Table):
             if not hasattr(options, "path"):
                 raise ConfigError(f"data={options.name} is no table: leave the path out")
             options = replace(options, path=str(Path(source).expanduser()))  # type: ignore[call-arg]
-        with reading("the table" if isinstance(source, pd.DataFrame) else str(source)):
-            files = _files(options, source if isinstance(source, pd.DataFrame) else None)
+        memory = isinstance(source, pd.DataFrame | Table)
+        with reading("the table" if memory or source is None else source):
+            files = _files(options, source if memory else None)
             judged = judge(options, files, FORMATS[type(options)].sequences(files, options))
         return cls(judged.kept, judged.manifest)
 
@@ -239,35 +252,18 @@ class Sequences:
         return f"<p>{escape(self._about())}</p>{table}{more}"
 
 
-def columns(source: pd.DataFrame | str | Path) -> set[str]:
-    """Names of a table's columns."""
-    if isinstance(source, pd.DataFrame):
-        return {str(name).strip() for name in source.columns}
-    path = Path(source).expanduser()
-    if path.suffix.lower() in (".parquet", ".pq") and path.is_file():
-        return set(pq.read_schema(path).names)
-    return {str(name).strip() for name in Table(path).frame.columns}
+def say_recognised(found: Recognised) -> None:
+    """Tell how a table is read, where its names or units are not those of its format."""
+    if found.line:
+        log.warning("%s", found.line)
 
 
-def seen_options(source: pd.DataFrame | str | Path | None) -> DataOptions:
-    """Options of the format that the columns of a table show; a tidy one where none is seen."""
-    if source is None:
-        raise ConfigError("there is no table: give one, or name a data set, as in data='esimas'")
-    names = columns(source)
-    spaced = {"time", "spacing", "v_follower", "v_leader"} <= names and "x" not in names
-    if {"x_follower", "x_leader"} <= names or spaced:
-        return PairOptions(path="")
-    if "vehicle" in names and "sequence" not in names:
-        return VehicleTableOptions(path="")
-    return TableOptions(domain="crowd" if "y" in names else "traffic", path="")
-
-
-def _files(options: DataOptions, frame: pd.DataFrame | None) -> dict[str, Any]:
+def _files(options: DataOptions, frame: pd.DataFrame | Table | None) -> dict[str, Any]:
     """What a format reads: files, or a table in memory."""
     if frame is None:
         cache = str(user_cache_path("nnode") / "raw")
         return FORMATS[type(options)].files(replace(options, download=options.download or cache))
-    table = Table(frame)
+    table = frame if isinstance(frame, Table) else Table(frame)
     if isinstance(options, TableOptions):
         walls = options.walls
         return {TABLE: table} | (
@@ -275,6 +271,11 @@ def _files(options: DataOptions, frame: pd.DataFrame | None) -> dict[str, Any]:
         )
     if type(options) is VehicleTableOptions or isinstance(options, PairOptions):
         return {table.path.stem: table}
+    if isinstance(options, WalkwayOptions) and isinstance(frame, Table):
+        geometry = options.geometry
+        return {PEOPLE: table} | (
+            {} if geometry is None else {GEOMETRY: table_path(options, "geometry", geometry)}
+        )
     kind = "lanes of another program" if isinstance(options, LaneOptions) else "files"
     raise ConfigError(
         f"data={options.name} are {kind} and no data frame; give their path, or rename the columns "

@@ -60,7 +60,7 @@ def check_model(system: System) -> None:
         what = "of first order" if law.order == 1 else "with smallest values over others"
         raise ConfigError(
             f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "
-            "evaluated, but not yet diagnosed"
+            "evaluated, but not diagnosed; take another law, such as model=sf"
         )
     lane = system.lane if isinstance(system, Traffic) else None
     added = [] if lane is None else list(lane.rates.values())[lane.order :]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import time
 
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from nnode.progress import OnTerminal
-
-log = logging.getLogger(__name__)
 
 
 class TaskProgress(OnTerminal):
@@ -44,8 +41,12 @@ class TaskProgress(OnTerminal):
         """Show what is known now; called often."""
         if self._bar:
             self._bar.update(self._task, completed=self._spent, text=self._text())
-        elif self.line_is_due():
-            log.info("%s: %s", self.title, self._text())
+        else:
+            self.log_if_due()
+
+    def line(self) -> str:
+        """Tasks that are done, and the time left."""
+        return f"{self.title}: {self._text()}"
 
     def _text(self) -> str:
         count = f"{self.done} of {self.total} tasks"

@@ -7,6 +7,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from nnode.app.cli.recognised import with_recognised
 from nnode.app.cli.saved import in_hydra, keys_given, path_given, plain
 from nnode.app.cli.typed import written
 from nnode.data.prepare import NOT_PREPARATION, made_by, refuse_others
@@ -31,7 +32,8 @@ def prepared_group(overrides: list[str]) -> list[str]:
 
 
 def with_prepared(config: DictConfig) -> DictConfig:
-    """``config`` with the options that ``data.prepared`` was prepared with, where that is set.
+    """``config`` with the options that ``data.prepared`` was prepared with, where that is set; else
+    with those that a table is recognised to need.
 
     Raises:
         ConfigError: another data set was chosen, or options on the command line contradict the
@@ -39,8 +41,10 @@ def with_prepared(config: DictConfig) -> DictConfig:
         DataError: no store in that folder.
     """
     folder = OmegaConf.select(config, "data.prepared")
-    if folder is None or not in_hydra():
+    if not in_hydra():
         return config
+    if folder is None:
+        return with_recognised(config)
     store = _store(folder)
     choice, own = str(HydraConfig.get().runtime.choices["data"]), _group(store)
     # another one of nnode's; a choice of the user's own may be of the same reader

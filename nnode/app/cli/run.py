@@ -10,6 +10,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -17,11 +18,13 @@ from pathlib import Path
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nnode.app.cli.help import help_text
+from nnode.app.cli.mistakes import in_words, refuse_added
 from nnode.app.cli.prepared import prepared_group
 from nnode.app.cli.runs import RESULT, end, failures, say
 from nnode.app.cli.typed import literal
@@ -34,6 +37,21 @@ from nnode.program import begin, configuration
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
+
+#: Variable of the environment with which Hydra raises errors.
+_RAISE = "HYDRA_FULL_ERROR"
+
+#: Flags of Hydra's, and those that take a value, with the values that there are.
+_FLAGS = (
+    "-h", "--help", "-m", "--multirun", "--version", "--resolve", "-r", "--run", "--hydra-help",
+    "-sc", "--shell-completion",
+)  # fmt: skip
+_CFG = ("job", "hydra", "all")
+_VALUED: dict[str, tuple[str, ...]] = {
+    "-c": _CFG, "--cfg": _CFG, "-p": (), "--package": (), "-cd": (), "--config-dir": (),
+    "-cp": (), "--config-path": (), "-cn": (), "--config-name": (), "-i": (), "--info": (),
+    "--experimental-rerun": (),
+}  # fmt: skip
 
 
 def run(
@@ -78,15 +96,19 @@ def run(
     except NNodeError as error:
         end(error)
     GlobalHydra.instance().clear()  # of a job that has forked this process
-    with _out_of_sight() as places:
+    with _out_of_sight() as places, _errors_raised():
         sys.argv[1:] = [*given, *places, *flags]
-        hydra.main(version_base="1.3", config_path=str(folder), config_name=name)(_task(job))()
+        command = hydra.main(version_base="1.3", config_path=str(folder), config_name=name)
+        try:
+            command(_task(job, name))()
+        except (HydraException, OmegaConfBaseException) as error:
+            end(in_words(error, name, given, flags))
     World().part()
     if failures():
         sys.exit(1)
 
 
-def _task(job: Job) -> Callable[[DictConfig], None]:
+def _task(job: Job, name: str) -> Callable[[DictConfig], None]:
     here = os.getpid()
 
     def task(config: DictConfig) -> None:
@@ -94,6 +116,7 @@ def _task(job: Job) -> Callable[[DictConfig], None]:
         folder = Path(settings.runtime.output_dir)
         try:
             with disk_words(folder):
+                refuse_added(config, name)
                 job(config, folder)
         except OmegaConfBaseException as error:
             lacking = isinstance(error, MissingMandatoryValue)
@@ -125,17 +148,59 @@ def _parted(bare: str | None) -> tuple[list[str], list[str]]:
         ConfigError: a word without a name, and no option that it could be meant for.
     """
     overrides, flags = [], []
-    for before, word in pairwise(sys.argv):
-        if word[:1] == "~" or ("=" in word and word[0] != "-"):
-            overrides.append(word)
-        elif word[:1] in ("-", "") or before.startswith("-"):
+    for before, word in pairwise(["", *sys.argv[1:]]):
+        if before in _VALUED:
+            if _VALUED[before] and word not in _VALUED[before]:
+                raise ConfigError(f"{before} {word}: expected one of {', '.join(_VALUED[before])}")
             flags.append(word)
+        elif word[:1] == "~" or ("=" in word and word[0] != "-"):
+            if not word.lstrip("+~").partition("=")[0].strip():
+                raise ConfigError(f"{word} names no option: expected NAME=VALUE")
+            overrides.append(word)
+        elif word[:1] == "-":
+            flags.append(_flag(word))
+        elif not word:
+            raise ConfigError("an empty word is no option: expected NAME=VALUE")
         elif bare is None:
             raise ConfigError(f"{word} is no option: expected NAME=VALUE, --help shows examples")
         else:
             overrides.append(f"{bare}={literal(word)}")
             bare = None
+    if len(sys.argv) > 1 and sys.argv[-1] in _VALUED.keys() - {"-i", "--info"}:
+        raise ConfigError(f"{sys.argv[-1]} lacks its value; --help shows examples")
     return overrides, flags
+
+
+def _flag(word: str) -> str:
+    """A flag of Hydra's.
+
+    Raises:
+        ConfigError: there is no such flag.
+    """
+    name, _, value = word.partition("=")
+    if word in _FLAGS or name in _VALUED:
+        return word
+    if value and name not in _FLAGS:
+        raise ConfigError(f"{word}: options have no dashes; type {word.lstrip('-')}")
+    near = get_close_matches(
+        name, ["--help", "--multirun", "--cfg", "--config-dir", "--version"], n=1
+    )
+    hint = f"; did you mean {near[0]}?" if near else ""
+    raise ConfigError(f"there is no flag {word}{hint}; --help shows all options")
+
+
+@contextmanager
+def _errors_raised() -> Iterator[None]:
+    """Let Hydra raise its errors; it would print them otherwise, in words of its own."""
+    asked = os.environ.get(_RAISE)
+    os.environ[_RAISE] = "1"
+    try:
+        yield
+    finally:
+        if asked is None:
+            del os.environ[_RAISE]
+        else:
+            os.environ[_RAISE] = asked
 
 
 @contextmanager

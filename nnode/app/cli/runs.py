@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from nnode.calibrate.distributed import World
 from nnode.calibrate.interrupt import Interrupted
-from nnode.errors import ConfigError, NNodeError, printable
+from nnode.errors import ConfigError, NNodeError, WriteError, printable
 from nnode.files import PARTIAL, csv_text, disk_words, write_text
 from nnode.lock import give, take
 
@@ -43,7 +43,7 @@ class Runs(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
-        _take(folder)
+        _take(folder, "sweep")
         _sweep[folder] = _results(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -86,7 +86,7 @@ def failures() -> list[Path]:
     return sorted(path.parent for path in new if "error" in json.loads(path.read_text()))
 
 
-def _take(folder: Path) -> None:
+def _take(folder: Path, what: str = "run") -> None:
     path = folder / f".room.{os.getpid()}{PARTIAL}"
     try:
         take(folder)
@@ -98,6 +98,10 @@ def _take(folder: Path) -> None:
                 path.unlink(missing_ok=True)
     except NNodeError as error:
         end(error)
+    except (OSError, ValueError) as error:  # a path that the system does not know how to make
+        said = getattr(error, "strerror", None) or error
+        end(WriteError(f"the folder {folder} cannot be made: {said}; choose another one with "
+                       f"hydra.{what}.dir="))  # fmt: skip
 
 
 def _results(folder: Path) -> set[tuple[Path, int]]:

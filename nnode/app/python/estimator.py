@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
 from nnode.app.python.inputs import choice, data_of, model_options, sequences
+from nnode.app.python.words import python_words
 from nnode.app.training import (
     build_solver,
     check,
@@ -104,7 +105,10 @@ class Calibrator:
         Raises:
             NNodeError: a table, a model or options that do not fit; the message says what to do.
         """
-        given = Sequences.of(X)
+        with python_words():
+            return self._fitted(Sequences.of(X))
+
+    def _fitted(self, given: Sequences) -> Self:
         config = self._config(given)
         check(config)
         with threads_given_back():
@@ -138,8 +142,9 @@ class Calibrator:
         """
         if not hasattr(self, "result_"):
             raise _unfitted()
+        with python_words():
+            given: Source = Sequences.of(X)
         model, solver = self.model_, self._solver
-        given: Source = Sequences.of(X)
         if self.start_speeds == "auto":
             given = sound_speeds(given, model.domain, model.order)
         dtype = next(model.parameters()).dtype
@@ -155,7 +160,8 @@ class Calibrator:
         Over all simulated agents and samples after the first, as ``nnode evaluate`` prints it;
         higher is better. A leader that drives as it was measured is left out.
         """
-        given = Sequences.of(X)
+        with python_words():
+            given = Sequences.of(X)
         return self.predict(given).score(given)
 
     # -- what scikit-learn asks of an estimator ------------------------------------------------
@@ -266,7 +272,7 @@ def _unfitted() -> NotFittedError:
 
 
 def fit(
-    data: pd.DataFrame | str | Path,
+    data: pd.DataFrame | str | Path | Sequences,
     domain: str | None = None,
     *,
     model: str | Mapping[str, Any] | System = "lin",
@@ -275,12 +281,13 @@ def fit(
     epochs: int = 100,
     heldout: float = 0.2,
     seed: int = 0,
+    **reading: Any,
 ) -> Calibration:
     """Calibrate a model to a table in one call: :class:`Calibrator`, without the estimator.
 
     Args:
-        data: CSV or Parquet, or a data frame, with ``sequence, time, agent, x`` and, where they
-            exist, ``y`` and more, SI units; see ``docs/data.md``.
+        data: CSV or Parquet, or a data frame, whose columns and units are recognised, see
+            :func:`nnode.sequences` and ``docs/data.md``; or those sequences.
         domain: ``traffic`` or ``crowd``; None: as the columns show.
         walls: CSV with x1, y1, x2, y2, m.
         model: see :class:`Calibrator`, as for the following.
@@ -288,11 +295,15 @@ def fit(
         epochs: at most.
         heldout: share of the sequences that the calibration does not see.
         seed: of start values and of the division.
+        reading: how the table is read, as :func:`nnode.sequences` takes it: ``columns={...}``,
+            ``position_unit="ft"``, ``faults="keep"``, ...
 
     Raises:
         NNodeError: a table, a model or options that do not fit; the message says what to do.
     """
-    options = {"domain": domain, "walls": None if walls is None else str(walls)}
+    options = {"walls": None if walls is None else str(walls), **reading}
+    if not isinstance(data, Sequences):
+        options["domain"] = domain
     given = sequences(data, **{key: value for key, value in options.items() if value is not None})
     calibrator = Calibrator(model, leader=leader, epochs=epochs, heldout=heldout, seed=seed)
     return calibrator.fit(given).result_

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListLike
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
-from nnode.app.cli.typed import written
+from nnode.app.cli.mistakes import unknown_option, wrong_value
+from nnode.app.cli.typed import plain_options, written
+from nnode.app.python.words import python_words
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.options import TrainerOptions
+from nnode.data.check.recognise import NEEDED, has_columns, recognised
 from nnode.data.dataset import Source
 from nnode.data.options import DataOptions, TableOptions
 from nnode.data.prepare import FORMATS
-from nnode.data.sequences import Sequences, columns, seen_options
+from nnode.data.readers.columns import Table as DataTable
+from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.models.field import FIELD, NEURONS
@@ -85,8 +90,28 @@ def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
     """
     try:
         return cast(DictConfig, OmegaConf.merge(OmegaConf.structured(schema), *given))
-    except Exception as error:  # omegaconf's own errors share no narrower class
+    except OmegaConfBaseException as error:
+        said = str(error).splitlines()[0]
+        key = str(error.full_key or _culprit(schema, given))
+        known = OmegaConf.create({section: OmegaConf.structured(schema)})
+        if not isinstance(error, ValidationError):
+            raise unknown_option(f"{section}.{key}", known, "nnode", "") from error
+        every = OmegaConf.merge(*given)
+        value = OmegaConf.select(every, key)
+        raise wrong_value(f"{section}.{key}={value}", said, known) from error
+    except (TypeError, ValueError) as error:
         raise ConfigError(f"{section}: {str(error).splitlines()[0]}") from error
+
+
+def _culprit(schema: Any, given: tuple[Mapping[str, Any], ...]) -> str:
+    """The option whose value is of another type than it must be."""
+    for options in given:
+        for key, value in options.items():
+            try:
+                OmegaConf.merge(OmegaConf.structured(schema), {key: value})
+            except OmegaConfBaseException:
+                return str(key)
+    return ""
 
 
 def choice(
@@ -127,27 +152,76 @@ def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
 
 
 def sequences(
-    table: pd.DataFrame | str | Path | None = None, *, data: str | None = None, **options: Any
+    table: pd.DataFrame | str | Path | Sequences | None = None,
+    *,
+    data: str | None = None,
+    **options: Any,
 ) -> Sequences:
     """Trajectories of a table, or of a data set that nnode knows, as a list of sequences.
+
+    Columns and units of a table are recognised by their names and by what they hold, as
+    :func:`nnode.check` does; a line says what was recognised. What ``options`` say wins.
 
     Args:
         table: a data frame, or the path of one; None for data sets that say where they are.
         data: how it is read, a name as in ``conf/data``: ``table``, ``pairs``, ``vehicles``,
-            ``esimas``, ...; None: as the columns show, in SI units.
+            ``esimas``, ...; None: as the table shows.
         options: of those data, as on the command line behind ``data.``: ``columns={...}``,
             ``walls="walls.csv"``, ``recording="1-1_1"``, ``faults="keep"``, ...
 
     Raises:
-        NNodeError: unknown data or options, or a table that does not fit; with the row.
+        NNodeError: unknown data or options, a table that does not fit, with the row, or one whose
+            columns or units may be two things; names both.
     """
-    given = dict(options)
-    if data is None:
-        seen = seen_options(table)
-        data = seen.name
-        if isinstance(seen, TableOptions):
-            given.setdefault("domain", seen.domain)
-    return Sequences.of(table, data_options(data, given, in_memory=table is not None))
+    with python_words():
+        if isinstance(table, Sequences):
+            refuse_reading(data, options)
+            return table
+        if table is None and data is None:
+            raise ConfigError("there is no table: give one, or name a data set: data='esimas'")
+        source, found = read_options(table, data, options)
+        return Sequences.of(source, found)
+
+
+def refuse_reading(data: str | None, options: Mapping[str, Any]) -> None:
+    """Refuse options of reading for what was read already.
+
+    Raises:
+        ConfigError: names them.
+    """
+    given = [name for name, value in {"data": data, **options}.items() if value is not None]
+    if given:
+        raise ConfigError(
+            f"{', '.join(given)}: these sequences are read already; give the table, or give the "
+            "options to nnode.sequences(table, ...)"
+        )
+
+
+def read_options(
+    table: pd.DataFrame | str | Path | None, data: str | None, given: Mapping[str, Any]
+) -> tuple[pd.DataFrame | DataTable | str | Path | None, DataOptions]:
+    """The options that read a table, and what they read: None the file that they name.
+
+    Args:
+        data: the group of the options; None: as the table shows.
+        given: options that win over what is recognised.
+
+    Raises:
+        NNodeError: see :func:`sequences`.
+    """
+    if table is None:
+        return None, data_options(str(data), given)
+    if data is not None and (data not in NEEDED or has_columns(table, data, given)):
+        return table, data_options(data, given, in_memory=True)
+    found = recognised(table, given.get("domain"), given)
+    if data not in (None, found.group):
+        return table, data_options(str(data), given, in_memory=True)
+    say_recognised(found)
+    values, own = plain_options(found.options), plain_options(type(found.options)())
+    known = {k: v for k, v in values.items() if v != own[k] and k != "name"}
+    more = {k: v for k, v in given.items() if k not in ("columns", "domain")}
+    options = data_options(found.group, {**known, **more}, in_memory=True)
+    return found.table, options
 
 
 def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False) -> DataOptions:
@@ -204,16 +278,24 @@ def data_used(checkpoint: Checkpoint) -> Source:
 
 
 def table_options(
-    data: Table, domain: str | None, walls: str | Path | None, folder: Path | None
-) -> TableOptions:
-    """A tidy table as a data set; a data frame becomes a file where there is a folder for it."""
-    path = "" if isinstance(data, pd.DataFrame) else str(Path(data).expanduser().absolute())
-    if isinstance(data, pd.DataFrame) and folder is not None:
+    data: Table,
+    domain: str | None,
+    walls: str | Path | None,
+    folder: Path | None,
+    more: Mapping[str, Any] | None = None,
+) -> tuple[pd.DataFrame | DataTable | str | Path | None, DataOptions]:
+    """A table as a data set, see :func:`read_options`; a data frame becomes a file where there is
+    a folder for it."""
+    given = {"domain": domain, "walls": None if walls is None else str(Path(walls).absolute())}
+    given = {**{k: v for k, v in given.items() if v is not None}, **(more or {})}
+    table = data if isinstance(data, pd.DataFrame) else str(Path(data).expanduser().absolute())
+    source, options = read_options(table, None, given)
+    if isinstance(source, str | Path):
+        options.path = str(source)  # type: ignore[attr-defined]
+    frame = source.frame if isinstance(source, DataTable) else source
+    if isinstance(frame, pd.DataFrame) and folder is not None and hasattr(options, "columns"):
         folder.mkdir(parents=True, exist_ok=True)
         path = str((folder / "table.parquet").absolute())
-        data.to_parquet(path, index=False)
-    if domain is None:
-        domain = "crowd" if "y" in columns(data) else "traffic"
-    return TableOptions(
-        domain=domain, path=path, walls=None if walls is None else str(Path(walls).absolute())
-    )
+        frame.to_parquet(path, index=False)
+        return None, replace(options, path=path)  # type: ignore[call-arg]
+    return source, options

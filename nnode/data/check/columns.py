@@ -76,12 +76,15 @@ class Meaning:
     Attributes:
         column: its name in the table.
         unit: that its name ends in; empty: none.
-        sure: ``named`` exactly, ``like`` a usual name, or by what it ``holds``.
+        sure: ``named`` exactly, ``like`` a usual name, by what it ``holds``, or as it was
+            ``given``.
+        rivals: further columns of usual names of that meaning, which hold other values.
     """
 
     column: str
     unit: str
     sure: str
+    rivals: tuple[str, ...] = ()
 
 
 def plain(name: str) -> tuple[str, str]:
@@ -138,15 +141,27 @@ def meanings(raw: Raw) -> dict[str, Meaning]:
             for column, (word, _) in known.items()
             if column not in own and word in usual
         }
-        for column in sorted(own, key=lambda c: own[c]):
-            fits = meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY
-            if column not in taken and fits:
-                sure = "named" if column == meaning else "like"
-                unit = "" if whole[column] in usual else known[column][1]
-                found[meaning] = Meaning(column, unit, sure)
-                taken.add(column)
-                break
+        fit = [
+            column
+            for column in sorted(own, key=lambda c: own[c])
+            if column not in taken
+            and (meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY)
+        ]
+        if fit:
+            column = fit[0]
+            sure = "named" if column == meaning else "like"
+            unit = "" if whole[column] in usual else known[column][1]
+            # the own name of a meaning leaves no doubt
+            others = () if whole[column] == usual[0] else _others(frame, column, fit[1:])
+            found[meaning] = Meaning(column, unit, sure, others)
+            taken.add(column)
     return found
+
+
+def _others(frame: pd.DataFrame, column: str, rivals: list[str]) -> tuple[str, ...]:
+    """Those of some columns that part the rows otherwise than a column does."""
+    own = pd.factorize(frame[column])[0]
+    return tuple(one for one in rivals if not np.array_equal(pd.factorize(frame[one])[0], own))
 
 
 def _by_content(frame: pd.DataFrame) -> dict[str, str]:

@@ -62,9 +62,9 @@ def read_raw(path: Path) -> Raw:
         DataError: it is empty, no text, or no table; says which.
     """
     if path.is_dir():
-        raise ConfigError(f"file={path} is a folder; name one of its files")
+        raise ConfigError(f"{path} is a folder; name one of its files")
     if not path.is_file():
-        raise ConfigError(f"there is no file {path}; set file= to a table of trajectories")
+        raise ConfigError(f"there is no file {path}; give the path of a table of trajectories")
     try:
         with path.open("rb") as file:
             start = file.read(_BYTES)

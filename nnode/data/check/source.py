@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.check.columns import Meaning
+from nnode.data.check.columns import Meaning, numbers
 from nnode.data.check.raw import Raw
 from nnode.data.check.scale import Scale
 from nnode.data.check.tracks import Tracks
@@ -27,8 +28,12 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.data.readers.highd import TRACKS
+from nnode.data.readers.table import UNEVEN
 
 _NGSIM = {"Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID"}
+#: Column that is made of two, where a table has recordings and sequences in them.
+JOINT = "recording and sequence"
+
 _TABLE = {"sequence", "time", "agent", "x"}
 _RUNS = {"run", "position", "t", "v", "gap"}
 
@@ -123,19 +128,13 @@ def _plain(raw: Raw) -> bool:
     return raw.named and raw.separator in (",", "")
 
 
-def _si(scale: Scale) -> bool:
-    """Whether a tidy table is in these units; that of its times can be told."""
-    return scale.position == "m" and scale.rate is None
-
-
 def _people(
     raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
 ) -> Source:
     columns = {meaning: one.column for meaning, one in found.items()}
-    exact = all(columns.get(name) == name for name in (*_TABLE, "y"))
-    if exact and _si(scale) and _plain(raw):
-        return Source("table", TableOptions(domain="crowd", path=path, time_unit=scale.time))
-    rate = float(f"{1 / tracks.dt:.9g}")
+    if "sequence" in columns and _even(tracks):
+        return _tidy(raw, found, scale, path)
+    rate = people_rate(tracks)
     steps = max(2, round(rate))
     own: dict[str, Any] = {"t_seq": float(f"{steps / rate:.9g}")} if rate != round(rate) else {}
     if np.ptp(tracks.x[:, 1]) > np.ptp(tracks.x[:, 0]):
@@ -155,6 +154,94 @@ def _people(
     return Source("pedpy", WalkwayOptions(**own), _to_people(raw, columns, scale, rate, made))
 
 
+def people_rate(tracks: Tracks) -> float:
+    """Samples of people per second."""
+    return float(f"{1 / tracks.dt:.9g}")
+
+
+def people_of(raw: Raw, found: Mapping[str, Meaning], scale: Scale, rate: float) -> pd.DataFrame:
+    """Rows id, frame, x, y (m) of a table of people, as the lines of :func:`_to_people` make them.
+
+    Args:
+        rate: samples per second.
+    """
+    assert raw.table is not None
+    frame = raw.table.frame
+    columns = {meaning: one.column for meaning, one in found.items()}
+    clock = numbers(frame, columns["time" if "time" in columns else "frame"])
+    number = np.round(rate * scale.seconds * clock)
+    runs = [columns[m] for m in ("recording", "sequence") if m in columns]
+    if runs:
+        number += (np.nanmax(number) - np.nanmin(number) + 1) * frame.groupby(runs).ngroup()
+    who = frame[[*runs, columns["agent"]]].astype(str).agg(" ".join, axis=1)
+    made = pd.DataFrame({"id": pd.factorize(who)[0], "frame": number})
+    for axis in ("x", "y"):
+        made[axis] = scale.metres * numbers(frame, columns[axis])
+    return made.dropna().astype({"frame": np.int64})
+
+
+def _even(tracks: Tracks) -> bool:
+    """Whether times of every part of a table are equally spaced, apart from holes of single agents,
+    as those of a tidy table must be."""
+    part = np.zeros(len(tracks)) if tracks.part is None else tracks.part
+    for number in np.unique(part):
+        step = np.diff(np.unique(np.round(tracks.time[part == number], 9)))
+        if step.size and (np.abs(step - np.median(step)) > UNEVEN * np.median(step)).any():
+            return False
+    return True
+
+
+def _together(tracks: Tracks) -> bool:
+    """Whether most agents are in their part of the table from its first to its last time."""
+    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
+    end = np.append(start[1:], len(tracks)) - 1
+    part = np.zeros(len(tracks), dtype=int) if tracks.part is None else tracks.part
+    first, last = np.full(part.max() + 1, np.inf), np.full(part.max() + 1, -np.inf)
+    np.minimum.at(first, part, tracks.time)
+    np.maximum.at(last, part, tracks.time)
+    near = tracks.dt / 2
+    begins = tracks.time[start] - first[part[start]] < near
+    ends = last[part[end]] - tracks.time[end] < near
+    return bool((begins & ends).mean() > 0.5)
+
+
+def _tidy(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:
+    """Sequences that are cut already."""
+    columns = {meaning: one.column for meaning, one in found.items()}
+    meant = {"time": "time" if "time" in columns else "frame"}
+    axes = ("x", "y") if scale.domain == "crowd" else ("x",)
+    meant |= {name: name for name in ("sequence", "agent", *axes, "length", "kind", "recording")}
+    named = _named(raw, columns, meant)
+    if scale.domain == "traffic" and raw.table is not None and "y" in raw.table.frame.columns:
+        named["y"] = None
+    own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
+    own |= {"time_unit": scale.time, "frame_rate": scale.rate, "domain": scale.domain}
+    place, lines = _commas(raw, path)
+    return Source("table", TableOptions(path=place, **own), lines)
+
+
+def _named(raw: Raw, columns: Mapping[str, str], meant: Mapping[str, str]) -> dict[str, str | None]:
+    """A reader's columns by their meaning to it, where they have other names than that.
+
+    A table's own column of a name that means something else must not be read for it.
+    """
+    held = set() if raw.table is None else {str(name) for name in raw.table.frame.columns}
+    return {
+        name: columns.get(m)
+        for name, m in meant.items()
+        if (name != columns[m] if m in columns else name in held)
+    }
+
+
+def _commas(raw: Raw, path: str, *change: str) -> tuple[str, list[str]]:
+    """Where the table is with commas between its cells, and the lines that write it there."""
+    if _plain(raw) and not change:
+        return path, []
+    made = str(raw.path.with_name(f"{raw.path.stem}_commas.csv").absolute())
+    read = ["import pandas as pd", "", *_read(raw)]
+    return made, [*read, *change, f"t.to_csv({made!r}, index=False)"]
+
+
 def _to_people(
     raw: Raw, columns: Mapping[str, str], scale: Scale, rate: float, made: Path
 ) -> list[str]:
@@ -164,14 +251,20 @@ def _to_people(
     metres = f"{scale.metres:g} * " if scale.metres != 1 else ""
     whose = [columns[m] for m in ("recording", "sequence", "agent") if m in columns]
     who = f"t[{whose[0]!r}]"
+    lines = [f"frame = {frames}"]
     if len(whose) > 1:
         who = f"t[{whose!r}].astype(str).agg(' '.join, axis=1)"
+        # people of two recordings never meet: one recording begins when the other one has ended
+        lines.append(
+            f"frame += (frame.max() - frame.min() + 1) * t.groupby({whose[:-1]!r}).ngroup()"
+        )
     return [
         "import pandas as pd",
         "",
         *_read(raw),
+        *lines,
         "people = pd.DataFrame({",
-        f"    'id': pd.factorize({who})[0], 'frame': {frames},",
+        f"    'id': pd.factorize({who})[0], 'frame': frame,",
         f"    'x': {metres}t[{columns['x']!r}], 'y': {metres}t[{columns['y']!r}], 'z': 0}})",
         f"with open({str(made)!r}, 'w') as file:",
         f"    file.write('# framerate: {rate:.9g}\\n# id frame x/m y/m z/m\\n')",
@@ -207,20 +300,24 @@ def _vehicles(
     raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
 ) -> Source:
     columns = {meaning: one.column for meaning, one in found.items()}
-    exact = all(columns.get(name) == name for name in _TABLE) and "y" not in columns
-    if exact and _si(scale) and _plain(raw):
-        return Source("table", TableOptions(domain="traffic", path=path, time_unit=scale.time))
+    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
+    end = np.append(start[1:], len(tracks)) - 1
+    back = bool(np.median(tracks.x[end, 0] - tracks.x[start, 0]) < 0)
+    exact = all(columns.get(name) == name for name in _TABLE)
+    cut = "sequence" in columns and "lane" not in columns
+    if cut and not back and _even(tracks) and (exact or _together(tracks)):
+        return _tidy(raw, found, scale, path)
     clock = "time" if "time" in columns else "frame"
     meant = {"vehicle": "agent", "time": clock} | {
-        name: name for name in ("x", "lane", "speed", "length", "kind")
+        name: name for name in ("x", "lane", "speed", "length", "kind", "recording")
     }
-    # a table's own column of a name that means something else must not be read for it
-    held = set() if raw.table is None else {str(name) for name in raw.table.frame.columns}
-    named: dict[str, str | None] = {
-        name: columns.get(m)
-        for name, m in meant.items()
-        if (name != columns[m] if m in columns else name in held)
-    }
+    whole = [columns[m] for m in ("recording", "sequence") if m in columns]
+    columns = {**columns, **({"recording": whole[0]} if whole else {})}
+    change: list[str] = []
+    if len(whole) > 1:
+        columns["recording"] = JOINT
+        change = [f"t[{JOINT!r}] = t[{whole!r}].astype(str).agg(' '.join, axis=1)"]
+    named = _named(raw, columns, meant)
     own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
     if "speed" in columns:
         own["speed_unit"] = scale.speed
@@ -229,15 +326,27 @@ def _vehicles(
         own["frame_rate"] = scale.rate
     if tracks.dt > VehicleTableOptions.dt:
         own["dt"] = float(f"{tracks.dt:.6g}")
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks)) - 1
-    if np.median(tracks.x[end, 0] - tracks.x[start, 0]) < 0:
+    if back:
         own["direction"] = -1
-    if _plain(raw):
-        return Source("vehicles", VehicleTableOptions(path=path, **own))
-    made = str(raw.path.with_name(f"{raw.path.stem}_commas.csv").absolute())
-    lines = ["import pandas as pd", "", *_read(raw), f"t.to_csv({made!r}, index=False)"]
-    return Source("vehicles", VehicleTableOptions(path=made, **own), lines)
+    if _most(tracks) < VehicleTableOptions.min_vehicles:
+        own["min_vehicles"] = max(_most(tracks), 1)
+    place, lines = _commas(raw, path, *change)
+    return Source("vehicles", VehicleTableOptions(path=place, **own), lines)
+
+
+def joint(raw: Raw, found: Mapping[str, Meaning]) -> pd.Series:
+    """Names of recording and sequence of every row."""
+    assert raw.table is not None
+    whole = [found[m].column for m in ("recording", "sequence")]
+    return raw.table.frame[whole].astype(str).agg(" ".join, axis=1)
+
+
+def _most(tracks: Tracks) -> int:
+    """The greatest number of vehicles in one lane at one time."""
+    where = np.zeros(len(tracks)) if tracks.lane is None else tracks.lane
+    part = np.zeros(len(tracks)) if tracks.part is None else tracks.part
+    each = np.stack([np.round(tracks.time / tracks.dt), where, part])
+    return int(np.unique(each, axis=1, return_counts=True)[1].max())
 
 
 def _pairs(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:

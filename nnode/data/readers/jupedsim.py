@@ -18,8 +18,9 @@ import shapely
 from shapely.geometry.polygon import orient
 
 from nnode.data.options import WalkwayOptions
+from nnode.data.readers.columns import Table
 from nnode.data.readers.juelich import cut_people, load_people
-from nnode.data.readers.recordings import table_path
+from nnode.data.readers.recordings import positive, table_path
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 
@@ -47,12 +48,13 @@ def walkway_files(options: WalkwayOptions) -> dict[str, Path]:
 
 
 def read_walkway(
-    path: Path, options: WalkwayOptions, geometry: Path | None = None
+    path: Path | Table, options: WalkwayOptions, geometry: Path | None = None
 ) -> list[Sequence]:
     """Read one file and cut it, see :func:`nnode.data.readers.juelich.read_juelich`.
 
     Args:
-        path: SQLite database as JuPedSim's writer makes it, or text ``id frame x y z``.
+        path: SQLite database as JuPedSim's writer makes it; text ``id frame x y z``; or a table
+            in memory with id, frame, x, y (m), and ``frame_rate`` among the options.
         options: those of the Jülich reader. ``frame_rate`` and ``unit`` are for texts without a
             header; a database tells its own.
         geometry: text file with the walkable area as WKT (m); it takes the place of the area
@@ -66,8 +68,11 @@ def read_walkway(
         ConfigError: an option out of its range, or one that contradicts the file.
         DataError: a file that is not of its format, or no sequence at all.
     """
-    path = Path(path)
-    if path.is_file() and _is_database(path):
+    area = None
+    if isinstance(path, Table):
+        people, rate = path.frame, positive("frame_rate", options.frame_rate)
+        path = path.path
+    elif path.is_file() and _is_database(path):
         people, rate, area = _read_database(path)
         if options.frame_rate not in (None, rate) or options.unit not in (None, "m"):
             raise ConfigError(
@@ -76,7 +81,6 @@ def read_walkway(
             )
     else:
         people, rate = load_people(path, options)
-        area = None
     walls = None
     if geometry is not None:
         walls = walls_of(_text(geometry), str(geometry))

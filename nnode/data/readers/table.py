@@ -1,4 +1,4 @@
-"""Reader of a tidy table: one row per sequence, time and agent, in SI units."""
+"""Reader of a tidy table: one row per sequence, time and agent."""
 
 from __future__ import annotations
 
@@ -9,14 +9,9 @@ import numpy as np
 from nnode.data.exits import destinations, exits_of, read_exits
 from nnode.data.options import TableOptions
 from nnode.data.readers.columns import Table, opened
-from nnode.data.readers.recordings import (
-    check_known,
-    natural,
-    one_of,
-    table_path,
-    wanted,
-)
-from nnode.data.sequence import TIME_UNITS, Sequence
+from nnode.data.readers.recordings import check_known, natural, one_of, table_path, wanted
+from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
+from nnode.data.sequence import Sequence
 from nnode.data.smooth import fill
 from nnode.errors import ConfigError, DataError
 
@@ -50,7 +45,7 @@ def read_table(
     Args:
         source: CSV or Parquet, or a table that is open, with the columns that
             :class:`TableOptions` lists.
-        options: ``domain`` and ``recording`` are read.
+        options: ``domain``, ``recording``, columns and units are read.
         walls: CSV or Parquet with a segment per row, x1, y1, x2, y2 (m).
 
     Returns:
@@ -70,7 +65,8 @@ def read_table(
     crowd = _is_crowd(options)
     table = opened(source)
     path = table.path
-    names = table.choose(_REQUIRED, _OPTIONAL)
+    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
+    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
         raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
@@ -84,11 +80,11 @@ def read_table(
             "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
         )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
-    time = table.times(names["time"], one_of("time_unit", options.time_unit, TIME_UNITS))[1]
-    values: dict[str, np.ndarray] = {axis: table.measured(names[axis]) for axis in axes}
-    values |= {name: table.numbers(names[name]) for name in goals if name in names}
+    time = table.times(names["time"], seconds_per_unit(options))[1]
+    values: dict[str, np.ndarray] = {axis: table.measured(names[axis]) * metres for axis in axes}
+    values |= {name: table.numbers(names[name]) * metres for name in goals if name in names}
     if "length" in names:
-        values["length"] = table.positive(names["length"])
+        values["length"] = table.positive(names["length"]) * metres
     words: dict[str, np.ndarray] = {
         k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names
     }

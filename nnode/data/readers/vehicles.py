@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.options import LaneOptions, VehicleTableOptions
+from nnode.data.options import LaneOptions, TableOptions, VehicleTableOptions
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.recordings import one_of, positive, table_path
@@ -22,7 +24,7 @@ SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 _LATEST = 2.0**52
 
 _REQUIRED = ("vehicle", "time", "x")
-_OPTIONAL = ("lane", "speed", "length", "kind")
+_OPTIONAL = ("lane", "speed", "length", "kind", "recording")
 
 
 def vehicle_files(options: LaneOptions) -> dict[str, Path]:
@@ -48,21 +50,48 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> list[Se
     check_cutting(options)
     table = opened(source)
     rows = _rows(table, options)
-    order = np.lexsort((rows.time, rows.vehicle.astype(str)))
-    step = np.diff(rows.time[order])[rows.vehicle[order][1:] == rows.vehicle[order][:-1]]
+    column = table.choose(_REQUIRED, _OPTIONAL, options.columns).get("recording")
+    recording = np.zeros(len(rows.time)) if column is None else table.names(column)
+    order = np.lexsort((rows.time, rows.vehicle.astype(str), recording.astype(str)))
+    same = rows.vehicle[order][1:] == rows.vehicle[order][:-1]
+    step = np.diff(rows.time[order])[same & (recording[order][1:] == recording[order][:-1])]
     step = step[step > 0]
     if step.size:
         check_interval(float(np.median(step)), f"{table.path}: rows of a vehicle")
-    return cut_vehicles({table.path.stem: rows}, options)
+    if column is None:
+        return cut_vehicles({table.path.stem: rows}, options)
+    parts = {name: _part(rows, recording == name) for name in pd.unique(recording)}
+    return cut_vehicles(parts, options)
 
 
-def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
+def _part(rows: Vehicles, chosen: np.ndarray) -> Vehicles:
+    """Some of the rows."""
+    number = np.flatnonzero(chosen)
+    cells = ("vehicle", "time", "x", "lane", "speed", "length", "kind")
+    own: dict[str, Any] = {
+        key: None if getattr(rows, key) is None else getattr(rows, key)[number] for key in cells
+    }
+    return Vehicles(path=rows.path, row=lambda i: rows.row(int(number[i])), **own)
+
+
+def seconds_per_unit(options: VehicleTableOptions | TableOptions) -> float:
+    """Seconds in a unit of a table's times.
+
+    Raises:
+        ConfigError: an unknown unit, or frames without their rate.
+    """
     scale = one_of("time_unit", options.time_unit, {**TIME_UNITS, "frame": np.nan})
     if options.time_unit == "frame":
         scale = 1.0 / positive("frame_rate", options.frame_rate)
+    return scale
+
+
+def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
     dates = table.instants(column)
-    # numbers keep their origin, with which the time grid begins
-    time = table.numbers(column) * scale if dates is None else (dates - dates.min()) / 1e9
+    if dates is None:  # numbers keep their origin, with which the time grid begins
+        time = table.numbers(column) * seconds_per_unit(options)
+    else:
+        time = (dates - dates.min()) / 1e9
     far = np.flatnonzero(~(np.abs(time) < _LATEST * options.dt))
     if far.size:
         raise DataError(

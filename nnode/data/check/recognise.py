@@ -1,0 +1,283 @@
+"""The options that read a table of anybody's: what its columns mean and in which units they are.
+
+The same recognition as that of the check, without a look at faults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from nnode.data.check.columns import Meaning, in_seconds, meanings, plain
+from nnode.data.check.examine import FAIR, LIKELY, SURE, sure
+from nnode.data.check.raw import Raw, read_raw
+from nnode.data.check.rows import Scaled, in_memory, scaled
+from nnode.data.check.scale import Scale
+from nnode.data.check.source import native_source, source_of
+from nnode.data.options import DataOptions, PairOptions, TableOptions, VehicleTableOptions
+from nnode.data.readers.columns import Table
+from nnode.data.sequence import Domain
+from nnode.errors import ConfigError, DataError, NNodeError
+
+#: Formats of tables, by the group of their options, each with columns that it cannot do without.
+NEEDED: dict[str, tuple[type[DataOptions], set[str]]] = {
+    "pairs": (PairOptions, {"time", "x_follower", "x_leader"}),
+    "table": (TableOptions, {"sequence", "time", "agent", "x"}),
+    "vehicles": (VehicleTableOptions, {"vehicle", "time", "x"}),
+}
+#: Columns of pairs whose positions are integrated.
+SPACED = {"time", "spacing", "v_follower", "v_leader"}
+#: Meanings that readers call by another name.
+_CALLED = {"vehicle": "agent", "run": "recording"}
+#: Options that say units, by the quantity.
+UNIT = {"position": "position_unit", "time": "time_unit", "speed": "speed_unit"}
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """How a table is read.
+
+    Attributes:
+        group: of the options, as in ``conf/data``.
+        options: that read the table.
+        table: what they read; None: the file that they name.
+        line: what was recognised, in words; empty where names and units are those of the format.
+    """
+
+    group: str
+    options: DataOptions
+    table: Table | None
+    line: str
+
+
+def recognised(
+    source: pd.DataFrame | str | Path,
+    domain: Domain | None = None,
+    given: Mapping[str, Any] | None = None,
+) -> Recognised:
+    """How a table is read: what the user says of it, and what its names and numbers show.
+
+    A table with all columns of a format, ``sequence, time, agent, x`` or ``vehicle, time, x`` or
+    ``time, x_follower, x_leader``, is of that format and in SI units, unless its numbers surely
+    are of other units; a tidy table keeps SI units even then, and the line says so.
+
+    Args:
+        source: a data frame, or the path of a table or of a file of a known format.
+        domain: of the data; None: as the columns show.
+        given: options that are known already, ``columns``, units and ``frame_rate``: they win.
+
+    Raises:
+        ConfigError: no such file; columns or units that may be two things; names both.
+        DataError: no table of trajectories; names what is lacking.
+    """
+    given = dict(given or {})
+    if domain not in (None, "traffic", "crowd"):
+        raise ConfigError(f"data.domain={domain}: expected traffic or crowd")
+    memory = isinstance(source, pd.DataFrame)
+    if isinstance(source, pd.DataFrame):
+        raw = Raw(Path("table"), table=Table(source), separator="")
+    else:
+        raw = read_raw(Path(source).expanduser())
+    if raw.table is None:
+        return _native(raw)
+    raw = in_seconds(raw)
+    assert raw.table is not None
+    exact = _exact(raw.table, given)
+    if exact == "table" and raw.separator in (",", ""):
+        return _tidy(raw, domain, given)
+    found = _with_given(raw, meanings(raw), given)
+    if exact is None and not memory and (native := native_source(raw, found)) is not None:
+        return _native(replace(raw, native=native))
+    if exact is None:
+        _clear(raw, found)
+    rate = given.get("frame_rate")
+    told = {what: str(given[key]) for what, key in UNIT.items() if key in given}
+    try:
+        seen = scaled(raw, found, domain, rate, told)
+    except DataError:
+        if exact is None:
+            raise
+        return _by_name(raw, exact, given)
+    if exact is None:
+        _sure_enough(raw, seen, rate or raw.rate, told)
+    elif raw.separator in (",", "") and (told or _si(seen.scale) or _share(seen) < SURE):
+        return _by_name(raw, exact, given)
+    found = seen.meanings
+    read = source_of(raw, found, seen.scale, seen.tracks)
+    line = _line(raw, found, seen, read.group)
+    if not memory and not read.convert:
+        return Recognised(read.group, read.options, None, line)
+    options, table = in_memory(raw, found, seen, read)
+    return Recognised(read.group, options, table, line)
+
+
+def _native(raw: Raw) -> Recognised:
+    """A file of a format whose reader knows its columns and units."""
+    read = source_of(raw)
+    return Recognised(read.group, read.options, None, f"{raw.path}: read as data={read.group}")
+
+
+def _by_name(raw: Raw, group: str, given: Mapping[str, Any]) -> Recognised:
+    """A table with the columns of a format, in the units that the format has by default."""
+    memory = raw.path == Path("table")
+    options = NEEDED[group][0](path="" if memory else str(raw.path))  # type: ignore[call-arg]
+    options = replace(options, columns=dict(given.get("columns") or {}))  # type: ignore[call-arg]
+    return Recognised(group, options, raw.table if memory else None, "")
+
+
+def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[str, Any]) -> bool:
+    """Whether a table has the columns of a format, under their own names or those given.
+
+    What is no table, or no file, has them: its reader says what is wrong.
+    """
+    if isinstance(source, pd.DataFrame):
+        names = {str(name).strip() for name in source.columns}
+    else:
+        path = Path(source).expanduser()
+        if not path.is_file():
+            return True
+        try:
+            table = read_raw(path).table
+        except NNodeError:
+            return True
+        if table is None:
+            return True
+        names = set(map(str, table.frame.columns))
+    names |= set(given.get("columns") or {})
+    return names >= NEEDED[group][1] or (group == "pairs" and names >= SPACED)
+
+
+def _exact(table: Table, given: Mapping[str, Any]) -> str | None:
+    """The format whose columns a table has under their own names, or under those given."""
+    names = set(map(str, table.frame.columns)) | set(given.get("columns") or {})
+    if names >= SPACED and not names & {"x", "x_follower", "x_leader"}:
+        return "pairs"
+    if "vehicle" in names and "sequence" not in names and "x_follower" not in names:
+        return "vehicles" if names >= NEEDED["vehicles"][1] else None
+    return next((group for group, (_, needed) in NEEDED.items() if names >= needed), None)
+
+
+def _tidy(raw: Raw, domain: Domain | None, given: Mapping[str, Any]) -> Recognised:
+    """A tidy table: its units are those that are documented, or given."""
+    assert raw.table is not None
+    names = set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+    chosen: Domain = domain or ("crowd" if "y" in names else "traffic")
+    read, line = _by_name(raw, "table", given), ""
+    if not any(key in given for key in UNIT.values()):
+        try:
+            seen = scaled(raw, _with_given(raw, meanings(raw), given), chosen, None)
+        except (DataError, ConfigError):
+            return replace(read, options=replace(read.options, domain=chosen))
+        best = seen.scale
+        if not _si(best) and _share(seen) >= SURE:
+            line = (
+                f"{raw.path}: a tidy table is read in m and s, and its numbers look like "
+                f"{_words(best)}; {_how(best)} reads it so"
+            )
+    return replace(read, options=replace(read.options, domain=chosen), line=line)
+
+
+def _with_given(
+    raw: Raw, found: dict[str, Meaning], given: Mapping[str, Any]
+) -> dict[str, Meaning]:
+    """Meanings as the user says, and the others as they were recognised."""
+    assert raw.table is not None
+    names = list(map(str, raw.table.frame.columns))
+    columns: Mapping[str, str | None] = given.get("columns") or {}
+    own: dict[str, Meaning] = {}
+    for key, column in columns.items():
+        meaning = _CALLED.get(str(key), str(key))
+        if column is None:
+            found = {m: one for m, one in found.items() if m != meaning}
+            continue
+        if column not in names:
+            raise ConfigError(
+                f"data.columns.{key}={column}: {raw.path} has no such column, it has "
+                f"{', '.join(names)}"
+            )
+        if meaning == "time" and given.get("time_unit") == "frame":
+            meaning = "frame"
+        own[meaning] = Meaning(column, plain(column)[1], "given")
+    taken = {one.column for one in own.values()}
+    if {"time", "frame"} & own.keys():
+        found = {m: one for m, one in found.items() if m not in ("time", "frame")}
+    return {m: one for m, one in found.items() if one.column not in taken} | own
+
+
+def _clear(raw: Raw, found: Mapping[str, Meaning]) -> None:
+    """Refuse columns that may be two things.
+
+    Raises:
+        ConfigError: names both.
+    """
+    for meaning, one in found.items():
+        if one.rivals and meaning in ("agent", "time", "frame", "x", "y", "sequence", "lane"):
+            raise ConfigError(
+                f"{raw.path}: the column of {meaning} may be {one.column} or "
+                f"{' or '.join(one.rivals)}, which hold different values; say which, as in "
+                f"data.columns.{meaning}={one.column}"
+            )
+
+
+def _sure_enough(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, str]) -> None:
+    """Refuse units that may be two things.
+
+    Raises:
+        ConfigError: names both.
+    """
+    best = seen.scale
+    if _share(seen) < LIKELY and not told:
+        other = next(one for one in seen.scales if _units(one) != _units(best))
+        raise ConfigError(
+            f"{raw.path}: its numbers may be {_words(best)} or {_words(other)}; say which, with "
+            f"{_how(best)} or {_how(other)}"
+        )
+    if best.rate is not None and rate is None:
+        rates = {
+            one.rate: one.probability for one in seen.scales
+            if one.rate and _units(one) == _units(best) and one.probability > FAIR
+        }  # fmt: skip
+        if len(rates) > 1:
+            listed = " or ".join(f"{one:g}" for one in sorted(rates))
+            raise ConfigError(
+                f"{raw.path}: times are frames of a rate that it does not tell; {listed} frames/s "
+                f"fit: say which, as in data.frame_rate={best.rate:g}"
+            )
+
+
+def _si(scale: Scale) -> bool:
+    return (scale.position, scale.time, scale.rate, scale.speed) == ("m", "s", None, "m/s")
+
+
+def _units(scale: Scale) -> tuple[str, ...]:
+    return scale.domain, scale.position, scale.time, scale.speed
+
+
+def _share(seen: Scaled) -> float:
+    """Probability of the units, whatever the rate of frames."""
+    return sum(s.probability for s in seen.scales if _units(s) == _units(seen.scale))
+
+
+def _words(scale: Scale) -> str:
+    clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
+    people = "people" if scale.domain == "crowd" else "vehicles"
+    return f"{people}, positions in {scale.position}, times in {clock}, speeds in {scale.speed}"
+
+
+def _how(scale: Scale) -> str:
+    """Options that say units."""
+    said = [f"data.position_unit={scale.position}", f"data.time_unit={scale.time}"]
+    said += [f"data.frame_rate={scale.rate:g}"] if scale.rate else []
+    return " ".join(said)
+
+
+def _line(raw: Raw, found: Mapping[str, Meaning], seen: Scaled, group: str) -> str:
+    named = ", ".join(f"{meaning} = {one.column}" for meaning, one in found.items())
+    return (
+        f"{raw.path}: recognised {named}; {_words(seen.scale)} ({sure(_share(seen))}); read as "
+        f"data={group}"
+    )
