@@ -171,9 +171,9 @@ def test_a_platoon_begins_when_all_are_there(tmp_path: Path) -> None:
 def test_a_long_hole_is_a_fault_of_its_sequence(tmp_path: Path) -> None:
     table = driven()
     other = table.assign(sequence="other")
-    first, second = read(tmp_path, table[~table.time.between(3.95, 5.05)], other)
-    assert "gap_in_time" in {fault.kind for fault in find_faults(first, "traffic")}
-    assert find_faults(second, "traffic") == []
+    sound, holed = read(tmp_path, table[~table.time.between(3.95, 5.05)], other)
+    assert "gap_in_time" in {fault.kind for fault in find_faults(holed, "traffic")}
+    assert find_faults(sound, "traffic") == []
 
 
 def test_one_agent_twice(tmp_path: Path) -> None:
