@@ -62,7 +62,7 @@ class Store:
             self._path = self.folder / _TABLES[_TABLES.index(content["table"]["file"])]
             self._walls = [np.asarray(w, float).reshape(-1, 4) for w in content["walls"]]
             found = interpolation(self.manifest.get("options"))
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise DataError(
                 f"{self.folder / MANIFEST} is damaged ({type(error).__name__}: {error}); "
                 "prepare the data again"
@@ -117,7 +117,14 @@ class Store:
     def _damage(self, i: int) -> Iterator[None]:
         try:
             yield
-        except (pa.ArrowException, OSError, LookupError, ValueError, TypeError) as error:
+        except (
+            pa.ArrowException,
+            OSError,
+            LookupError,
+            ValueError,
+            TypeError,
+            OverflowError,
+        ) as error:
             raise DataError(
                 f"{self._path}: sequence {i} ({self.index[i]!s:.80}) cannot be "
                 f"read: {error}; the store is damaged: prepare the data again"

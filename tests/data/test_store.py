@@ -192,6 +192,14 @@ def test_a_replacement_broken_off_at_any_move_leaves_a_whole_store(
     assert len(list(Store(folder))) == (1 if broken == 2 else 2)
 
 
+def test_a_number_beyond_float64_in_a_manifest(folder: Path) -> None:
+    content = json.loads((folder / MANIFEST).read_text())
+    content["walls"] = [[[10**400, 0, 1, 1]]]
+    (folder / MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(DataError, match="is damaged"):
+        Store(folder)
+
+
 @pytest.mark.parametrize("name", ["../elsewhere.parquet", "/etc/passwd", "manifest.json", 3])
 def test_a_manifest_names_no_file_but_its_table(folder: Path, name: object) -> None:
     content = json.loads((folder / MANIFEST).read_text())
