@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.speed.problems import Problem
+from benchmarks.speed.problems import Problem, pose
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch
 from nnode.models.system import System
@@ -131,3 +131,50 @@ ENGINES: dict[str, Engine] = {
         _solver(lambda dt: FusedSolver(dt, 2, method="euler")), _every, True, 1e-4, 1e-5
     ),
 }
+
+#: Methods and steps, s. The first is what engines are compared with.
+STEPPED = (("euler", 0.002), ("euler", 0.1), ("ballistic", 0.1), ("rk4", 0.1))
+#: So many steps of Runge and Kutta's method in the longest one stand for the solution: its errors
+#: fall with the fourth power, by 7e4.
+FINER = 16
+
+
+def _stepped(method: str, dt: float) -> str:
+    return f"{method} {dt:g} s"
+
+
+def by_method(problem: Problem) -> dict[str, Call]:
+    """One gradient by every method, on one thread; ballistic steps are of accelerations."""
+    return {
+        _stepped(method, dt): torch_call(problem, FusedSolver(dt, 1, method=method))
+        for method, dt in STEPPED
+        if method != "ballistic" or problem.system.order > 1
+    }
+
+
+def method_errors(problem: Problem) -> dict[str, dict[str, float]]:
+    """By method, in float64: ``rms`` and ``largest`` distance of places from the solution, m, and
+    ``gradient``, the largest relative error of a component of the gradient."""
+    exact = pose(problem.shape, problem.model, torch.float64)
+    system, batch = exact.system, exact.batch
+
+    def solved(method: str, dt: float) -> tuple[Tensor, Tensor]:
+        path = FusedSolver(dt, 1, method=method)(system, batch)
+        own = list(system.parameters())
+        slopes = torch.autograd.grad(sequence_costs(path, batch).sum(), own)
+        return path.x.detach(), torch.cat([slope.flatten() for slope in slopes])
+
+    longest = max(dt for _, dt in STEPPED)
+    x, slope = solved("rk4", longest / FINER)
+    found = {}
+    for method, dt in STEPPED:
+        if _stepped(method, dt) not in by_method(exact):
+            continue
+        other, own = solved(method, dt)
+        away = other - x
+        found[_stepped(method, dt)] = {
+            "rms": float(away.square().mean().sqrt()),
+            "largest": float(away.abs().max()),
+            "gradient": float(((own - slope) / slope).abs().max()),
+        }
+    return found

@@ -56,6 +56,8 @@ SHAPES: dict[str, tuple[Shape, ...]] = {
     "effects": (Shape("traffic", ("lin", "lin+1", "lin+3", "idm"), 100, 10, 50, 100, 0.002),),
     # eight parameters each; of the last one speeds depend on those ahead
     "tangents": (Shape("traffic", ("lin_places", "idm_zone", "lin_ahead"), 100, 10, 50, 10, 0.02),),
+    # 30 s; by methods of stepping, which have their own steps
+    "methods": (Shape("traffic", ("n4", "idm"), 100, 10, 300, 50, 0.002),),
     "crowd": (Shape("crowd", ("sf", "nn"), 128, 44, 25, 1, 0.04),),
     "crowd_effects": (Shape("crowd", ("sf", "sf+1", "sf+3"), 16, 44, 25, 1, 0.04),),
     # one hall: few enough people for every engine, then as many as cell lists allow

@@ -120,3 +120,24 @@ def print_per_person(found: dict[str, dict[str, Any]]) -> None:
             f"{engine}: one step of one person takes {times} µs among {sizes} people; "
             f"largest / smallest {row['ratio']:.3g}"
         )
+
+
+def print_methods(rows: list[dict[str, Any]]) -> None:
+    """Times and errors of problems of the shape ``methods``."""
+    for row in rows:
+        table = Table(title=f"one gradient by method, {row['problem']}")
+        table.add_column("method, step")
+        heads = ("median (ms)", "faster than the first", "rms (m)", "largest (m)", "gradient")
+        for head in heads:
+            table.add_column(head, justify="right")
+        engines = row["engines"]
+        first = next(iter(engines.values()))["median"]
+        for name, taken in engines.items():
+            away = row["errors"][name]
+            table.add_row(
+                name,
+                f"{1e3 * taken['median']:.4g}",
+                f"{first / taken['median']:.3g}",
+                *(f"{away[key]:.1e}" for key in ("rms", "largest", "gradient")),
+            )
+        Console(width=WIDTH).print(table)

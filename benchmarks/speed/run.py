@@ -13,13 +13,19 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from benchmarks.speed.engines import ENGINES, Call, Engine, torch_call
+from benchmarks.speed.engines import ENGINES, Call, Engine, by_method, method_errors, torch_call
 from benchmarks.speed.figure import performance_figure
 from benchmarks.speed.floor import evaluations, floor_call
 from benchmarks.speed.growth import diagnosed, print_growth
 from benchmarks.speed.memory import peak_memory
 from benchmarks.speed.problems import SHAPES, Problem, pose
-from benchmarks.speed.report import per_person, print_per_person, print_problem, print_tangents
+from benchmarks.speed.report import (
+    per_person,
+    print_methods,
+    print_per_person,
+    print_problem,
+    print_tangents,
+)
 from benchmarks.speed.start import warm_start
 from benchmarks.speed.tangents import calls, check, starts
 from nnode.calibrate.cost import squared_error
@@ -90,6 +96,10 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                     found.append({"shape": name, **_tangents(problem, options.repeats)})
                     write_json(folder / "benchmark.json", results)
                     continue
+                if name == "methods":
+                    found.append({"shape": name, **_methods(problem, options.repeats)})
+                    write_json(folder / "benchmark.json", results)
+                    continue
                 chosen = {
                     key: engine
                     for key, engine in ENGINES.items()
@@ -105,6 +115,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
                 print_problem(found[-1])
                 results["scale"] = per_person([r for r in found if r["shape"] == "scale"])
                 write_json(folder / "benchmark.json", results)
+    print_methods([row for row in found if row["shape"] == "methods"])
     print_tangents([row for row in found if row["shape"] == "tangents"])
     print_per_person(results["scale"])
     print_growth([row for row in found if row["shape"] == _DIAGNOSIS])
@@ -221,6 +232,22 @@ def _measure(problem: Problem, engines: dict[str, Engine], repeats: int) -> dict
     if floor is not None:
         row["floor"] = {"evaluations": evaluations(problem), **taken[_FLOOR]}
     return row
+
+
+def _methods(problem: Problem, repeats: int) -> dict[str, Any]:
+    """Methods of stepping in turn, and how far each is from the solution."""
+    own = by_method(problem)
+    for call in own.values():
+        call()  # compiles
+    return {
+        "problem": problem.label,
+        "model": problem.model,
+        "sequences": problem.shape.sequences,
+        "agents": problem.shape.agents,
+        "steps": problem.shape.steps,
+        "errors": method_errors(problem),
+        "engines": _rounds(own, repeats),
+    }
 
 
 def _tangents(problem: Problem, repeats: int) -> dict[str, Any]:

@@ -47,7 +47,8 @@ def drive_run(
             new temporary one.
         program: ``libsumo``, in this process, or ``traci``.
         steps: ``match`` refuses a scenario whose steps are not the run's; ``run`` lets SUMO make
-            the run's; ``scenario`` takes those of the scenario.
+            the run's; ``scenario`` takes those of the scenario. The steps of a law that is stepped
+            by Runge and Kutta's method by default are ballistic ones of the same length here.
         end: s of SUMO's clock; None: the scenario's, or when all have arrived.
         far: m at which a vehicle ahead counts as none; None: as far as SUMO looks.
         lengths: whether the law's gaps are bumper to bumper; None: as the run's data had lengths.
@@ -109,10 +110,12 @@ def drive_scenario(config: DictConfig, folder: Path) -> None:
 
 
 def steps_of(checkpoint: Checkpoint, model: System) -> Steps:
-    """The steps that a run was calibrated with."""
+    """The steps that a run was calibrated with; ballistic ones for a law whose own steps have
+    stages, which SUMO does not have."""
     solver, sampling = checkpoint.config["solver"], float(checkpoint.manifest["dt"])
     seconds = sampling / substeps(sampling, solver.get("dt"), model)
-    return Steps(seconds, str(solver.get("method") or model.step))
+    own = "ballistic" if model.step == "rk4" else model.step
+    return Steps(seconds, str(solver.get("method") or own))
 
 
 def _has_lengths(checkpoint: Checkpoint, run: str, model: System) -> bool:

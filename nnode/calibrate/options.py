@@ -67,8 +67,8 @@ class SolverOptions:
     name: str = MISSING  # of the solver
     # s, step; null: 0.002 for speeds and 0.1 for accelerations of vehicles, 0.0625 in crowds
     dt: float | None = None
-    # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: ballistic for
-    # accelerations of vehicles, otherwise euler
+    # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: the law's own, rk4 for
+    # smooth laws of the field, ballistic for other accelerations of vehicles, otherwise euler
     method: str | None = None
 
 

@@ -16,6 +16,7 @@ from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
 from nnode.generate.people import sample_people, takes_paces
 from nnode.laws.lane import Rule
+from nnode.laws.steps import STAGES
 from nnode.models import Crowd, Traffic
 from nnode.models.effects.base import IndividualEffect
 from nnode.models.effects.crowd_individual import GaitSway
@@ -146,8 +147,9 @@ def sample(
         samples: S.
         seed: of all that is drawn; batches that are to be independent need different ones.
         dt: step, s; None: the default of the model.
-        method: of stepping; None, or one with stages, is the model's own: the motion is driven
-            by noise, where stages gain nothing.
+        method: of stepping, ``semi_implicit``, ``ballistic`` or ``rk4``; others are the model's
+            own. The push stays the same during a step, also between the stages of ``rk4``:
+            without noise the motion is that of the solver.
 
     Returns:
         ``(K, S * B, N, D)``, sample by sample.
@@ -174,9 +176,9 @@ def sample(
     _give_drivers(noisy, many, batch.names, rng)
     # Euler's step of this time constant is exact for the given one
     noisy.terms.append(Push(step / (1 - kept)))
-    rates = Rates(
-        noisy, many, n, method if method in ("semi_implicit", "ballistic") else noisy.step
-    )
+    if method not in ("semi_implicit", "ballistic", "rk4"):
+        method = noisy.step
+    rates = Rates(noisy, many, n, method)
     y = noisy.initial(many, step)
 
     def normal() -> Tensor:
@@ -185,8 +187,16 @@ def sample(
     y[..., -1] = noise.sigma * normal()
     kick = noise.sigma * math.sqrt(1 - kept**2)
 
+    still = torch.ones_like(y[0, 0])
+    still[-1] = 0.0
+
     def change(step: Tensor, y: Tensor) -> Tensor:
         found: Tensor = rates(step, y)
+        if STAGES[method] == "rk4":
+            second = rates(step + 0.5, y + still * found / 2)
+            third = rates(step + 0.5, y + still * second / 2)
+            last = rates(step + 1, y + still * third)
+            found = found + still * ((found + 2 * second + 2 * third + last) / 6 - found)
         found[..., -1] += kick * normal()
         return found
 

@@ -2,6 +2,10 @@
 
 Gaps are bumper to bumper where lengths are known; without them the standstill gap contains the
 vehicle's length. A law sees a gap of at least 0.1 m, so that it brakes after a collision, too.
+
+Laws that are smooth are stepped by Runge and Kutta's method of fourth order (``step: rk4``). Gipps'
+law, which says the speed one reaction time later, keeps ballistic steps, and the laws that say what
+holds one step later keep their own.
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ _OPTIMAL = {
 _NETWORK = {
     "parameters": {},
     "rate": {"v": "NN(gap/20, v/10, dv/2)"},
+    "step": "rk4",
     "source": "acceleration as a network of gap, speed and speed difference, in 20 m, 10 and 2 m/s",
 }
 
@@ -46,6 +51,7 @@ FIELD: dict[str, dict[str, Any]] = {
         "constants": _LEAST,
         "where": {**_NET, "wish": "s0 + max(v*T + v*dv/(2*sqrt(a*b)), 0)"},
         "rate": {"v": "a*(1 - (v/v0)**4 - (wish/net)**2)"},
+        "step": "rk4",
         "source": "Intelligent Driver Model: Treiber, Hennecke & Helbing 2000",
     },
     "ovm": {
@@ -58,6 +64,7 @@ FIELD: dict[str, dict[str, Any]] = {
         "constants": _LEAST,
         "where": {**_NET, **_OPTIMAL},
         "rate": {"v": "kappa*(optimal - v)"},
+        "step": "rk4",
         "source": "optimal velocity: Bando, Hasebe, Nakayama, Shibata & Sugiyama 1995",
     },
     "fvdm": {
@@ -71,6 +78,7 @@ FIELD: dict[str, dict[str, Any]] = {
         "constants": _LEAST,
         "where": {**_NET, **_OPTIMAL},
         "rate": {"v": "kappa*(optimal - v) - lam*dv"},
+        "step": "rk4",
         "source": "full velocity difference: Jiang, Wu & Zhu 2001",
     },
     "gipps": {
@@ -121,6 +129,7 @@ FIELD: dict[str, dict[str, Any]] = {
         },
         "where": {"net": "gap - length_1"},
         "rate": {"v": "c_s*(net - s0 - T*v) - c_v*dv"},
+        "step": "rk4",
         "source": "Helly 1959; the usual form of adaptive cruise control",
     },
     "newell": {

@@ -106,7 +106,8 @@ class FormulaLaw(_Own, Law):
         delayed: name to ``[formula, delay]``, a value some time ago, of at most ``remembered``
             steps; the law is then a map from step to step.
         states: name to ``[unit, rate, start]``, formulas, of what a vehicle remembers.
-        step: the law's own method of stepping, see :mod:`nnode.laws.steps`; None: the field's.
+        step: the law's own method of stepping, see :mod:`nnode.laws.steps`; None: ballistic for
+            an acceleration. ``rk4`` is ballistic beside an effect that remembers step by step.
         network: neurons of the hidden layer of NN, a network that formulas may call with any
             inputs; where the rate does not, NN(gap/20, v/10, dv/2) is added to it, in SI
             units, and starts at 0. None: there is none.

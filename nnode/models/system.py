@@ -49,8 +49,8 @@ class System(nn.Module):
 
     @property
     def step(self) -> str:
-        """The method of stepping where none is asked for: the law's own, or the field's, ballistic
-        for accelerations of vehicles and otherwise Euler's; see :mod:`nnode.laws.steps`."""
+        """The method of stepping where none is asked for: the law's own, or ballistic for
+        accelerations of vehicles and otherwise Euler's; see :mod:`nnode.laws.steps`."""
         return "euler"
 
     def scene(self, batch: Batch) -> Scene:
@@ -164,6 +164,8 @@ class Traffic(System):
     def step(self) -> str:
         law = self.terms[0] if len(self.terms) else None
         own = law.step if isinstance(law, Law) else None
+        if own == "rk4" and self.lane is not None and "dt" in self.lane.symbols:
+            own = None  # an effect that remembers step by step has no stages in between
         return own or ("ballistic" if self.order > 1 else "euler")
 
     @property

@@ -44,9 +44,10 @@ class TorchdiffeqSolver:
 
     Args:
         method: a torchdiffeq method, or ``ballistic`` or ``semi_implicit``, which are Euler's of
-            a changed formula (see :mod:`nnode.laws.steps`); None takes ``ballistic`` for
-            accelerations of vehicles and ``euler`` otherwise. Fixed-step ones step ``dt``,
-            adaptive ones obey ``rtol`` and ``atol``.
+            a changed formula (see :mod:`nnode.laws.steps`); None takes the law's own, ``rk4``
+            for the smooth laws of the field, else ``ballistic`` for accelerations of vehicles and
+            ``euler`` for everything else. Fixed-step ones step ``dt``, adaptive ones obey
+            ``rtol`` and ``atol``. torchdiffeq's ``rk4`` is the 3/8 rule.
         gradient: ``adjoint`` integrates the adjoint equation backwards (the continuous
             adjoint of the paper, discretised: differs from the exact gradient of the
             discrete scheme by O(dt)); ``discrete`` differentiates the scheme itself.

@@ -15,6 +15,7 @@ from nnode.errors import ConfigError
 from nnode.models import Crowd, Relaxation, System, build_model
 from nnode.models.field import FIELD
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
+from tests.solvers.fused.compare import RungeKutta
 
 TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
 
@@ -56,7 +57,7 @@ def test_costs_and_slopes_are_those_of_autograd(kind: Convention, pairs: Batch) 
     system = model(T=1.1)
     cost = TangentCost(system, pairs, FusedSolver(), kind)
     curved = cost(cost.start)
-    wanted = sequence_costs(TorchdiffeqSolver(None, "discrete")(system, pairs), pairs, kind)
+    wanted = sequence_costs(RungeKutta()(system, pairs), pairs, kind)
     np.testing.assert_allclose(curved.cost, wanted.detach().numpy(), rtol=1e-11)
     np.testing.assert_allclose(cost.costs(cost.start), curved.cost, rtol=1e-11)
     slopes = torch.autograd.grad(wanted.sum(), list(system.parameters()))
@@ -70,7 +71,7 @@ def test_costs_of_platoons_are_those_that_come_with_slopes(kind: Convention) -> 
     x = np.stack([lead - 45, lead - 20, lead], 1)[..., None]
     batch = collate([Sequence(name="a", recording="r", time=time, x=x)])
     cost = TangentCost(model(), batch, FusedSolver(), kind)
-    wanted = sequence_costs(TorchdiffeqSolver(None, "discrete")(model(), batch), batch, kind)
+    wanted = sequence_costs(RungeKutta()(model(), batch), batch, kind)
     np.testing.assert_allclose(cost(cost.start).cost, wanted.detach().numpy(), rtol=1e-11)
     np.testing.assert_allclose(cost.costs(cost.start), wanted.detach().numpy(), rtol=1e-11)
 

@@ -86,12 +86,13 @@ def test_every_follower_of_a_platoon_has_its_own() -> None:
 def test_it_is_said_and_refused_where_there_is_no_speed() -> None:
     table = pairs(number=4, seconds=12.0)
     table.loc[table.time == 0, "v_follower"] += 0.8
-    found = nnode.Calibrator("idm", start_speeds="fitted", cost="gap").fit(table)
+    own = {"method": "ballistic", "cost": "gap"}  # that the pairs are made with
+    found = nnode.Calibrator("idm", start_speeds="fitted", **own).fit(table)
     assert found.result_.start_speeds["kind"] == "fitted"
     assert found.result_.start_speeds["change"] == pytest.approx(0.8, rel=1e-3)
     assert found.cost_ < 1e-6
     assert "first speeds of training sequences are fitted" in found.result_.summary()
-    given = nnode.Calibrator("idm", cost="gap").fit(table).result_
+    given = nnode.Calibrator("idm", **own).fit(table).result_
     assert given.start_speeds == {"kind": "measured"}
     assert given.cost > 1e-3
     with pytest.raises(ConfigError, match="needs optimizer=gauss_newton"):

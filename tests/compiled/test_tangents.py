@@ -17,8 +17,9 @@ from nnode.laws.tensors import computed
 from nnode.models import Traffic, build_model
 from nnode.models.effects.following import ReactionDelay
 from nnode.models.field import FIELD, NEURONS
-from nnode.solvers import TorchdiffeqSolver
+from nnode.solvers import Solver, TorchdiffeqSolver
 from tests.models.following import DT, driven, model, set_
+from tests.solvers.fused.compare import RungeKutta
 
 
 def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
@@ -35,7 +36,9 @@ def by_autograd(
     system: Traffic, batch: Batch, method: str | None, names: list[str], substeps: int
 ) -> tuple[Tensor, Tensor]:
     """Places at the samples and ``(P, K, B, N)`` their derivatives, one number after another."""
-    solver = TorchdiffeqSolver(method, "discrete", batch.dt / substeps)
+    solver: Solver = TorchdiffeqSolver(method, "discrete", batch.dt / substeps)
+    if (method or system.step) == "rk4":
+        solver = RungeKutta(substeps)
     x = solver(system, batch).x
     lane = system.lane
     assert lane is not None
@@ -140,7 +143,7 @@ def test_of_the_weights_of_a_network() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("method", METHODS[:3])
+@pytest.mark.parametrize("method", METHODS)
 def test_of_every_method(method: str) -> None:
     compared(model("idm"), platoons(), ["idm__T", "idm__a"], method)
 

@@ -21,6 +21,7 @@ from nnode.models.term import State, Term
 from nnode.models.traffic import Linear
 from nnode.solvers import TorchdiffeqSolver
 from tests.app.following import TRUE, platoon
+from tests.solvers.fused.compare import RungeKutta
 
 STEP = 0.1
 
@@ -148,10 +149,14 @@ def test_bands_cover_what_was_sampled_from_the_model_itself() -> None:
 def test_no_noise_is_the_solver_s_motion() -> None:
     batch = platoons(3, 20.0)
     model = idm()
-    plain = TorchdiffeqSolver()(model, batch)
+    assert model.step == "rk4"
+    plain = RungeKutta()(model, batch)
     found = sample(model, batch, Noise(0.0, 1.0), 2, seed=0)
     torch.testing.assert_close(found.x[:, :3], plain.x)
     torch.testing.assert_close(found.x[:, 3:], plain.x)
+    plain = TorchdiffeqSolver("ballistic")(model, batch)
+    found = sample(model, batch, Noise(0.0, 1.0), 1, seed=0, method="ballistic")
+    torch.testing.assert_close(found.x, plain.x)
 
 
 def test_the_same_seed_gives_the_same_samples() -> None:

@@ -15,6 +15,7 @@ from nnode.data.sequence import collate
 from nnode.errors import ConfigError, SimulationError
 from nnode.laws.steps import METHODS, STAGES, stepped
 from nnode.models import Linear, Traffic, build_model
+from nnode.models.field import FIELD
 from nnode.solvers import FusedSolver, TorchdiffeqSolver
 from tests.models.following import DT, behind, driven, model, numbers
 from tests.solvers.fused.compare import RungeKutta, difference, gradient
@@ -150,11 +151,59 @@ def test_speeds_are_stepped_as_they_are() -> None:
 
 def test_a_method_is_the_law_s_own_the_field_s_or_the_one_that_is_asked_for() -> None:
     assert Traffic([Linear()]).step == "euler"
-    assert model("idm").step == "ballistic"
-    assert model("krauss").step == "semi_implicit"
+    assert {law: model(law).step for law in FIELD} == {
+        **dict.fromkeys(FIELD, "rk4"), "gipps": "ballistic",
+        "krauss": "semi_implicit", "newell": "semi_implicit",
+    }  # fmt: skip
+    # what remembers step by step has no stages in between
+    assert model("idm", {"name": "pure_delay", "T": 0.3}).step == "ballistic"
+    assert model("idm", {"name": "reaction_delay", "T": 0.3}).step == "rk4"
+    assert model(BRAKE).step == "ballistic"
     own = alone(model({**BRAKE, "step": "euler"}), [5.0], 1.0, None)
     np.testing.assert_array_equal(own[0], alone(model(BRAKE), [5.0], 1.0, "euler")[0])
     assert np.abs(own[0] - alone(model(BRAKE), [5.0], 1.0, None)[0]).max() > 0.1
+
+
+def test_a_description_without_a_step_keeps_ballistic_steps() -> None:
+    """Those of checkpoints from before smooth laws had Runge and Kutta's."""
+    before = {key: entry for key, entry in FIELD["idm"].items() if key != "step"}
+    batch = behind(lambda t: 12 * t + np.sin(t), [25.0, 28.0], 3.0)
+    assert model(before).step == "ballistic"
+    with torch.no_grad():
+        found = TorchdiffeqSolver(dt=DT)(model(before), batch).x
+        exact = TorchdiffeqSolver("ballistic", dt=DT)(model("idm"), batch).x
+        now = TorchdiffeqSolver(dt=DT)(model("idm"), batch).x
+    assert torch.equal(found, exact)
+    assert (found - now).abs().max() > 1e-3
+
+
+def test_the_default_follows_the_solution_for_half_a_minute() -> None:
+    """Places of IDM behind a leader who swings, against DOP853 from sample to sample: the default
+    to 5e-5 m in steps of 0.1 s, where ballistic ones are off by decimetres."""
+    system, n = model("idm"), 5
+    batch = behind(lambda t: 15 * t + 8 * np.sin(0.4 * t), [26.0, 31.0, 22.0, 29.0], 30.0)
+    p, lead = numbers(system), batch.x[:, 0, -1, 0].numpy()
+    fast, y = batch.v[:, 0, -1, 0].numpy(), torch.cat([batch.x[0, 0, :-1], batch.v[0, 0, :-1]])
+    known, found = y[:, 0].numpy(), []
+    for k in range(batch.n_samples - 1):
+
+        def rates(t: float, y: np.ndarray, k: int = k) -> np.ndarray:
+            part = np.array([1 - t / DT, t / DT])
+            x, v = np.append(y[: n - 1], part @ lead[k : k + 2]), y[n - 1 :]
+            ahead = np.append(v[1:], part @ fast[k : k + 2])
+            wish = p.s0 + np.maximum(v * p.T + v * (v - ahead) / (2 * sqrt(p.a * p.b)), 0)
+            rate = p.a * (1 - (v / p.v0) ** 4 - (wish / (np.diff(x) - 4.0)) ** 2)
+            return np.append(v, rate)
+
+        known = solve_ivp(rates, (0, DT), known, "DOP853", rtol=1e-9, atol=1e-9).y[:, -1]
+        found.append(known[: n - 1])
+    away = {}
+    for method in (None, "ballistic"):
+        with torch.no_grad():
+            x = TorchdiffeqSolver(method, dt=DT)(system, batch).x[1:, 0, :-1, 0].numpy()
+        away[method] = float(np.abs(x - np.array(found)).max())
+    assert away[None] < 5e-5
+    assert away["ballistic"] > 0.1
 
 
 @pytest.mark.parametrize("law", ["krauss", "newell"])

@@ -111,6 +111,9 @@ def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, 
     for name in sections:
         if name not in own or choices[name] == own[name]:
             OmegaConf.update(merged, name, saved[name], merge=True)
+            if isinstance(saved[name], dict) and "law" in saved[name]:
+                # a law is one piece: what its description did not say then, it does not say now
+                OmegaConf.update(merged, f"{name}.law", saved[name]["law"], merge=False)
         elif name in _chosen:
             raise ConfigError(
                 f"this checkpoint has {name}={own[name]}, the first one of the sweep "

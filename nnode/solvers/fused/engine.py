@@ -26,12 +26,14 @@ log = logging.getLogger(__name__)
 
 
 class FusedSolver:
-    """Euler's method and the exact gradient of the discrete scheme, in compiled code.
+    """A method of fixed steps and the exact gradient of its discrete scheme, in compiled code.
 
-    States equal those of ``TorchdiffeqSolver("euler")`` up to rounding; in float32 those of
-    traffic are closer to the float64 ones, as steps are added with compensation. The gradient is
-    that of ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint,
-    from which it differs by O(dt).
+    With ``method="euler"``, the default of speeds, states equal those of
+    ``TorchdiffeqSolver("euler")`` up to rounding; in float32 those of traffic are closer to the
+    float64 ones, as steps are added with compensation. The gradient is that of
+    ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint, from which it
+    differs by O(dt). ``rk4`` is the classic method, and torchdiffeq's the 3/8 rule, which differs
+    from it by O(dt^4).
 
     Models whose law and effects are formulas (see :mod:`nnode.laws`) run compiled. Any other
     model, with a term that is code of its own, goes through torchdiffeq: the same gradient, at the
@@ -53,8 +55,9 @@ class FusedSolver:
             ``cutoff_error`` A / m through people, and as much through walls; see
             :func:`nnode.compiled.crowds.cells.cutoff_distance`. 0 lets everybody meet
             everybody.
-        method: of lanes, one of :data:`nnode.laws.steps.METHODS`; None takes ``ballistic`` for
-            accelerations and ``euler`` for speeds.
+        method: of lanes, one of :data:`nnode.laws.steps.METHODS`; None takes the law's own,
+            ``rk4`` for the smooth laws of the field, else ``ballistic`` for accelerations and
+            ``euler`` for speeds.
 
     Attributes:
         uncompiled: why the model it warned of is not compiled; empty: there was none.

@@ -87,7 +87,8 @@ _UNITS = {
 def clipped(
     law: dict[str, Any], limits: tuple[float, float], values: dict[str, float]
 ) -> dict[str, Any]:
-    """A law of the shelf with published parameters, and its acceleration clipped.
+    """A law of the shelf with published parameters, its acceleration clipped, in the published
+    steps, ballistic ones.
 
     Args:
         law: its description, see :data:`nnode.models.field.FIELD`.
@@ -101,4 +102,5 @@ def clipped(
         "parameters": {name: f"{value!r} {_UNITS[name]}" for name, value in values.items()},
         "constants": {**law.get("constants", {}), **ends},
         "rate": {"v": f"clip({law['rate']['v']}, least_rate, most_rate)"},
+        "step": "ballistic",
     }

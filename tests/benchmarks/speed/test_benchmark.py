@@ -230,6 +230,19 @@ def test_script_refuses_unknown_options(tmp_path) -> None:  # type: ignore[no-un
     assert "Key 'shape' not in" in done.stderr
 
 
+@pytest.mark.thorough  # compiles three methods
+def test_methods_are_timed_beside_their_errors(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    (shape,) = SHAPES["methods"]
+    tiny = replace(shape, models=("idm",), sequences=2, agents=3, samples=20)
+    monkeypatch.setitem(SHAPES, "methods", (tiny,))
+    benchmark(options(shapes=["methods"]), tmp_path)
+    (row,) = json.loads((tmp_path / "benchmark.json").read_text())["problems"]
+    away = [row["errors"][name]["gradient"] for name in ("rk4 0.1 s", "euler 0.002 s")]
+    assert 0 < away[0] < away[1] < row["errors"]["ballistic 0.1 s"]["gradient"]
+    assert all(taken["median"] > 0 for taken in row["engines"].values())
+    assert "idm: 2 sequences, 3 cars" in capsys.readouterr().out
+
+
 @pytest.mark.thorough  # four new processes that compile
 def test_tangents_of_eight_parameters_are_timed(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     (shape,) = SHAPES["tangents"]

@@ -143,8 +143,9 @@ def test_a_lasting_time_gap_is_a_share_of_what_was_seen_and_stays(share: float) 
 
 
 def simulated(system: Any, batch: Batch, step: float = DT) -> Any:
+    """In ballistic steps, which are easily written out by hand."""
     with torch.no_grad():
-        return TorchdiffeqSolver(None, "discrete", step)(system, batch)
+        return TorchdiffeqSolver("ballistic", "discrete", step)(system, batch)
 
 
 def path(seconds: float) -> Batch:

@@ -10,8 +10,10 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
+from nnode.models.field import FIELD
+from nnode.models.own_law import law_from
 from nnode.solvers.fused.engine import FusedSolver
-from nnode.study.following import data, fit, inference, leaders
+from nnode.study.following import data, fit, inference, leaders, printed
 from nnode.study.following.candidates import EVERY, decay, key, starts
 
 HELLY = {"c_s": 0.15, "c_v": 0.7, "T": 1.4, "s0": 3.0}
@@ -49,6 +51,16 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
     monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
     monkeypatch.setattr(data, "batch", lambda folder, test=False: collate(pairs))
     return pairs
+
+
+def test_candidates_are_stepped_as_in_the_published_comparisons() -> None:
+    steps = {name: one.system().step for name, one in EVERY.items()}
+    maps = {name for name in steps if name.split(" ")[0] in ("krauss", "newell")}
+    assert {steps[name] for name in maps} == {"semi_implicit"}
+    assert {steps[name] for name in steps.keys() - maps} == {"ballistic"}
+    for law, limits in printed.CLIPPED.items():
+        values = dict.fromkeys(FIELD[law]["parameters"], 1.0)
+        assert law_from(law, printed.clipped(FIELD[law], limits, values)).step == "ballistic"
 
 
 def test_clusters_stay_in_one_fold() -> None:
