@@ -14,8 +14,8 @@ from nnode.calibrate.options import Precision
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`benchmarks.speed.run`."""
 
-    # problems: paper | stress | effects | steps | methods | tangents | crowd | crowd_effects
-    # | people | scale | diagnosis
+    # problems: paper | stress | effects | steps | methods | tangents | crowd |
+    # crowd_effects | people | scale | diagnosis
     shapes: list[str] = field(
         default_factory=lambda: [
             "paper",

@@ -16,7 +16,7 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch
 from nnode.models.system import System
 from nnode.solvers import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, substeps
-from nnode.solvers.base import check_finite
+from nnode.solvers.base import check_finite, observed, simulated_batch
 
 #: One simulation with cost and gradient: ``(K, B, N, D)`` positions and the flat gradient, in
 #: the order of ``System.named_parameters``.
@@ -51,14 +51,15 @@ class LoopSolver:
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         n = substeps(batch.dt, self.dt, system)
-        scene, y = system.scene(batch), system.initial(batch)
+        near, origin = simulated_batch(system, batch)
+        scene, y = system.scene(near), system.initial(near)
         step = batch.dt / n
         found = [y]
         for s in range(n * (batch.n_samples - 1)):
             y = y + step * system(y.new_tensor(s * step), y, scene)
             if (s + 1) % n == 0:
                 found.append(y)
-        return check_finite(Trajectory(*system.observe(torch.stack(found), batch)), batch)
+        return check_finite(observed(system, torch.stack(found), batch, origin), batch)
 
 
 def torch_call(problem: Problem, solver: Solver) -> Call:

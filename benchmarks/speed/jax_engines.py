@@ -46,7 +46,7 @@ def jax_call(problem: Problem, arrangement: str) -> Callable[[], tuple[np.ndarra
     last = arrangement.endswith("_batch_last")
     shape, law = problem.shape, _law(problem.model)
     turn = (0, 2, 1) if last else (0, 1, 2)
-    measured = jnp.asarray(problem.batch.x[..., 0].numpy().transpose(turn))
+    measured = jnp.asarray(problem.batch.relative_to(None).x[..., 0].numpy().transpose(turn))
     names = [name.removeprefix("terms.0.") for name, _ in problem.system.named_parameters()]
     values = {
         name: jnp.asarray(p.detach().numpy())

@@ -226,8 +226,8 @@ def test_script_refuses_unknown_options(tmp_path) -> None:  # type: ignore[no-un
         cwd=tmp_path,
         check=False,
     )
-    assert done.returncode == 1
-    assert "Key 'shape' not in" in done.stderr
+    assert done.returncode == 2
+    assert "did you mean benchmark.shapes" in done.stderr
 
 
 @pytest.mark.thorough  # compiles three methods

@@ -37,7 +37,7 @@ def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
     table, parameters = measured(LawCase(true, 5, sequences=12, vehicles=4, seconds=20.0))
     path = tmp_path / "table.csv"
     table.to_csv(path, index=False)
-    sequences = read_table(path, table_options(path, "traffic", None, tmp_path))
+    sequences = read_table(path, table_options(path, "traffic", None, tmp_path)[1])
     laws = {n: law(n) for n in ("lin", "idm", "helly")}
     found, calibrated = compare_laws(laws, sequences, DiscoverOptions())
     assert set(calibrated) == set(laws)
@@ -110,7 +110,7 @@ def test_what_a_nearer_law_does_without_is_no_finding(tmp_path: Path) -> None:
     table, _ = measured(LawCase("ovm", 3, sequences=12, vehicles=4, seconds=20.0))
     path = tmp_path / "table.csv"
     table.to_csv(path, index=False)
-    sequences = read_table(path, table_options(path, "traffic", None, tmp_path))
+    sequences = read_table(path, table_options(path, "traffic", None, tmp_path)[1])
     label = np.arange(len(sequences))
     engine = TrafficEngine(sequences, clusters=label)
     base = settled(engine, begun(engine, law("lin").double()).system)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,15 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(folder)
 
 
+def test_a_fit_to_noise_ends_at_a_minimum(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0)
+    noisy = [replace(s, x=s.x + noise.normal(0.0, 0.1, s.x.shape)) for s in platoons(8)]
+    write_store(tmp_path, noisy, {"domain": "traffic"})
+    one = tasks.fit(str(tmp_path), "r", "lin", None, 4, 0.002, 60, 20, [0.02, 0.001], 0)
+    assert one["cost"] > 1e-2
+    assert one["residual"] < 1e-3
+
+
 def test_fit_finds_the_truth(store: str) -> None:
     one = tasks.fit(store, "r", "lin", None, 4, 0.002, 60, 20, [0.02, 0.001], 0)
     assert one["parameters"]["v0"] == pytest.approx(V0, rel=2e-3)
@@ -61,7 +71,7 @@ def test_fit_finds_the_truth(store: str) -> None:
     assert one["cost"] == pytest.approx(np.mean(one["costs"]))
     # the data are exact: only Euler's error is left, which falls with the step
     assert one["steps"]["0.001"] < one["cost"] + 1e-6 < one["steps"]["0.02"] < 1e-2
-    assert one["residual"] < 1e-3
+    # relative to a cost of 4e-6, the residual is rounding here: see the test below
     assert len(one["speeds"]) == 49
     assert one["speeds"][18] == pytest.approx(V0 * (1 - L / 20), rel=5e-3)
     low, high = np.quantile(one["bootstrap"]["values"]["L"], [0.025, 0.975])
