@@ -14,15 +14,15 @@ from nnode.calibrate.options import Precision
 class BenchmarkOptions:
     """What ``scripts/benchmark.py`` times, see :mod:`benchmarks.speed.run`."""
 
-    # problems: paper | stress | effects | steps | methods | tangents | crowd |
-    # crowd_effects | people | scale | diagnosis
+    # problems: paper | stress | effects | steps | tangents | crowd | crowd_effects
+    # | people | scale | methods | diagnosis
+    # the last two only if asked for
     shapes: list[str] = field(
         default_factory=lambda: [
             "paper",
             "stress",
             "effects",
             "steps",
-            "methods",
             "tangents",
             "crowd",
             "crowd_effects",
