@@ -53,7 +53,7 @@ def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[
         raise ConfigError(f"part={part} is unknown, expected one of {', '.join(PARTS)}")
     before = set(source_hashes(checkpoint.manifest).values())
     shared = bool(before & set(source_hashes(store.manifest).values()))
-    known = not shared or _cutting(store.manifest) == _cutting(checkpoint.manifest)
+    known = not shared or _cut_alike(store.manifest, checkpoint.manifest)
     own = {
         name: set(checkpoint.split.get(name, [])) if shared and known else set()
         for name in ("heldout", "train", "dropped")
@@ -77,12 +77,14 @@ def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[
     return part, found[part], trained
 
 
-def _cutting(manifest: dict[str, Any]) -> dict[str, Any]:
-    """The options that decide how files become sequences, whichever of them are kept."""
-    options = dict(manifest.get("options", {}))
-    for key in ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION):
-        options.pop(key, None)
-    return options
+def _cut_alike(*manifests: dict[str, Any]) -> bool:
+    """Whether files became sequences in the same way, whichever of them are kept.
+
+    An option that an earlier version did not have is not compared.
+    """
+    one, other = ({**m.get("options", {}), "reader": m.get("reader")} for m in manifests)
+    kept = ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION)
+    return all(one[key] == other[key] for key in one.keys() & other.keys() - {*kept})
 
 
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:

@@ -144,11 +144,15 @@ def refuse_changes(
 ) -> None:
     """Refuse any difference outside ``allowed`` keys.
 
+    An option that the version of the checkpoint did not have has its default, unless it is given.
+
     Raises:
         ConfigError: naming the option, what the checkpoint has and what is asked for.
     """
     for key, value in now.items():
         full, had = prefix + key, saved.get(key)
+        if key not in saved and full not in keys_given():
+            continue
         if isinstance(value, dict) and isinstance(had, dict):
             refuse_changes(value, had, allowed, f"{full}.")
         elif full not in allowed and value != had:

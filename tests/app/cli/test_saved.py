@@ -109,3 +109,16 @@ def test_a_law_stays_as_its_checkpoint_describes_it(monkeypatch: pytest.MonkeyPa
     now: Any = OmegaConf.to_container(merged.model, resolve=True, enum_to_str=True)
     assert build_model(now).step == "ballistic"
     refuse_changes({"model": now}, saved, ())
+
+
+def test_an_option_that_a_checkpoint_does_not_know_has_its_default(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given: list[str] = []
+    hydra = SimpleNamespace(overrides=SimpleNamespace(task=given))
+    monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
+    now, saved = {"data": {"max_hole": 0.5, "smooth": None}}, {"data": {"smooth": None}}
+    refuse_changes(now, saved, ())
+    given.append("data.max_hole=0.5")
+    with pytest.raises(ConfigError, match=r"data\.max_hole cannot change"):
+        refuse_changes(now, saved, ())
