@@ -10,7 +10,7 @@ import torch
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
-from nnode.models import System
+from nnode.models import System, Traffic
 from nnode.solvers import TorchdiffeqSolver
 
 #: Method and longest step, s: their error is to be seen in no picture.
@@ -87,7 +87,10 @@ def _together(
     batch = collate(sequences).to(like.device, like.dtype)
     longest = STEP[system.domain] if step is None else step
     dt = batch.dt / max(1, math.ceil(batch.dt / longest - 1e-6))
-    x = TorchdiffeqSolver(METHOD[system.domain], dt=dt)(system, batch).x.double().cpu().numpy()
+    lane = system.lane if isinstance(system, Traffic) else None
+    # a law that names the length of a step has no stages within one
+    method = system.step if lane is not None and "dt" in lane.symbols else METHOD[system.domain]
+    x = TorchdiffeqSolver(method, dt=dt)(system, batch).x.double().cpu().numpy()
     return [x[: s.n_samples, i, : s.n_agents] for i, s in enumerate(sequences)]
 
 

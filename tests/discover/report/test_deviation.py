@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from scipy.integrate import solve_ivp
 
+from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence
 from nnode.discover.report.deviation import (
     deviation,
@@ -15,7 +17,7 @@ from nnode.discover.report.deviation import (
     smooth_velocity,
 )
 from nnode.models import Crowd, Relaxation, Traffic
-from nnode.models.build import add_effects
+from nnode.models.build import add_effects, build_model
 from nnode.models.traffic import Linear
 
 
@@ -108,3 +110,16 @@ def test_a_simulation_that_blows_up_spoils_no_other() -> None:
     assert second is None
     found = deviation(system, [bad])
     assert np.isfinite(found.value).all()
+
+
+@pytest.mark.parametrize("law", ["gipps", "krauss", "newell"])
+def test_laws_that_name_the_length_of_a_step_are_drawn(law: str) -> None:
+    system = build_model(model_options(law, leader="measured"), 0, torch.float64)
+    found = deviation(system, [platoon(16.0, 16.0)])
+    assert len(found.time) == 7
+    if law == "newell":  # at once where the leader was T before, less d: 22 m behind it, not 40 m
+        own = {name.rpartition(".")[2]: p.item() for name, p in system.named_parameters()}
+        wanted = (own["d"] + 16.0 * own["T"] - 40.0) / 2
+        assert found.value[:, 0] == pytest.approx(wanted)
+    else:  # no more than a comfortable acceleration of 2 m/s² away from a steady drive
+        assert np.abs(found.value).max() < 4.0
