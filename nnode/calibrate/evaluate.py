@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -163,38 +162,6 @@ def sensitivity(
         share = (p * slope / cost).masked_fill(pressed, 0.0).abs()
         most = max(most, float(share.detach().max()))
     return most
-
-
-@torch.no_grad()
-def nearby_fall(
-    system: System, solver: Solver, batch: Batch, convention: Convention = Convention.integral
-) -> float:
-    """Largest relative fall of the mean cost along the negative gradient, near the parameters.
-
-    Relative gradients alone do not show a minimum: where a model fits well, the cost is so curved
-    that a distance of 1e-8 from the minimum leaves a large one. The parameters are changed in place
-    and set back.
-
-    Raises:
-        SimulationError: the model cannot be simulated.
-    """
-    with torch.enable_grad():
-        cost = sequence_costs(solver(system, batch), batch, convention).mean()
-        own = [p for p in system.parameters() if p.requires_grad]
-        slopes = torch.autograd.grad(cost, own, allow_unused=True)
-    pairs = [(p, g) for p, g in zip(own, slopes, strict=True) if g is not None]
-    before = [p.clone() for p, _ in pairs]
-    steepest = max(float((p * g).abs().max()) for p, g in pairs)
-    least = float(cost)
-    for share in (10.0**-k for k in range(1, 9)):  # by which the steepest parameter changes
-        for (p, g), start in zip(pairs, before, strict=True):
-            p.copy_(start - share * start.square() * g / steepest)
-        with suppress(SimulationError):
-            now = sequence_costs(solver(system, batch), batch, convention).mean()
-            least = min(least, float(now))
-    for (p, _), start in zip(pairs, before, strict=True):
-        p.copy_(start)
-    return 1 - least / float(cost)
 
 
 def _times(batch: Batch) -> Tensor:
