@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from nnode.models import System
 from nnode.models.build import build_model
 from nnode.solvers import FusedSolver
 from nnode.solvers.rates import Rates
-from tests.discover.platoons import platoons
 
 TRUTH = (0.5, 40.0, 12.0)
 
@@ -168,13 +166,3 @@ def test_networks_and_costs_of_vehicles_are_refused(people: list[Sequence]) -> N
         CrowdCost(build_model(model_options("nn")), batch, FusedSolver())
     with pytest.raises(ConfigError, match="vehicles that follow"):
         CrowdCost(social(*TRUTH), batch, FusedSolver(), Convention.gap)
-
-
-def test_a_curved_minimum_is_no_stall() -> None:
-    """Where the cost is very curved, rounding leaves a large relative gradient at the minimum."""
-    noise = np.random.default_rng(0)
-    lane = [replace(s, x=s.x + noise.normal(0.0, 0.05, s.x.shape)) for s in platoons(number=4)]
-    found = nnode.Calibrator("lin", leader="measured", optimizer="lbfgs").fit(lane).result_
-    other = nnode.Calibrator("lin", leader="measured", optimizer="gauss_newton").fit(lane).result_
-    assert found.cost == pytest.approx(other.cost, rel=1e-8)
-    assert found.status == "converged"
