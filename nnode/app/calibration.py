@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _BOUND = {"low": "lower", "high": "upper"}
-#: Relative change of a cost by relative change of a parameter below which a minimum is reached. Of
-#: ``sf`` on Jülich data it is 5e-6 at most at minima, and 0.11 and 0.24 where L-BFGS stalls from
-#: two starts. Of ``lin`` on a noisy platoon it is 1.2e-3 at a minimum as deep as Gauss and Newton's to
-#: 1e-11: the cost is so curved that rounding leaves a slope. The level is the geometric mean.
+#: Relative change of a cost by relative change of a parameter below which a minimum is reached.
+#: Of ``sf`` on Jülich data it is 5e-6 at most at minima, and 0.11 and 0.24 where L-BFGS stalls
+#: from two starts. Of ``lin`` on a noisy platoon it is 1.2e-3 at a minimum as deep as Gauss and
+#: Newton's: the cost is so curved that rounding leaves a slope. The level is the geometric mean.
 _LEVEL = 1e-2
 #: An epoch moved nothing where it lowered the cost by less than moving one parameter by this share
 #: does at first order.
@@ -51,7 +51,8 @@ _MOVED = 1e-4
 _EXACT = 1e-6
 STALLED = (
     "the line search stalled: the last epoch found no lower cost, although the gradient is not 0; "
-    "these parameters may be no minimum. Start from other parameters, or take optimizer=gauss_newton"
+    "these parameters may be no minimum. Start from other parameters, or take "
+    "optimizer=gauss_newton"
 )
 
 
