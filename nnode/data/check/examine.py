@@ -156,7 +156,7 @@ def _rivals(found: Mapping[str, Meaning]) -> Iterator[Finding]:
 def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:
     """What is known too little: the frame rate, or units."""
     best = every[0]
-    same = [one for one in every if _units(one) == _units(best)]
+    same = [one for one in every if unit_names(one) == unit_names(best)]
     if sum(one.probability for one in same) < LIKELY:
         others = "; ".join(f"{_words(one)} ({one.probability:.0%})" for one in every[:3])
         yield Finding("units", "warning", f"units are a guess: {others}; say what you know")
@@ -170,7 +170,8 @@ def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _units(scale: Scale) -> tuple[str, ...]:
+def unit_names(scale: Scale) -> tuple[str, ...]:
+    """Domain and units, whatever the rate of frames."""
     return scale.domain, scale.position, scale.time, scale.speed
 
 

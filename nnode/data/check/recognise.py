@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from nnode.data.check.columns import Meaning, in_seconds, meanings, plain
-from nnode.data.check.examine import FAIR, LIKELY, SURE, sure
+from nnode.data.check.examine import FAIR, LIKELY, SURE, sure, unit_names
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.rows import Scaled, in_memory, scaled
 from nnode.data.check.scale import Scale
@@ -231,7 +231,7 @@ def _sure_enough(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, 
     """
     best = seen.scale
     if _share(seen) < LIKELY and not told:
-        other = next(one for one in seen.scales if _units(one) != _units(best))
+        other = next(one for one in seen.scales if unit_names(one) != unit_names(best))
         raise ConfigError(
             f"{raw.path}: its numbers may be {_words(best)} or {_words(other)}; say which, with "
             f"{_how(best)} or {_how(other)}"
@@ -239,7 +239,7 @@ def _sure_enough(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, 
     if best.rate is not None and rate is None:
         rates = {
             one.rate: one.probability for one in seen.scales
-            if one.rate and _units(one) == _units(best) and one.probability > FAIR
+            if one.rate and unit_names(one) == unit_names(best) and one.probability > FAIR
         }  # fmt: skip
         if len(rates) > 1:
             listed = " or ".join(f"{one:g}" for one in sorted(rates))
@@ -253,13 +253,9 @@ def _si(scale: Scale) -> bool:
     return (scale.position, scale.time, scale.rate, scale.speed) == ("m", "s", None, "m/s")
 
 
-def _units(scale: Scale) -> tuple[str, ...]:
-    return scale.domain, scale.position, scale.time, scale.speed
-
-
 def _share(seen: Scaled) -> float:
     """Probability of the units, whatever the rate of frames."""
-    return sum(s.probability for s in seen.scales if _units(s) == _units(seen.scale))
+    return sum(s.probability for s in seen.scales if unit_names(s) == unit_names(seen.scale))
 
 
 def _words(scale: Scale) -> str:
