@@ -38,9 +38,9 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.discover.options import DiscoverOptions
-from nnode.models.field import FIELD, NEURONS
-from nnode.models.field_crowd import PEOPLE
-from nnode.models.options import (
+from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.options import (
     FormulaOptions,
     LawOptions,
     NetworkForceOptions,
@@ -183,11 +183,11 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
         ("model", f"{name}_schema"): FormulaOptions(
             term="formula", law=law, network=NEURONS.get(name)
         )
-        for name, law in FIELD.items()
+        for name, law in CAR_FOLLOWING_LAWS.items()
     },
     **{
         ("model", f"{name}_schema"): FormulaOptions(term="formula", law=law)
-        for name, law in PEOPLE.items()
+        for name, law in PEDESTRIAN_LAWS.items()
     },
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),

@@ -42,12 +42,12 @@ def with_line(file: str, line: str, folder: Path) -> subprocess.CompletedProcess
 @pytest.mark.parametrize(
     ("file", "line", "lower", "upper"),
     [
-        ("nnode/data/store.py", "import nnode.models.term", "nnode.data", "nnode.models"),
+        ("nnode/data/store.py", "import nnode.model.term", "nnode.data", "nnode.model"),
         (
-            "nnode/models/term.py",
-            "def late():\n    import nnode.solvers",
-            "nnode.models",
-            "nnode.solvers",
+            "nnode/model/term.py",
+            "def late():\n    import nnode.simulate",
+            "nnode.model",
+            "nnode.simulate",
         ),
         (
             "nnode/plots/style.py",
@@ -55,10 +55,10 @@ def with_line(file: str, line: str, folder: Path) -> subprocess.CompletedProcess
             "nnode.plots",
             "nnode.discover",
         ),
-        ("nnode/solvers/base.py", "from nnode import load", "nnode.solvers", "nnode.app"),
+        ("nnode/simulate/base.py", "from nnode import load", "nnode.simulate", "nnode.app"),
         ("nnode/errors.py", "import nnode.files", "nnode.errors", "nnode.files"),
         ("nnode/errors.py", "import benchmarks.truths", "nnode", "benchmarks"),
-        ("benchmarks/truths/case.py", "import nnode.models", "benchmarks.truths", "nnode.models"),
+        ("benchmarks/truths/case.py", "import nnode.model", "benchmarks.truths", "nnode.model"),
         (
             "benchmarks/config.py",
             "import benchmarks.speed",

@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from nnode.errors import LONGEST, DataError, NotFittedError, printable
-from nnode.laws.parse import FormulaError
+from nnode.model.parse import FormulaError
 
 
 def test_a_message_that_is_sound_stays_as_it_is() -> None:

@@ -73,7 +73,7 @@ def case(seed: int, name: str) -> dict[str, Any]:
     from nnode.data.sequence import Sequence
     from nnode.discover.diagnose import diagnose
     from nnode.discover.options import DiscoverOptions
-    from nnode.models.build import build_model
+    from nnode.model.build import build_model
 
     rng = np.random.default_rng([seed, NAMES.index(name)])
     truth = {

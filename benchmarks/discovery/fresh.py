@@ -15,9 +15,9 @@ from nnode.app.python.report import Report
 from nnode.data.options import Faults, TableOptions
 from nnode.discover.inputs import read_inputs
 from nnode.discover.judge.confirm import Comparing
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import without
-from nnode.models.system import System
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import without
+from nnode.model.system import System
 
 
 def kept_back(table: Path, number: int) -> pd.DataFrame:

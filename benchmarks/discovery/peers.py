@@ -26,10 +26,10 @@ from nnode.discover.residuals.engine import Engine, fill, row_of, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.score import Trace, traces
 from nnode.errors import SimulationError
-from nnode.models import build_model
-from nnode.models.effects import CATALOGUE, Effect
-from nnode.models.extend import extended
-from nnode.models.system import System
+from nnode.model import build_model
+from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.extend import extended
+from nnode.model.system import System
 
 #: A cell belongs to an interval where its coefficient is at least this share of the largest one.
 _CELL = 0.3

@@ -60,10 +60,10 @@ def diagnose_case(
     from nnode.app import discover
     from nnode.discover.options import DiscoverOptions
     from nnode.discover.rules import Rules
-    from nnode.models.effects import CATALOGUE
+    from nnode.model.effects import CATALOGUE
 
     what = Case.from_dict(case)
-    classes = {effect.name: effect.kin for effect in CATALOGUE.effects.values()}
+    classes = {effect.name: effect.confusable_group for effect in CATALOGUE.effects.values()}
     with TemporaryDirectory(prefix="nnode-case-") as made, TemporaryDirectory() as given:
         start = time.monotonic()
         truth = generate(replace(what, n_sequences=what.n_sequences + fresh), Path(made))

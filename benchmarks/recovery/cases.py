@@ -15,7 +15,7 @@ from benchmarks.recovery.recover import Recovered, recover
 from nnode.data.options import SumoOptions
 from nnode.data.readers.sumo import read_sumo
 from nnode.data.sequence import Sequence
-from nnode.models.field import FIELD
+from nnode.model.field import CAR_FOLLOWING_LAWS
 
 #: What SUMO calls the parameters.
 _SUMO = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel"}
@@ -129,7 +129,7 @@ def _collision_free() -> Case:
     typed = {"T": 1.0, "l": 0.4, "a": 8.0, "D": 0.1}
 
     def recovered(folder: Path) -> Recovered:
-        law = import_module("nnode.models.field_crowd").PEOPLE["cfsm"]
+        law = import_module("nnode.model.field_crowd").PEDESTRIAN_LAWS["cfsm"]
         jupedsim = import_module("jupedsim")
         model = jupedsim.CollisionFreeSpeedModel(
             strength_neighbor_repulsion=typed["a"], range_neighbor_repulsion=typed["D"]
@@ -153,17 +153,19 @@ def _collision_free() -> Case:
 
 #: By the names that the command knows.
 CASES: dict[str, Case] = {
-    "idm_euler": _sumo("IDM, Euler", "IDM", "`idm`", FIELD["idm"], _IDM),
-    "idm_ballistic": _sumo("IDM, ballistic", "IDM", "`idm`", FIELD["idm"], _IDM, ballistic=True),
+    "idm_euler": _sumo("IDM, Euler", "IDM", "`idm`", CAR_FOLLOWING_LAWS["idm"], _IDM),
+    "idm_ballistic": _sumo(
+        "IDM, ballistic", "IDM", "`idm`", CAR_FOLLOWING_LAWS["idm"], _IDM, ballistic=True
+    ),
     "idm_ballistic_rest": _sumo(
         "IDM, ballistic", "IDM", "`idm`, a ≥ −v/dt", laws.IDM, _IDM, ballistic=True
     ),
     "krauss_moving": _sumo(
-        "KraussOrig1, Euler, never at rest nor at v0", "KraussOrig1", "`krauss`", FIELD["krauss"],
-        _KRAUSS, profile=SLOWLY,
+        "KraussOrig1, Euler, never at rest nor at v0", "KraussOrig1", "`krauss`",
+        CAR_FOLLOWING_LAWS["krauss"], _KRAUSS, profile=SLOWLY,
     ),
     "krauss_stopping": _sumo(
-        "KraussOrig1, Euler", "KraussOrig1", "`krauss`", FIELD["krauss"], _KRAUSS
+        "KraussOrig1, Euler", "KraussOrig1", "`krauss`", CAR_FOLLOWING_LAWS["krauss"], _KRAUSS
     ),
     "krauss_crawl": _sumo(
         "KraussOrig1, Euler", "KraussOrig1", "`krauss`, last b dt at b dt", laws.KRAUSS_ORIG,
@@ -174,7 +176,7 @@ CASES: dict[str, Case] = {
         laws.KRAUSS_BALLISTIC, _KRAUSS, ballistic=True, emergency=_KRAUSS["b"],
     ),
     "krauss_default": _sumo(
-        "Krauss, Euler: SUMO's default", "Krauss", "`krauss`", FIELD["krauss"], _KRAUSS
+        "Krauss, Euler: SUMO's default", "Krauss", "`krauss`", CAR_FOLLOWING_LAWS["krauss"], _KRAUSS
     ),
     "force_contact": _social_force(
         "social force, people touch", "its formula, its steps",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from nnode.models.field import FIELD
+from nnode.model.field import CAR_FOLLOWING_LAWS
 
-_IDM, _KRAUSS = FIELD["idm"], FIELD["krauss"]
+_IDM, _KRAUSS = CAR_FOLLOWING_LAWS["idm"], CAR_FOLLOWING_LAWS["krauss"]
 #: Gaps that SUMO counts as none, m, its slack in distances, m, and what stands for no speed, m/s.
 _SMALL = {"near": "0.01 m", "slack": "0.001 m", "still": "1e-9 m/s", "one": "1 s"}
 

@@ -18,10 +18,10 @@ from nnode.calibrate.least_squares import (
     trajectory_residuals,
 )
 from nnode.data.sequence import Sequence, collate
-from nnode.models import Crowd, Traffic
-from nnode.models.own_law import law_from
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model import Crowd, Traffic
+from nnode.model.formula_law import law_from
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 
 #: The searches start this share away from every parameter: up and down in turns, all up, all down.
 AWAY = 0.3
@@ -98,7 +98,7 @@ def recover(
         typed: parameter of the law to what was typed into the other program, SI units. Others
             keep the values of the description.
         dt: step, s.
-        method: of lanes; see :data:`nnode.laws.steps.METHODS`.
+        method: of lanes; see :data:`nnode.model.steps.METHODS`.
         error: of measured positions, m. The first state and the leader keep theirs, so that the
             errors are independent and the intervals those of the textbook.
         seed: of these errors.

@@ -42,7 +42,7 @@ torch.set_num_threads(1)
 from nnode.data.sequence import Sequence
 from nnode.discover.diagnose import diagnose
 from nnode.discover.options import DiscoverOptions
-from nnode.models.build import build_model
+from nnode.model.build import build_model
 data, v0, length = np.load(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
 model = dict(term="lin", name="lin", leader="measured", v0=v0, L=length, L_min=1.0)
 sequences = [

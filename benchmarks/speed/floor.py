@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 
 from benchmarks.speed.problems import Problem
-from nnode.compiled.functions import FLAGS, torch_softplus
-from nnode.models import NetworkSpeed
+from nnode.model import NetworkSpeed
+from nnode.simulate.kernels.functions import FLAGS, torch_softplus
 
 #: Numbers of a row: 8 kB at most, which stay in the first-level cache.
 _ROW = 1024

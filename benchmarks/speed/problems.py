@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models import Crowd, NetworkForce, Relaxation, SocialForce, System
-from nnode.models.build import MODELS, add_effects
+from nnode.model import Crowd, NetworkForce, Relaxation, SocialForce, System
+from nnode.model.build import MODELS, add_effects
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.problems import Problem, Shape, pose
-from nnode.compiled import lanes
 from nnode.errors import SimulationError
-from nnode.models import Traffic
+from nnode.model import Traffic
+from nnode.simulate.kernels import lanes
 
 #: Where this package stands: it is not installed.
 _ROOT = Path(__file__).parents[2]

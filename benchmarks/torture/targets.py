@@ -22,7 +22,6 @@ from benchmarks.torture.gadgets import evil_checkpoint, strange_checkpoint
 from benchmarks.torture.inputs import damaged_bytes, damaged_formula, damaged_text
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
-from nnode.compiled import source
 from nnode.data.options import (
     EsimasOptions,
     JuelichOptions,
@@ -35,8 +34,9 @@ from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS
 from nnode.data.sequence import Sequence
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
-from nnode.models import Traffic, build_model
-from nnode.models.own_law import law_from
+from nnode.model import Traffic, build_model
+from nnode.model.formula_law import law_from
+from nnode.simulate.kernels import source
 from nnode.study.runner import KEPT, Task, run_tasks
 
 Damage = Callable[[bytes, random.Random], bytes]

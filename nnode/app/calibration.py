@@ -26,8 +26,8 @@ from nnode.data.dataset import SequenceDataset, SmoothSpeeds, Source, noise_of
 from nnode.data.smooth import BEARABLE, Noise
 from nnode.errors import ConfigError, SimulationError
 from nnode.files import xarray
-from nnode.models import System
-from nnode.models.term import short_names
+from nnode.model import System
+from nnode.model.term import short_names
 from nnode.plots import force_figure
 
 if TYPE_CHECKING:
@@ -356,7 +356,7 @@ def _by_tangents(
     from nnode.calibrate.gauss_newton.intervals import intervals
     from nnode.calibrate.gauss_newton.pooling import own_parameters
     from nnode.calibrate.gauss_newton.start_speeds import cost_of
-    from nnode.solvers.fused import FusedSolver
+    from nnode.simulate.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
     make = partial(cost_of, options.start_speeds, solver=trainer.solver, convention=options.cost)

@@ -54,8 +54,8 @@ from nnode.discover.report.files import (
 )
 from nnode.errors import ConfigError
 from nnode.files import write_text
-from nnode.models import build_model
-from nnode.models.effects.own import load_own
+from nnode.model import build_model
+from nnode.model.effects.own import load_own
 from nnode.program import scripts, typed
 from nnode.progress import Stages
 

@@ -19,8 +19,8 @@ from nnode.exchange.drive import Drive, drive
 from nnode.exchange.drivers import drivable
 from nnode.exchange.running_sumo import Steps
 from nnode.files import write_json
-from nnode.models import System
-from nnode.solvers.base import substeps
+from nnode.model import System
+from nnode.simulate.base import substeps
 
 #: What ``steps=`` asks for.
 STEPS = ("match", "run", "scenario")

@@ -40,7 +40,7 @@ from nnode.exchange.trajectories import (
     write_walls,
 )
 from nnode.files import write_json, write_text
-from nnode.models import System
+from nnode.model import System
 
 #: What can be written, in the order in which it is.
 TARGETS = ("jupedsim", "sumo", "pedpy", "fcd", "parquet", "csv")

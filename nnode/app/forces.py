@@ -14,7 +14,7 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.errors import ConfigError, DownloadError
 from nnode.files import csv_text, file_name, write_text
-from nnode.models import System
+from nnode.model import System
 from nnode.plots import (
     curve_table,
     force_contours,

@@ -1,4 +1,4 @@
-"""What laws, forces and effects there are: ``python -m nnode.laws``."""
+"""What laws, forces and effects there are: ``python -m nnode.app.laws``."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from nnode.laws.crowd import CrowdRule
-from nnode.laws.lane import Rule
-from nnode.models import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
-from nnode.models.effects import CATALOGUE
-from nnode.models.effects.base import Effect
-from nnode.models.field import FIELD, NEURONS
-from nnode.models.field_crowd import PEOPLE
-from nnode.models.formula import rule_of
-from nnode.models.own_law import FormulaForce, FormulaLaw, law_from
-from nnode.models.term import Interval, Term
+from nnode.model import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
+from nnode.model.crowd_dynamics import CrowdRule
+from nnode.model.effects import CATALOGUE
+from nnode.model.effects.base import Effect
+from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.formula import rule_of
+from nnode.model.formula_law import FormulaForce, FormulaLaw, law_from
+from nnode.model.lane_dynamics import Rule
+from nnode.model.term import Interval, Term
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def lines() -> Iterator[str]:
     yield "Laws of lanes (a law of your own: docs/method.md)"
     for law in (Linear(), Logarithmic(), NetworkSpeed(4)):
         yield from _of(law, "dx/dt = ")
-    for name, description in FIELD.items():
+    for name, description in CAR_FOLLOWING_LAWS.items():
         own = law_from(name, description, network=NEURONS.get(name))
         yield from _of(own, "dx/dt = " if own.order == 1 else "dv/dt = ")
     for domain, title in (("traffic", "Effects in lanes; W is what law and effects before say"),
@@ -37,7 +37,7 @@ def lines() -> Iterator[str]:
             yield "Forces on people"
             for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
                 yield from _of(force, "dv/dt = ")
-            for name, description in PEOPLE.items():
+            for name, description in PEDESTRIAN_LAWS.items():
                 yield from _of(law_from(name, description), "")
         yield title
         for effect in CATALOGUE.of(domain, every=True):  # type: ignore[arg-type]
@@ -112,3 +112,7 @@ def _bounds(interval: Interval | None) -> str:
     if interval is None or (interval.low, interval.high) == (-float("inf"), float("inf")):
         return ""
     return f", in [{interval.low:g}, {interval.high:g}]"
+
+
+if __name__ == "__main__":
+    main()

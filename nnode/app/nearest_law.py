@@ -19,10 +19,10 @@ from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.result import Laws
 from nnode.errors import ConfigError
-from nnode.models import System, build_model
-from nnode.models.effects import CATALOGUE, Effect
-from nnode.models.extend import effects_of
-from nnode.models.system import Traffic
+from nnode.model import System, build_model
+from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.extend import effects_of
+from nnode.model.system import Traffic
 from nnode.progress import Stages
 
 #: Laws that are compared where none are named; networks contain effects, and newell remembers step
@@ -144,7 +144,7 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, Found]]:
     done = _both(job, nearest, found, hints, watch)
     # what imitates another law would bring that law's other imitations to the front
     known = {effect.name for effect in effects}
-    more = [e for e in _lacking(*done[0]) if not e.of_laws and e.name not in known]
+    more = [e for e in _lacking(*done[0]) if not e.built_into_laws and e.name not in known]
     if len(done) > 1 and more:
         last, hints = compared(systems, effects + more)
         behind = {one.name: one.p_value for one in last.ranking}

@@ -19,9 +19,9 @@ from nnode.data.store import Store
 from nnode.discover.report.replay import zone_of
 from nnode.errors import DataError
 from nnode.exchange.trajectories import simulated as simulated_by
-from nnode.models import System
-from nnode.models.effects import Effect
-from nnode.models.extend import effects_of
+from nnode.model import System
+from nnode.model.effects import Effect
+from nnode.model.extend import effects_of
 from nnode.pages.page import write_player
 from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone
 

@@ -31,9 +31,9 @@ from nnode.data.options import DataOptions, LoaderOptions
 from nnode.data.sequence import Batch
 from nnode.data.split import Split, split
 from nnode.errors import ConfigError
-from nnode.models import InteractionForce, System, build_model
+from nnode.model import InteractionForce, System, build_model
 from nnode.plots import force_figure
-from nnode.solvers import Solver, TorchdiffeqSolver, substeps
+from nnode.simulate import Solver, TorchdiffeqSolver, substeps
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
                 f"solver=fused works on the CPU, the device is {device}; set the device to cpu, "
                 "or take solver=torchdiffeq"
             )
-        from nnode.solvers import FusedSolver  # loads Numba, which takes a second
+        from nnode.simulate import FusedSolver  # loads Numba, which takes a second
 
         return FusedSolver(
             options.dt, options.threads, options.cutoff, options.cutoff_error, options.method

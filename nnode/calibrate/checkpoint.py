@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nnode.errors import CheckpointError, NNodeError
 from nnode.files import disk_words, interpolation, replacing
-from nnode.models import System, build_model
+from nnode.model import System, build_model
 from nnode.version import VERSION
 
 #: Raised when the layout of a checkpoint changes.

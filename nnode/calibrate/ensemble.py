@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.problem import Problem
-from nnode.models.system import System
-from nnode.models.term import Interval
+from nnode.model.system import System
+from nnode.model.term import Interval
 
 
 class EnsembleCost(Problem):

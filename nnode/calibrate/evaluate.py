@@ -12,11 +12,11 @@ from torch import Tensor
 from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs, squared_error
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
-from nnode.laws.lane import Rule
-from nnode.models import Crowd, FollowTheLeader, Relaxation, System, Traffic
-from nnode.models.own_law import FormulaForce
-from nnode.models.term import Interval, Term
-from nnode.solvers.base import Solver, Trajectory
+from nnode.model import Crowd, FollowTheLeader, Relaxation, System, Traffic
+from nnode.model.formula_law import FormulaForce
+from nnode.model.lane_dynamics import Rule
+from nnode.model.term import Interval, Term
+from nnode.simulate.base import Solver, Trajectory
 
 #: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
 MOST = 1e24

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from nnode.calibrate.cost import Convention
 from nnode.data.sequence import Batch
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 
 
 @dataclass(eq=False, repr=False)

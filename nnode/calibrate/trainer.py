@@ -33,8 +33,8 @@ from nnode.data.dataset import EpochSampler
 from nnode.data.sequence import Batch
 from nnode.errors import CheckpointError, ConfigError, SimulationError
 from nnode.files import replacing
-from nnode.models import System
-from nnode.solvers.base import Solver
+from nnode.model import System
+from nnode.simulate.base import Solver
 
 log = logging.getLogger(__name__)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import copy
 
 from nnode.errors import ConfigError
-from nnode.laws.crowd import SMALLEST
-from nnode.laws.expression import symbols
-from nnode.models.build import add_effects
-from nnode.models.crowd import InteractionForce
-from nnode.models.crowd_formula import CrowdBase, crowd_of
-from nnode.models.effects import Effect, IndividualEffect
-from nnode.models.effects.crowd_force import ForceEffect
-from nnode.models.extend import effects_of
-from nnode.models.system import Crowd, System, Traffic
+from nnode.model.build import add_effects
+from nnode.model.crowd import InteractionForce
+from nnode.model.crowd_dynamics import SMALLEST
+from nnode.model.crowd_formula import CrowdBase, crowd_of
+from nnode.model.effects import Effect, IndividualEffect
+from nnode.model.effects.crowd_force import ForceEffect
+from nnode.model.expression import symbols
+from nnode.model.extend import effects_of
+from nnode.model.system import Crowd, System, Traffic
 
 
 def check_effect(effect: type[Effect]) -> None:
@@ -33,7 +33,7 @@ def check_effect(effect: type[Effect]) -> None:
 
 def not_offered(effect: type[Effect], system: System) -> str:
     """Why an effect cannot act on a model; empty: it can."""
-    if isinstance(system, Crowd) and effect.paced and system.desired != "last":
+    if isinstance(system, Crowd) and effect.sets_desired_speed and system.desired != "last":
         return (
             f"with desired={system.desired} everybody has a preferred speed already, measured in "
             "the seconds before: one for all would mend its errors and be no effect"

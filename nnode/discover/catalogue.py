@@ -14,9 +14,9 @@ from typing import cast
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.files import write_text
-from nnode.models.effects import CATALOGUE, Effect, Setting, Strength
-from nnode.models.effects.own import load_own
-from nnode.models.term import Interval
+from nnode.model.effects import CATALOGUE, Effect, Setting, Strength
+from nnode.model.effects.own import load_own
+from nnode.model.term import Interval
 
 #: What stands before and after the table in a document.
 MARKS = ("<!-- catalogue -->", "<!-- end of the catalogue -->")
@@ -33,7 +33,7 @@ def catalogue(own: bool = False) -> str:
     parts = []
     for domain, title in (("traffic", "Traffic"), ("crowd", "Crowds")):
         every = CATALOGUE.of(cast(Domain, domain), every=True)
-        effects = [e for e in every if e.sought and (own or _ours(e))]
+        effects = [e for e in every if e.searched_orders and (own or _ours(e))]
         if effects:
             parts.append(f"### {title}\n\n{_HEAD}\n" + "\n".join(map(_row, effects)))
     return "\n\n".join(parts)
@@ -74,10 +74,10 @@ def _range(given: Strength | Setting) -> str:
 
 
 def _usual(given: Strength | Setting) -> str:
-    if not isinstance(given, Strength) or given.usual is None:
+    if not isinstance(given, Strength) or given.min_effect_size is None:
         return ""
     away = f" away from {_number(given.neutral)}" if given.neutral else ""
-    return f", usually {_number(given.usual)} or more{away}"
+    return f", usually {_number(given.min_effect_size)} or more{away}"
 
 
 def _number(value: float) -> str:

@@ -46,8 +46,8 @@ from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
-from nnode.models.effects import CATALOGUE, Effect, IndividualEffect
-from nnode.models.system import System
+from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
+from nnode.model.system import System
 from nnode.progress import Stages
 
 #: Effects that are described where nothing can be tested.

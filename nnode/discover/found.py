@@ -9,7 +9,7 @@ import numpy as np
 
 from nnode.data.sequence import Sequence
 from nnode.discover.result import Diagnosis
-from nnode.models import System
+from nnode.model import System
 
 
 @dataclass

@@ -11,8 +11,8 @@ from nnode.data.sequence import Domain
 from nnode.discover.able import check_effect
 from nnode.discover.rules import Rules
 from nnode.errors import ConfigError
-from nnode.models.effects import CATALOGUE
-from nnode.models.effects.own import VARIABLE
+from nnode.model.effects import CATALOGUE
+from nnode.model.effects.own import VARIABLE
 
 
 @dataclass

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from nnode.models import System
-from nnode.models.own_law import law_from
-from nnode.models.term import Term, short_names
+from nnode.model import System
+from nnode.model.formula_law import law_from
+from nnode.model.term import Term, short_names
 
 #: Address of a parameter to what a run says of it: ``low`` and ``high``, None where not known.
 Intervals = Mapping[str, Mapping[str, Any]]
@@ -44,7 +44,7 @@ def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ..
     """Which of the field's laws a model has, whatever it calls it.
 
     Args:
-        described: their descriptions by name, see :func:`nnode.models.own_law.law_from`.
+        described: their descriptions by name, see :func:`nnode.model.formula_law.law_from`.
         names: those that are asked for.
     """
     term = system.terms[0] if len(system.terms) else None

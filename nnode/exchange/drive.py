@@ -12,7 +12,7 @@ import numpy as np
 from nnode.errors import ConfigError
 from nnode.exchange.drivers import Drivers, drivable
 from nnode.exchange.running_sumo import RunningSumo, Steps
-from nnode.models import System
+from nnode.model import System
 
 #: What SUMO writes, which ``data=sumo`` reads.
 TRAJECTORIES = "fcd.xml.gz"

@@ -12,15 +12,15 @@ import torch
 
 from nnode.data.sequence import PADDING_GAP
 from nnode.errors import ConfigError, SimulationError
-from nnode.laws.arrays import straight
-from nnode.laws.expression import Expr, below, symbol, symbols
-from nnode.laws.lane import Lane
-from nnode.laws.steps import stepped
-from nnode.models import System, Traffic
-from nnode.models.effects.base import IndividualEffect
-from nnode.models.effects.traffic import VehicleClass
-from nnode.models.formula import begins, own_values, values_of
-from nnode.models.term import Term
+from nnode.model import System, Traffic
+from nnode.model.arrays import numpy_function
+from nnode.model.effects.base import IndividualEffect
+from nnode.model.effects.traffic import VehicleClass
+from nnode.model.expression import Expr, symbol, symbols, topological
+from nnode.model.formula import begins, own_values, values_of
+from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.steps import stepped
+from nnode.model.term import Term
 
 #: Gaps, m, that stand for an empty road: a law that drives there says the same at both.
 EMPTY = (1e6, 1e9)
@@ -191,7 +191,7 @@ class Drivers:
         new = self._fresh
         self._begun = given["start"]
         starts = self.lane.starts
-        begun = straight(tuple(starts.values()), _GAPS)(given, given["gaps"])
+        begun = numpy_function(tuple(starts.values()), _GAPS)(given, given["gaps"])
         others = iter(self._remembered(seen, given))
         for state in self._added:
             own = begun[list(starts).index(state)] if state in starts else next(others)
@@ -217,7 +217,7 @@ class Drivers:
             told = torch.cat([t.remember(places, speeds, self._system) for t in code], -1)
         return [column.numpy() for column in told[:, 0].unbind(-1)]
 
-    def _check_empty(self, lane: Lane) -> None:
+    def _check_empty(self, lane: LaneDynamics) -> None:
         """Refuse a law that does not come to an end as the gap grows.
 
         Args:
@@ -257,12 +257,12 @@ class _Rates:
     computed after that one.
     """
 
-    def __init__(self, lane: Lane) -> None:
+    def __init__(self, lane: LaneDynamics) -> None:
         outputs = tuple(lane.rates[s] for s in (lane.top, *list(lane.rates)[lane.order :]))
-        parts = below([*outputs, *lane.starts.values()], set(_GAPS))
+        parts = topological([*outputs, *lane.starts.values()], set(_GAPS))
         named = {part.value for part in parts if part.op == "symbol"}
         self.places = not named.isdisjoint(("x", "x_1", "x_2"))
-        self._all = straight(outputs, _GAPS)
+        self._all = numpy_function(outputs, _GAPS)
         chain: set[Expr] = set()
         for part in parts:
             if part.value == "dx_1" or any(a in chain for a in part.args):
@@ -273,8 +273,8 @@ class _Rates:
             ready = {a for part in inside for a in part.args if a not in chain}
             ready |= {node for node in outputs if node not in chain}
             known = tuple(a for a in (*_GAPS, *parts) if a in ready and a.op != "const")
-            self._before = straight(known, _GAPS)
-            self._after = straight(outputs, known)
+            self._before = numpy_function(known, _GAPS)
+            self._after = numpy_function(outputs, known)
 
     def __call__(self, given: Mapping[str, Any], n: int) -> list[np.ndarray]:
         if not self._chained:
@@ -311,7 +311,7 @@ def one_behind_the_other(lead: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def drivable(system: System) -> Lane:
+def drivable(system: System) -> LaneDynamics:
     """The formula of a model that can drive vehicles in another program.
 
     Raises:

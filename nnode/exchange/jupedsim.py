@@ -29,11 +29,11 @@ from nnode.exchange.counterpart import (
     field_law,
     interval_lines,
 )
-from nnode.laws.crowd import CrowdRule
-from nnode.models import Relaxation, SocialForce, System
-from nnode.models.field_crowd import PEOPLE
-from nnode.models.own_law import FormulaForce
-from nnode.models.scene import Scene, wall_points
+from nnode.model import Relaxation, SocialForce, System
+from nnode.model.crowd_dynamics import CrowdRule
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.formula_law import FormulaForce
+from nnode.model.scene import Scene, wall_points
 
 
 @dataclass
@@ -95,7 +95,9 @@ _PACE = "desired_speed: the median of people's preferred speeds; each has his ow
 
 def has_parameters(system: System) -> bool:
     """Whether JuPedSim has a counterpart to a model."""
-    return system.find(SocialForce) is not None or field_law(system, PEOPLE, SAME) is not None
+    return (
+        system.find(SocialForce) is not None or field_law(system, PEDESTRIAN_LAWS, SAME) is not None
+    )
 
 
 def jupedsim_parameters(
@@ -110,7 +112,7 @@ def jupedsim_parameters(
     Raises:
         ConfigError: JuPedSim has no counterpart to the model.
     """
-    name = field_law(system, PEOPLE, SAME)
+    name = field_law(system, PEDESTRIAN_LAWS, SAME)
     if name is not None:
         found, content = _of_the_field(system, name, scenes)
     else:

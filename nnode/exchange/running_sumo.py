@@ -37,7 +37,7 @@ Told = dict[str, dict[int, Any]]
 
 @dataclass(frozen=True)
 class Steps:
-    """How a program steps: length, s, and method, of :data:`nnode.laws.steps.METHODS`."""
+    """How a program steps: length, s, and method, of :data:`nnode.model.steps.METHODS`."""
 
     seconds: float
     method: str

@@ -25,8 +25,8 @@ from nnode.exchange.counterpart import (
     field_law,
     interval_lines,
 )
-from nnode.models import Linear, Logarithmic, System
-from nnode.models.field import FIELD
+from nnode.model import Linear, Logarithmic, System
+from nnode.model.field import CAR_FOLLOWING_LAWS
 
 #: SUMO's own length of a passenger car, m, where the data tell none.
 DEFAULT_LENGTH = 5.0
@@ -63,7 +63,7 @@ def equilibrium_gap(law: Linear | Logarithmic, speed: float, time_gap: float = 0
 def has_type(system: System) -> bool:
     """Whether SUMO has a counterpart to a model's law."""
     simple = system.find(Linear) is not None or system.find(Logarithmic) is not None
-    return simple or field_law(system, FIELD, tuple(SAME)) is not None
+    return simple or field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME)) is not None
 
 
 def sumo_type(
@@ -82,7 +82,7 @@ def sumo_type(
     Raises:
         ConfigError: SUMO has no counterpart to the law.
     """
-    law = field_law(system, FIELD, tuple(SAME))
+    law = field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME))
     if law is not None:
         found = _same(system, law, name, length)
     else:

@@ -10,7 +10,7 @@ import pandas as pd
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.evaluate import Metrics
 from nnode.files import csv_text, write_text
-from nnode.models import System
+from nnode.model import System
 
 
 def write_results(

@@ -22,7 +22,7 @@ from nnode.data.sequence import Batch
 from nnode.discover.lanes.paths import noise_variance
 from nnode.errors import DataError
 from nnode.generate.noise import Noise, sample, takes_drivers
-from nnode.models import System
+from nnode.model import System
 from nnode.study.statistics import group_weights
 
 #: s; times of the noise at which motion is sampled, between which moments are interpolated.

@@ -15,18 +15,18 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
 from nnode.generate.people import sample_people, takes_paces
-from nnode.laws.lane import Rule
-from nnode.laws.steps import STAGES
-from nnode.models import Crowd, Traffic
-from nnode.models.effects.base import IndividualEffect
-from nnode.models.effects.crowd_individual import GaitSway
-from nnode.models.effects.traffic import DriverHeterogeneity
-from nnode.models.own_law import law_from
-from nnode.models.system import System
-from nnode.models.term import State, Term
-from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.ode import whole_steps
-from nnode.solvers.rates import Rates
+from nnode.model import Crowd, Traffic
+from nnode.model.effects.base import IndividualEffect
+from nnode.model.effects.crowd_individual import GaitSway
+from nnode.model.effects.traffic import DriverHeterogeneity
+from nnode.model.formula_law import law_from
+from nnode.model.lane_dynamics import Rule
+from nnode.model.steps import STAGES
+from nnode.model.system import System
+from nnode.model.term import State, Term
+from nnode.simulate.base import Trajectory, check_finite, substeps
+from nnode.simulate.ode import whole_steps
+from nnode.simulate.rates import Rates
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from torch import Tensor
 from torchdiffeq import odeint
 
 from nnode.data.sequence import Batch
-from nnode.models.scene import Scene
-from nnode.models.system import Crowd
-from nnode.solvers.base import Trajectory, check_finite, substeps
-from nnode.solvers.ode import whole_steps
-from nnode.solvers.rates import Rates
+from nnode.model.scene import Scene
+from nnode.model.system import Crowd
+from nnode.simulate.base import Trajectory, check_finite, substeps
+from nnode.simulate.ode import whole_steps
+from nnode.simulate.rates import Rates
 
 #: The least preferred speed that is drawn, of the measured one.
 SLOWEST = 0.1

@@ -21,7 +21,7 @@ from nnode.files import write_json
 from nnode.generate.fit import FittedNoise
 from nnode.generate.noise import Noise, numbered, sample
 from nnode.generate.scores import BANDS, Mean, Scores, band
-from nnode.models import System
+from nnode.model import System
 from nnode.study.statistics import Paired
 
 #: At most so many vehicles or people, samples counted, move at once.

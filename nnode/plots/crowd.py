@@ -15,8 +15,8 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from nnode.errors import ConfigError
-from nnode.models import SocialForce, System
-from nnode.models.extend import beside
+from nnode.model import SocialForce, System
+from nnode.model.extend import beside
 from nnode.plots.interaction import (
     Part,
     Vector,

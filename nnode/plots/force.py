@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from nnode.models import System
+from nnode.model import System
 from nnode.plots.crowd import head_on_figure
 from nnode.plots.traffic import follow_law, speed_curves
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from nnode.errors import ConfigError
-from nnode.models import InteractionForce, SocialForce, System
+from nnode.model import InteractionForce, SocialForce, System
 
 Part = Literal["sum", "pair", "wall"]
 Vector = tuple[float, float]

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from nnode.errors import ConfigError
-from nnode.models import System
-from nnode.models.extend import beside
+from nnode.model import System
+from nnode.model.extend import beside
 from nnode.plots.interaction import (
     Part,
     Vector,

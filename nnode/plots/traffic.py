@@ -15,9 +15,9 @@ from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
-from nnode.models import System
-from nnode.models.extend import beside
-from nnode.models.formula import Law
+from nnode.model import System
+from nnode.model.extend import beside
+from nnode.model.formula import Law
 from nnode.plots.style import (
     GREY,
     OKABE_ITO,

@@ -10,9 +10,9 @@ import torch
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
-from nnode.models.system import System
+from nnode.model.system import System
 from nnode.pages.replay import ReplayBlock, Scene
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.simulate.fused import FusedSolver
 
 
 def spread(items: Many[Sequence], number: int) -> list[Sequence]:

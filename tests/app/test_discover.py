@@ -24,7 +24,7 @@ from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report import page
 from nnode.errors import ConfigError
-from nnode.models import System
+from nnode.model import System
 from tests.app.conftest import Script, composed
 from tests.app.forked import Forks
 from tests.discover import stand_in

@@ -20,7 +20,7 @@ from nnode.data.prepare import prepare
 from nnode.data.readers.sumo import read_sumo
 from nnode.errors import CheckpointError, ConfigError
 from nnode.exchange.running_sumo import Steps
-from nnode.models import build_model
+from nnode.model import build_model
 from tests.app.conftest import Script
 
 

@@ -24,9 +24,9 @@ from nnode.data.readers.juelich import read_juelich
 from nnode.data.readers.sumo import read_sumo
 from nnode.data.readers.table import read_table
 from nnode.errors import CheckpointError, ConfigError
-from nnode.models import Linear, Relaxation, SocialForce, Traffic
-from nnode.models.crowd import NetworkForce
-from nnode.models.system import Crowd
+from nnode.model import Linear, Relaxation, SocialForce, Traffic
+from nnode.model.crowd import NetworkForce
+from nnode.model.system import Crowd
 from tests.app.conftest import Script
 
 

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
-from nnode.models import build_model
+from nnode.model import build_model
 
 pytestmark = pytest.mark.thorough
 

@@ -5,15 +5,22 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from nnode.models.effects import CATALOGUE
-from nnode.models.field import FIELD
+from nnode.model.effects import CATALOGUE
+from nnode.model.field import CAR_FOLLOWING_LAWS
 
 
 def test_the_catalogue_is_printed_whole() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "nnode.laws"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "nnode.app.laws"], capture_output=True, text=True, check=True
     )
-    for name in ("lin", "log", "network_speed", *FIELD, "social_force", "network_force"):
+    for name in (
+        "lin",
+        "log",
+        "network_speed",
+        *CAR_FOLLOWING_LAWS,
+        "social_force",
+        "network_force",
+    ):
         assert f"\n  {name}:" in done.stdout
     for domain in ("traffic", "crowd"):
         for effect in CATALOGUE.of(domain, every=True):  # type: ignore[arg-type]

@@ -272,8 +272,8 @@ def test_the_fused_solver_trains_to_the_same_numbers(
 #: An effect of the user's own, whose code nobody reads.
 OWN = """
 import torch
-from nnode.models.effects import CATALOGUE, Effect, Strength
-from nnode.models.term import Interval
+from nnode.model.effects import CATALOGUE, Effect, Strength
+from nnode.model.term import Interval
 
 @CATALOGUE.add
 class Draught(Effect):

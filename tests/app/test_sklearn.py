@@ -9,7 +9,7 @@ import pytest
 
 import nnode
 from nnode.errors import NotFittedError
-from nnode.models import Linear, Traffic
+from nnode.model import Linear, Traffic
 from tests.app.following import table
 
 pytest.importorskip("sklearn")

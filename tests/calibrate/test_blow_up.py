@@ -12,10 +12,10 @@ import torch
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import SimulationError
-from nnode.models import build_model
-from nnode.solvers import Solver, TorchdiffeqSolver
-from nnode.solvers.base import Trajectory
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model import build_model
+from nnode.simulate import Solver, TorchdiffeqSolver
+from nnode.simulate.base import Trajectory
+from nnode.simulate.fused import FusedSolver
 
 SOLVERS = [
     pytest.param(lambda dt: TorchdiffeqSolver(gradient="discrete", dt=dt), id="torchdiffeq"),

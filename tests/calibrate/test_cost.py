@@ -12,8 +12,8 @@ from scipy.io import loadmat
 from nnode.calibrate.cost import Convention, sequence_costs, squared_error
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models import Linear, Traffic
-from nnode.solvers import TorchdiffeqSolver, Trajectory
+from nnode.model import Linear, Traffic
+from nnode.simulate import TorchdiffeqSolver, Trajectory
 
 
 def two_sequences() -> Batch:

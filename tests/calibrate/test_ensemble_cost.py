@@ -11,9 +11,9 @@ import torch
 from nnode.calibrate.cost import Convention, sequence_costs
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models.build import build_model
-from nnode.models.system import System
-from nnode.solvers import FusedSolver, TorchdiffeqSolver
+from nnode.model.build import build_model
+from nnode.model.system import System
+from nnode.simulate import FusedSolver, TorchdiffeqSolver
 
 DT = 0.02
 N4 = {

@@ -18,8 +18,8 @@ from nnode.calibrate.evaluate import (
     no_interaction,
 )
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models import Crowd, Linear, Relaxation, SocialForce, Traffic
-from nnode.solvers import TorchdiffeqSolver, Trajectory
+from nnode.model import Crowd, Linear, Relaxation, SocialForce, Traffic
+from nnode.simulate import TorchdiffeqSolver, Trajectory
 
 
 def traffic(name: str, x: list[list[float]], dt: float = 0.5) -> Sequence:

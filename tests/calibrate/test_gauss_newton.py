@@ -12,17 +12,17 @@ from nnode.calibrate.gauss_newton.method import TangentCost, alone, pooled, sand
 from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.models import Crowd, Relaxation, System, build_model
-from nnode.models.field import FIELD
-from nnode.solvers import FusedSolver, TorchdiffeqSolver
-from tests.solvers.fused.compare import RungeKutta
+from nnode.model import Crowd, Relaxation, System, build_model
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from tests.simulate.fused.compare import RungeKutta
 
 TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
 
 
 def model(**values: float) -> System:
     system = build_model({"term": "formula", "name": "idm", "leader": "measured",
-                          "law": FIELD["idm"]})  # fmt: skip
+                          "law": CAR_FOLLOWING_LAWS["idm"]})  # fmt: skip
     with torch.no_grad():
         for name, value in values.items():
             getattr(system.terms[0], name).fill_(value)

@@ -18,10 +18,10 @@ from nnode.calibrate.gauss_newton.crowd import CrowdCost
 from nnode.calibrate.gauss_newton.method import Curved, sandwich
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
-from nnode.models import System
-from nnode.models.build import build_model
-from nnode.solvers import FusedSolver
-from nnode.solvers.rates import Rates
+from nnode.model import System
+from nnode.model.build import build_model
+from nnode.simulate import FusedSolver
+from nnode.simulate.rates import Rates
 
 TRUTH = (0.5, 40.0, 12.0)
 

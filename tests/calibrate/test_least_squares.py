@@ -11,7 +11,7 @@ from torch import Tensor
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import least_squares, trajectory_residuals
 from nnode.errors import SimulationError
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.simulate.fused import FusedSolver
 from nnode.study.crowd.fit import new_system
 from tests.study.crowd.corridor import corridor
 

@@ -21,8 +21,8 @@ from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.models import Linear, Traffic
-from nnode.solvers import FusedSolver
+from nnode.model import Linear, Traffic
+from nnode.simulate import FusedSolver
 
 #: v0 (m/s) and L (m) that the data are made with.
 TRUTH = (24.0, 6.0)

@@ -16,7 +16,7 @@ from nnode.calibrate.gauss_newton.pooling import Own, own_parameters
 from nnode.calibrate.options import Pooling
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
-from nnode.solvers import FusedSolver
+from nnode.simulate import FusedSolver
 from nnode.study.following.candidates import EVERY
 from tests.app.following import pairs
 from tests.study.following.test_fit import HELLY, driven

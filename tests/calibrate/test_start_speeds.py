@@ -15,8 +15,8 @@ from nnode.calibrate.gauss_newton.start_speeds import StartSpeedCost
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import start_smoothed
 from nnode.errors import ConfigError
-from nnode.models import System
-from nnode.solvers import FusedSolver
+from nnode.model import System
+from nnode.simulate import FusedSolver
 from nnode.study.following.candidates import EVERY
 from tests.app.following import pairs
 from tests.study.following.test_fit import HELLY, driven

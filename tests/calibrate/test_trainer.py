@@ -24,8 +24,8 @@ from nnode.calibrate.optimizers import (
 from nnode.calibrate.trainer import Trainer
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
-from nnode.models import System
-from nnode.solvers import Trajectory
+from nnode.model import System
+from nnode.simulate import Trajectory
 
 Make = Callable[..., Trainer]
 

@@ -27,8 +27,8 @@ from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import LoaderOptions
 from nnode.data.store import Store
 from nnode.errors import SimulationError
-from nnode.models import build_model
-from nnode.solvers import TorchdiffeqSolver
+from nnode.model import build_model
+from nnode.simulate import TorchdiffeqSolver
 
 N4 = {
     "term": "network_speed",

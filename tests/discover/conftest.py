@@ -13,7 +13,7 @@ from nnode.data.options import TableOptions
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions
-from nnode.models import build_model
+from nnode.model import build_model
 from tests.discover import stand_in
 from tests.discover.recorded import corridor, lane
 

@@ -31,11 +31,11 @@ from nnode.discover.result import (
     Place,
     Structure,
 )
-from nnode.models import Linear, System
-from nnode.models.build import add_effects
-from nnode.models.crowd import SocialForce
-from nnode.models.effects import CATALOGUE, Effect, Strength
-from nnode.models.term import Interval, State
+from nnode.model import Linear, System
+from nnode.model.build import add_effects
+from nnode.model.crowd import SocialForce
+from nnode.model.effects import CATALOGUE, Effect, Strength
+from nnode.model.term import Interval, State
 from tests.discover.recorded import ALPHA, PUSH, V0, WIND, ZONE, L
 
 #: A folder: the stand-in leaves a sign there and waits, so that it can be interrupted.

@@ -20,16 +20,16 @@ from nnode.discover.residuals.fit import evaluated
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.score import traces
 from nnode.errors import ConfigError
-from nnode.models import Crowd, Relaxation, SocialForce, System, Traffic
-from nnode.models.build import build_model
-from nnode.models.crowd import norm, velocity
-from nnode.models.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
-from nnode.models.effects.crowd_individual import GaitSway
-from nnode.models.effects.crowd_pairs import heading
-from nnode.models.effects.following import Inertia
-from nnode.models.effects.traffic import DriverHeterogeneity, SpeedZone, for_followers, gaps
-from nnode.models.extend import extended
-from nnode.models.term import Interval, State, Term
+from nnode.model import Crowd, Relaxation, SocialForce, System, Traffic
+from nnode.model.build import build_model
+from nnode.model.crowd import norm, velocity
+from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
+from nnode.model.effects.crowd_individual import GaitSway
+from nnode.model.effects.crowd_pairs import heading
+from nnode.model.effects.following import Inertia
+from nnode.model.effects.traffic import DriverHeterogeneity, SpeedZone, for_followers, gaps
+from nnode.model.extend import extended
+from nnode.model.term import Interval, State, Term
 from tests.discover import walkers
 from tests.discover.platoons import LENGTH, V0, platoons
 

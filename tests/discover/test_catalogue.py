@@ -11,10 +11,10 @@ from nnode.data.sequence import Sequence, collate
 from nnode.discover.catalogue import MARKS, catalogue, main, written
 from nnode.discover.report.deviation import simulate
 from nnode.errors import ConfigError
-from nnode.models import build_model
-from nnode.models.build import add_effects
-from nnode.models.effects import CATALOGUE, own
-from nnode.models.extend import effects_of
+from nnode.model import build_model
+from nnode.model.build import add_effects
+from nnode.model.effects import CATALOGUE, own
+from nnode.model.extend import effects_of
 from tests.app.conftest import ROOT
 from tests.discover import stand_in
 
@@ -34,7 +34,7 @@ def test_every_effect_has_a_row_with_its_source() -> None:
             assert effect.name not in rows
             assert f"`{effect.name}`" in catalogue(own=True)
             continue
-        if not effect.sought:
+        if not effect.searched_orders:
             assert effect.name not in rows
             continue
         assert effect.source.replace("|", "\\|") in rows[effect.name]

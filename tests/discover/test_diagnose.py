@@ -11,8 +11,8 @@ import torch
 from nnode.discover.diagnose import diagnose
 from nnode.discover.options import DiscoverOptions
 from nnode.errors import DataError
-from nnode.models import System
-from nnode.models.build import build_model
+from nnode.model import System
+from nnode.model.build import build_model
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 
 OPTIONS = DiscoverOptions(effects=["relative_speed", "speed_zone"])

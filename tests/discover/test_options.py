@@ -8,7 +8,7 @@ import pytest
 
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.errors import ConfigError
-from nnode.models.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE
 from tests.discover import stand_in
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.exchange.sumo import equilibrium_gap
-from nnode.models import Linear, System
+from nnode.model import Linear, System
 from tests.app.conftest import Script, forks, script  # noqa: F401
 from tests.exchange import by_jupedsim, by_sumo
 

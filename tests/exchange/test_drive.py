@@ -24,8 +24,8 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.exchange.drive import Drive, drive
 from nnode.exchange.running_sumo import RunningSumo, Steps
-from nnode.models import System, build_model
-from nnode.solvers import FusedSolver
+from nnode.model import System, build_model
+from nnode.simulate import FusedSolver
 
 #: m: rounding of what SUMO writes, on both sides.
 ROUNDED = 1e-9

@@ -12,8 +12,8 @@ from torch import Tensor
 from nnode.app.python.inputs import model_options
 from nnode.errors import ConfigError, SimulationError
 from nnode.exchange.drivers import Drivers, Seen, drivable, one_behind_the_other
-from nnode.models import Linear, System, Traffic, build_model
-from nnode.models.traffic import FollowTheLeader
+from nnode.model import Linear, System, Traffic, build_model
+from nnode.model.traffic import FollowTheLeader
 
 DT = 0.1
 

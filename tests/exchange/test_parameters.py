@@ -21,7 +21,7 @@ from nnode.exchange.jupedsim import (
     scenes_of,
 )
 from nnode.exchange.sumo import equilibrium_gap, has_type, sumo_type, traffic_of
-from nnode.models import (
+from nnode.model import (
     Crowd,
     Linear,
     Logarithmic,
@@ -32,11 +32,11 @@ from nnode.models import (
     System,
     Traffic,
 )
-from nnode.models.build import add_effects
-from nnode.models.field import FIELD
-from nnode.models.field_crowd import PEOPLE
-from nnode.models.own_law import law_from
-from nnode.models.term import State
+from nnode.model.build import add_effects
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.formula_law import law_from
+from nnode.model.term import State
 
 SCENES = Scenes(people=12.0, points=50.0, spacing=0.25, speed=1.3)
 
@@ -145,9 +145,9 @@ def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
 
 def field(name: str) -> System:
     """A law of the field, whatever its user calls it."""
-    described = FIELD.get(name) or PEOPLE[name]
+    described = CAR_FOLLOWING_LAWS.get(name) or PEDESTRIAN_LAWS[name]
     law = law_from("mine", described)
-    return Traffic([law], leader="measured") if name in FIELD else Crowd([law])
+    return Traffic([law], leader="measured") if name in CAR_FOLLOWING_LAWS else Crowd([law])
 
 
 @pytest.mark.parametrize(("law", "follow"), [("idm", "IDM"), ("krauss", "KraussOrig1")])
@@ -178,10 +178,12 @@ def test_intervals_stand_in_comments() -> None:
 
 
 def test_a_law_with_another_formula_is_none_of_sumo_s() -> None:
-    rate = FIELD["idm"]["rate"]["v"].replace("(v/v0)**4", "(v/v0)**2")
-    system = Traffic([law_from("idm", {**FIELD["idm"], "rate": {"v": rate}})], leader="measured")
+    rate = CAR_FOLLOWING_LAWS["idm"]["rate"]["v"].replace("(v/v0)**4", "(v/v0)**2")
+    system = Traffic(
+        [law_from("idm", {**CAR_FOLLOWING_LAWS["idm"], "rate": {"v": rate}})], leader="measured"
+    )
     assert not has_type(system)
-    beside = law_from("idm", FIELD["idm"], network=4)
+    beside = law_from("idm", CAR_FOLLOWING_LAWS["idm"], network=4)
     assert not has_type(Traffic([beside], leader="measured"))
     with pytest.raises(ConfigError, match=r"neither idm nor krauss.*drive\.py"):
         sumo_type(system, "x", 15.0, None)

@@ -21,8 +21,8 @@ from nnode.data.store import Store
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import equilibrium_gap, sumo_type
 from nnode.exchange.trajectories import write_pedpy
-from nnode.models import Crowd, Linear, Relaxation, SocialForce, Traffic
-from nnode.models.term import State
+from nnode.model import Crowd, Linear, Relaxation, SocialForce, Traffic
+from nnode.model.term import State
 from tests.app.conftest import Script, forks, script  # noqa: F401
 from tests.exchange.by_sumo import call
 

@@ -23,11 +23,11 @@ from nnode.data.readers.sumo import read_sumo
 from nnode.data.sequence import Sequence, collate
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import SAME, sumo_type
-from nnode.models import Crowd, Relaxation, SocialForce, System, Traffic
-from nnode.models.field import FIELD
-from nnode.models.field_crowd import PEOPLE
-from nnode.models.own_law import law_from
-from nnode.solvers import FusedSolver
+from nnode.model import Crowd, Relaxation, SocialForce, System, Traffic
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.formula_law import law_from
+from nnode.simulate import FusedSolver
 from tests.exchange.test_recovery import recovered
 
 
@@ -61,7 +61,9 @@ def test_sumo_s_vehicles(
     typed = {names[p]: value for p, value in values.items()}
     typed |= {} if law == "idm" else {"sigma": 0.0}
     first = vehicles(by_sumo.platoon(sumo, tmp_path / "a", SAME[law], typed, profile=profile))
-    system = Traffic([of_the_field(law_from(law, FIELD[law]), case)], leader="measured")
+    system = Traffic(
+        [of_the_field(law_from(law, CAR_FOLLOWING_LAWS[law]), case)], leader="measured"
+    )
     text = sumo_type(system, "own", 15.0, by_sumo.LENGTH).text
     (kind,) = ElementTree.fromstring(text).iter("vType")
     written = dict(kind.attrib)
@@ -106,7 +108,7 @@ def test_jupedsim_s_collision_free_people(jupedsim: ModuleType, tmp_path: Path) 
     arguments = {"strength_neighbor_repulsion": 8.0, "range_neighbor_repulsion": 0.1}
     typed = content("CollisionFreeSpeedModel", arguments, time_gap=1.0, radius=0.2)
     first = people(jupedsim, tmp_path / "a", typed)
-    system = Crowd([of_the_field(law_from("cfsm", PEOPLE["cfsm"]), "collision_free")])
+    system = Crowd([of_the_field(law_from("cfsm", PEDESTRIAN_LAWS["cfsm"]), "collision_free")])
     second = people(jupedsim, tmp_path / "b", exported(system, first))
     for a, b in zip(first, second, strict=True):
         np.testing.assert_allclose(a.x, b.x, atol=1e-6)
@@ -148,7 +150,7 @@ def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
     """
     import shapely
 
-    system = Crowd([law_from("gcfm", PEOPLE["gcfm"])])
+    system = Crowd([law_from("gcfm", PEDESTRIAN_LAWS["gcfm"])])
     apart, speed, dt = 1.4, 0.2, 1e-4
     x = np.array([[0.0, 0.0], [apart, 0.0]])
     v = np.array([[speed, 0.0], [-speed, 0.0]])
@@ -196,7 +198,7 @@ def in_a_room(
         name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), v=np.stack([v, v]),
         destination=np.array([goal]), preferred=np.array([[1.3, 0.0]]), walls=room,
     )  # fmt: skip
-    system = Crowd([law_from(name, PEOPLE[name])], desired="exit")
+    system = Crowd([law_from(name, PEDESTRIAN_LAWS[name])], desired="exit")
     written = exported(system, [s])
     simulation = jupedsim.Simulation(
         model=getattr(jupedsim, written["classes"]["model"])(**written["model"]),

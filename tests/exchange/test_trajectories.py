@@ -25,7 +25,7 @@ from nnode.exchange.trajectories import (
     write_pedpy,
     write_table,
 )
-from nnode.solvers.base import Trajectory
+from nnode.simulate.base import Trajectory
 
 
 def walk(

@@ -16,12 +16,12 @@ from nnode.errors import ConfigError, DataError
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
 from nnode.generate.scores import band
-from nnode.models import Traffic, build_model
-from nnode.models.term import State, Term
-from nnode.models.traffic import Linear
-from nnode.solvers import TorchdiffeqSolver
+from nnode.model import Traffic, build_model
+from nnode.model.term import State, Term
+from nnode.model.traffic import Linear
+from nnode.simulate import TorchdiffeqSolver
 from tests.app.following import TRUE, platoon
-from tests.solvers.fused.compare import RungeKutta
+from tests.simulate.fused.compare import RungeKutta
 
 STEP = 0.1
 

@@ -16,8 +16,8 @@ from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
 from nnode.generate.people import SLOWEST
 from nnode.generate.scores import band, nearest
-from nnode.models import Crowd, System, build_model
-from nnode.solvers import TorchdiffeqSolver
+from nnode.model import Crowd, System, build_model
+from nnode.simulate import TorchdiffeqSolver
 
 STEP = 0.1
 

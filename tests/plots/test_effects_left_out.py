@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from nnode.models import build_model
-from nnode.models.build import add_effects
+from nnode.model import build_model
+from nnode.model.build import add_effects
 from nnode.plots.crowd import force_contours
 from nnode.plots.settings import six_settings
 from nnode.plots.traffic import speed_curves

@@ -10,7 +10,7 @@ from matplotlib.contour import ContourSet
 from torch import Tensor
 
 from nnode.errors import ConfigError
-from nnode.models import (
+from nnode.model import (
     Crowd,
     InteractionForce,
     Linear,

@@ -8,7 +8,7 @@ import torch
 from matplotlib.quiver import Quiver
 
 from nnode.errors import ConfigError
-from nnode.models import Crowd, NetworkForce, Relaxation, SocialForce
+from nnode.model import Crowd, NetworkForce, Relaxation, SocialForce
 from nnode.plots import save, six_settings
 from nnode.plots.settings import SETTINGS, Setting
 

@@ -12,7 +12,7 @@ from scipy.io import loadmat
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
-from nnode.models import (
+from nnode.model import (
     Crowd,
     Linear,
     Logarithmic,

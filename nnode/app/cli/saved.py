@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.errors import CheckpointError, ConfigError
-from nnode.models.field import FIELD
+from nnode.model.field import CAR_FOLLOWING_LAWS
 from nnode.program import choices, own_choices
 
 GROUPS = ("model", "data", "optimizer", "solver")
@@ -90,7 +90,9 @@ def field_groups(overrides: list[str]) -> list[str]:
     the user chooses nothing else; the paper's models keep the paper's."""
     pairs = (override.lstrip("+").partition("=") for override in overrides)
     chosen = {key: value for key, _, value in pairs}
-    if "experiment" in chosen or not FIELD.keys() >= set(chosen.get("model", "").split(",")):
+    if "experiment" in chosen or not CAR_FOLLOWING_LAWS.keys() >= set(
+        chosen.get("model", "").split(",")
+    ):
         return []
     wanted = {"solver": "fused", "optimizer": "gauss_newton"}
     return [f"{group}={choice}" for group, choice in wanted.items() if group not in chosen]

@@ -32,10 +32,10 @@ from nnode.data.dataset import Source, sound_speeds
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError, NotFittedError
 from nnode.exchange.trajectories import simulated
-from nnode.models import System
-from nnode.models.build import add_effects
-from nnode.models.field import FIELD
-from nnode.solvers import Solver
+from nnode.model import System
+from nnode.model.build import add_effects
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.simulate import Solver
 
 #: Sequences that are simulated at once.
 _TOGETHER = 32
@@ -52,7 +52,7 @@ class Calibrator:
 
     Args:
         model: a name as in ``conf/model``; options with their ``term``; or a
-            :class:`nnode.models.System`, which is copied.
+            :class:`nnode.model.System`, which is copied.
         effects: beside it, names or ``{"name": ..., parameter: value}``.
         leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
@@ -216,7 +216,8 @@ class Calibrator:
     def _config(self, given: Sequences) -> DictConfig:
         """The same configuration as the command's."""
         field = isinstance(self.model, str) and (
-            self.model in FIELD or (self.model == "sf" and self.solver in (None, "fused"))
+            self.model in CAR_FOLLOWING_LAWS
+            or (self.model == "sf" and self.solver in (None, "fused"))
         )
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))

@@ -26,8 +26,8 @@ from nnode.data.readers.columns import Table as DataTable
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError
-from nnode.models.field import FIELD, NEURONS
-from nnode.models.field_crowd import PEOPLE
+from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
 from nnode.program import configuration
 
 #: Models by the names that ``conf/model`` gives them.
@@ -39,9 +39,9 @@ MODELS: dict[str, dict[str, Any]] = {
     "n10": {"term": "network_speed", "hidden": 10},
     **{
         name: {"term": "formula", "law": law, "network": NEURONS.get(name)}
-        for name, law in FIELD.items()
+        for name, law in CAR_FOLLOWING_LAWS.items()
     },
-    **{name: {"term": "formula", "law": law} for name, law in PEOPLE.items()},
+    **{name: {"term": "formula", "law": law} for name, law in PEDESTRIAN_LAWS.items()},
     "formula": {"term": "formula"},
     "sf": {"term": "social_force"},
     "nn": {"term": "network_force"},

@@ -11,7 +11,7 @@ import pandas as pd
 from nnode.discover.report.files import interval, plain_report, sentence
 from nnode.discover.result import Clusters, DataFault, Diagnosis, Gap, NamedEffect, Place
 from nnode.files import xarray
-from nnode.models import System
+from nnode.model import System
 
 if TYPE_CHECKING:
     from xarray import Dataset

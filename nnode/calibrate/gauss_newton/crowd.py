@@ -14,7 +14,7 @@ from torch import Tensor
 from nnode.calibrate.cost import FOLLOWING
 from nnode.calibrate.gauss_newton.method import TangentCost, pooled
 from nnode.errors import ConfigError
-from nnode.models.system import Crowd, System
+from nnode.model.system import Crowd, System
 
 #: Relative size of a difference: the cube root of float64's precision, where the error of central
 #: differences by rounding and that by curvature are equal (Press et al. 2007, section 5.7).

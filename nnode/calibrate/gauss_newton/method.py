@@ -20,11 +20,11 @@ from torch import Tensor
 from nnode.calibrate.cost import FOLLOWING, Convention, changed_gap, errors, net_gaps
 from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK, box_step, damped_step
 from nnode.calibrate.problem import Problem
-from nnode.compiled import lanes
 from nnode.errors import ConfigError, SimulationError
-from nnode.models.system import System, Traffic
-from nnode.models.term import Interval
-from nnode.solvers.base import simulated_batch, substeps
+from nnode.model.system import System, Traffic
+from nnode.model.term import Interval
+from nnode.simulate.base import simulated_batch, substeps
+from nnode.simulate.kernels import lanes
 
 #: Share of the cost below which a fall is rounding.
 _ROUNDING = 1e-14

@@ -22,8 +22,8 @@ from nnode.calibrate.options import Pooling
 from nnode.data.clusters import clusters, folds, index_of
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.models.system import System
-from nnode.models.term import short_names
+from nnode.model.system import System
+from nnode.model.term import short_names
 
 #: Factors on the penalty by which sequences are drawn towards the pool.
 STRENGTHS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)

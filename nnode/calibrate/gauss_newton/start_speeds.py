@@ -15,8 +15,8 @@ from nnode.calibrate.least_squares import DAMPING, EASE, STIFFEN, STUCK
 from nnode.calibrate.options import StartSpeeds
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 
 #: First speeds: steps at most, the share of the cost below which a fall ends them, and the
 #: difference by which their derivatives are taken, m/s.

@@ -14,7 +14,7 @@ from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.errors import ConfigError
-from nnode.models.system import System
+from nnode.model.system import System
 
 
 @dataclass

@@ -15,8 +15,8 @@ from nnode.calibrate.least_squares import damped_step
 from nnode.calibrate.options import StartSpeeds
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.models.system import System
-from nnode.solvers.base import Solver
+from nnode.model.system import System
+from nnode.simulate.base import Solver
 
 
 class GaussNewton(Optimizer):
@@ -71,7 +71,7 @@ class GaussNewton(Optimizer):
         self._batch = batch
         # compiled code takes a second to import
         from nnode.calibrate.gauss_newton.start_speeds import cost_of
-        from nnode.solvers.fused import FusedSolver
+        from nnode.simulate.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")

@@ -29,9 +29,9 @@ from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.errors import ConfigError
-from nnode.models.effects import CATALOGUE, Effect
-from nnode.models.extend import effects_of, extended
-from nnode.models.system import System
+from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.extend import effects_of, extended
+from nnode.model.system import System
 
 #: Rounds of choosing the law that tells the whitening.
 ROUNDS = 3
@@ -145,7 +145,7 @@ def imitated(
     shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [
         step for step in found.steps
-        if not step.chosen.score.effect.of_laws and step.chosen.name not in shared
+        if not step.chosen.score.effect.built_into_laws and step.chosen.name not in shared
     ]  # fmt: skip
     return steps, p_value
 

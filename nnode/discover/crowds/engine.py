@@ -22,9 +22,9 @@ from nnode.discover.crowds.windows import Windows, WindowScene
 from nnode.discover.found import Simulation
 from nnode.discover.residuals.engine import Squares, fill, of_residuals
 from nnode.discover.residuals.variables import Variable
-from nnode.models.effects.base import Effect, IndividualEffect, Probe
-from nnode.models.system import Crowd, System
-from nnode.models.term import State
+from nnode.model.effects.base import Effect, IndividualEffect, Probe
+from nnode.model.system import Crowd, System
+from nnode.model.term import State
 
 #: A simulated person is never further than this from the measured one, m: contacts may throw
 #: somebody far away, and the rest of the run still counts.
@@ -237,7 +237,7 @@ class CrowdEngine:
         self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
     ) -> Tensor:
         """``(M, n)``: derivatives of everyone's residuals with respect to M amounts of his own,
-        see :meth:`~nnode.models.effects.IndividualEffect.directions`.
+        see :meth:`~nnode.model.effects.IndividualEffect.directions`.
 
         As people walk alone, the derivative with respect to one person's amount is the same
         column, restricted to the residuals of this unit.

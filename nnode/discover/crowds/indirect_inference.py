@@ -26,7 +26,7 @@ from nnode.discover.crowds.paths import Path, Smoother
 from nnode.discover.residuals.engine import Rate, fill, row_of, runge_kutta
 from nnode.discover.residuals.fit import ROUGH, Fit, limits, refine
 from nnode.errors import SimulationError
-from nnode.models.system import Crowd, System
+from nnode.model.system import Crowd, System
 
 log = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ from torch.func import functional_call
 
 from nnode.discover.crowds.walk import Walk
 from nnode.discover.residuals.engine import runge_kutta, trained
-from nnode.models.effects.base import Effect
-from nnode.models.term import State
+from nnode.model.effects.base import Effect
+from nnode.model.term import State
 
 #: Differences of positions (m) and velocities (m/s) for derivatives.
 DIFFERENCE = 1e-4

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
-from nnode.models.crowd import dot, norm, velocity
-from nnode.models.crowd_formula import walls_of
-from nnode.models.effects.crowd_pairs import heading
-from nnode.models.term import State
+from nnode.model.crowd import dot, norm, velocity
+from nnode.model.crowd_formula import walls_of
+from nnode.model.effects.crowd_pairs import heading
+from nnode.model.term import State
 
 Of = Callable[[State], Tensor]
 

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
-from nnode.compiled.crowds.alone import WalkSource, compiled
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
 from nnode.discover.residuals.engine import runge_kutta, trained
-from nnode.models.crowd import NetworkForce
-from nnode.models.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
-from nnode.models.formula import own_values, values_of
-from nnode.models.system import Crowd, System
-from nnode.models.term import State, Term
+from nnode.model.crowd import NetworkForce
+from nnode.model.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
+from nnode.model.formula import own_values, values_of
+from nnode.model.system import Crowd, System
+from nnode.model.term import State, Term
+from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -43,7 +43,8 @@ class Beyond(nn.Module):
 
 @dataclass
 class Tables:
-    """What the compiled code knows of the surroundings, see :mod:`nnode.compiled.crowds.alone`."""
+    """What the compiled code knows of the surroundings, see
+    :mod:`nnode.simulate.kernels.crowds.alone`."""
 
     others: np.ndarray
     window: np.ndarray

@@ -13,9 +13,9 @@ from torch import Tensor
 from nnode.data.sequence import PADDING_GAP, Batch, Sequence, collate
 from nnode.discover.crowds.paths import Smoother
 from nnode.errors import DataError
-from nnode.models.crowd import SocialForce
-from nnode.models.scene import Scene
-from nnode.models.system import Crowd, System
+from nnode.model.crowd import SocialForce
+from nnode.model.scene import Scene
+from nnode.model.system import Crowd, System
 
 #: Longest step of a simulation, and about the interval of the residuals, s.
 STEP = 0.13

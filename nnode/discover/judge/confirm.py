@@ -27,7 +27,7 @@ from nnode.discover.residuals.engine import Engine, row_of
 from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
-from nnode.models.system import System
+from nnode.model.system import System
 
 
 def engine_of(

@@ -18,7 +18,7 @@ from nnode.discover.judge.confirm import Comparing, engine_of
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import DataError, SimulationError
-from nnode.models.system import Crowd, System
+from nnode.model.system import Crowd, System
 
 #: Shares of the time: the first part, and from where on the last part begins. What lies between
 #: keeps moods from carrying over.

@@ -29,7 +29,7 @@ from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import sums
 from nnode.discover.result import Profile
 from nnode.errors import SimulationError
-from nnode.models.system import System
+from nnode.model.system import System
 
 #: s that a profile lasts after as long a drive at its mean speed, in which starts are forgotten.
 LASTS = 30.0

@@ -24,8 +24,8 @@ from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import gains
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import SimulationError
-from nnode.models.extend import without
-from nnode.models.system import System
+from nnode.model.extend import without
+from nnode.model.system import System
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.profile import intervals as edge_intervals
 from nnode.discover.statistics.random_effects import Individuals
 from nnode.discover.statistics.score import Evidence, Score
-from nnode.models.effects import Effect
-from nnode.models.extend import place_of
+from nnode.model.effects import Effect
+from nnode.model.extend import place_of
 
 #: Normal quantile of an interval of 95 %.
 WIDE = 1.96
@@ -59,7 +59,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
                 name=other.name,
                 loss=float(other.losses.sum() / step.chosen.losses.sum()),
                 p_value=test.p_value,
-                separated_by=effect.separated_by,
+                separated_by=effect.distinguishing_data,
                 clusters=clusters_to_tell(test, apart_at(step.chosen, other)),
                 profile=_profile(engine, fit, other, apart_at(step.chosen, other)),
             )

@@ -13,9 +13,9 @@ from torch.func import functional_call, vmap
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.motion import Leaders, Motion
 from nnode.discover.lanes.side_by_side import AtSamples
-from nnode.models.scene import Scene
-from nnode.models.system import System
-from nnode.models.term import State
+from nnode.model.scene import Scene
+from nnode.model.system import System
+from nnode.model.term import State
 
 
 class Along:

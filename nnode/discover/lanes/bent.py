@@ -12,9 +12,9 @@ from torch import Tensor
 from nnode.discover.lanes.motion import Motion, Slopes, Values, formula_of
 from nnode.discover.lanes.side_by_side import AtSamples, repeated
 from nnode.discover.residuals.variables import Curve
-from nnode.models.scene import Scene
-from nnode.models.system import System, Traffic
-from nnode.models.term import State
+from nnode.model.scene import Scene
+from nnode.model.system import System, Traffic
+from nnode.model.term import State
 
 
 class Bent(Motion):

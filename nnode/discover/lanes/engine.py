@@ -33,11 +33,11 @@ from nnode.discover.residuals.engine import (
 )
 from nnode.discover.residuals.fit import limits
 from nnode.discover.residuals.variables import Variable
-from nnode.laws.expression import symbols
-from nnode.models.effects import Effect, IndividualEffect, Probe
-from nnode.models.extend import effects_of, extended, without
-from nnode.models.system import System
-from nnode.models.term import State, Term
+from nnode.model.effects import Effect, IndividualEffect, Probe
+from nnode.model.expression import symbols
+from nnode.model.extend import effects_of, extended, without
+from nnode.model.system import System
+from nnode.model.term import State, Term
 
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.

@@ -16,22 +16,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.laws.arrays import Straight, straight
-from nnode.laws.differentiate import derivatives
-from nnode.laws.expression import Expr
-from nnode.laws.lane import Lane
-from nnode.laws.steps import stepped
-from nnode.laws.tensors import SAFE, LaneRates
-from nnode.models.formula import inputs_of, own_values, values_of
-from nnode.models.scene import Scene
-from nnode.models.system import System, Traffic
-from nnode.models.term import Term
+from nnode.model.arrays import NumpyFunction, numpy_function
+from nnode.model.differentiate import derivatives
+from nnode.model.expression import Expr
+from nnode.model.formula import inputs_of, own_values, values_of
+from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.scene import Scene
+from nnode.model.steps import stepped
+from nnode.model.system import System, Traffic
+from nnode.model.tensors import SAFE, LaneRates
+from nnode.model.term import Term
 
 #: A formula's values by the names of its symbols.
 Values = dict[str, Any]
 
 
-def formula_of(system: System) -> Lane | None:
+def formula_of(system: System) -> LaneDynamics | None:
     """A model's formula, speeds never below 0 in it; None where a term is code."""
     if type(system) is not Traffic:
         return None
@@ -71,18 +71,18 @@ class _Code:
         chain: whether a rate depends on the speed of the vehicle ahead.
     """
 
-    ready: Straight
-    rates: Straight
-    lead: Straight
+    ready: NumpyFunction
+    rates: NumpyFunction
+    lead: NumpyFunction
     chain: bool
 
 
 @cache
-def _code(lane: Lane) -> _Code:
+def _code(lane: LaneDynamics) -> _Code:
     parts = LaneRates(lane)
     ready = tuple(parts.ready)
-    rates = straight(tuple(parts.outputs), ready)
-    return _Code(straight(ready), rates, straight((lane.leader,)), parts.chain)
+    rates = numpy_function(tuple(parts.outputs), ready)
+    return _Code(numpy_function(ready), rates, numpy_function((lane.leader,)), parts.chain)
 
 
 class Motion:
@@ -209,7 +209,9 @@ class Slopes:
 
 
 @cache
-def _slopes_of(lane: Lane) -> tuple[list[tuple[int, str]], Straight, list[str], Straight]:
+def _slopes_of(
+    lane: LaneDynamics,
+) -> tuple[list[tuple[int, str]], NumpyFunction, list[str], NumpyFunction]:
     """Which derivatives there are, and functions of all of them: of rates, and of leaders."""
     states = list(lane.rates)
     names = [f"{s}{ahead}" for ahead in ("", "_1", "_2") for s in states] + ["dx_1", *lane.owned]
@@ -220,7 +222,7 @@ def _slopes_of(lane: Lane) -> tuple[list[tuple[int, str]], Straight, list[str], 
             which.append((p, name))
             nodes.append(node)
     lead = derivatives(lane.leader, list(lane.owned))
-    return which, straight(tuple(nodes)), list(lead), straight(tuple(lead.values()))
+    return which, numpy_function(tuple(nodes)), list(lead), numpy_function(tuple(lead.values()))
 
 
 def slopes(motion: Motion, given: Values, rates: np.ndarray) -> Slopes:

@@ -18,8 +18,8 @@ from nnode.discover.lanes.bent import Bend, Bent, motion_of
 from nnode.discover.lanes.motion import Motion, slopes
 from nnode.discover.lanes.sweep import Sweep
 from nnode.discover.residuals.engine import trained
-from nnode.models.scene import Scene
-from nnode.models.system import System
+from nnode.model.scene import Scene
+from nnode.model.system import System
 
 
 class _Linear(Protocol):

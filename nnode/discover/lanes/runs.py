@@ -13,8 +13,8 @@ from nnode.data.sequence import Batch
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.motion import Leaders, Motion
 from nnode.discover.residuals.engine import runs_of
-from nnode.models.scene import Scene
-from nnode.models.system import System, initial_with
+from nnode.model.scene import Scene
+from nnode.model.system import System, initial_with
 
 
 class Runs(Protocol):

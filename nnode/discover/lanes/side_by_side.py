@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nnode.models.scene import Scene
+from nnode.model.scene import Scene
 
 #: What has times before the simulations.
 _ALONG_TIME = ("measured", "measured_rate")

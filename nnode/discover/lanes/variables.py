@@ -9,8 +9,8 @@ from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
-from nnode.models.effects.traffic import gaps, rate_of
-from nnode.models.term import State
+from nnode.model.effects.traffic import gaps, rate_of
+from nnode.model.term import State
 
 #: Knots of a curve.
 KNOTS = 33

@@ -16,8 +16,8 @@ from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
-from nnode.models.system import System
-from nnode.models.term import State
+from nnode.model.system import System
+from nnode.model.term import State
 
 #: A curve may bend about so many times; several are tried.
 BENDS = (2, 5, 12)

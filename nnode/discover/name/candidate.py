@@ -12,9 +12,9 @@ from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
 from nnode.discover.statistics.score import Score, Screen, minimal_of, traces
 from nnode.errors import SimulationError
-from nnode.models.effects import Effect
-from nnode.models.extend import extended, place_of
-from nnode.models.system import System
+from nnode.model.effects import Effect
+from nnode.model.extend import extended, place_of
+from nnode.model.system import System
 
 #: An interval is moved at most so many times.
 SHIFTS = 3

@@ -20,9 +20,9 @@ from nnode.discover.statistics.paired import compare, heldout, outdone, there
 from nnode.discover.statistics.profile import moved
 from nnode.discover.statistics.score import Score, Screen, traces
 from nnode.errors import SimulationError
-from nnode.models.effects import Effect
-from nnode.models.extend import effects_of, without
-from nnode.models.system import System
+from nnode.model.effects import Effect
+from nnode.model.extend import effects_of, without
+from nnode.model.system import System
 
 log = logging.getLogger(__name__)
 
@@ -237,8 +237,8 @@ def _sure(one: Candidate, screen: Screen, tried: int) -> bool:
 
 def apart_at(one: Candidate, other: Candidate) -> float:
     """The level at which two effects are told apart."""
-    kin = one.score.effect.kin
-    return rules().sure if kin and kin == other.score.effect.kin else rules().level
+    group = one.score.effect.confusable_group
+    return rules().sure if group and group == other.score.effect.confusable_group else rules().level
 
 
 def _hinted(hint: System | None, system: System, name: str) -> System | None:

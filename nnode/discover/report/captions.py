@@ -25,7 +25,7 @@ from nnode.discover.report.figures.marks import (
 from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.discover.report.files import amount, individual, interval
 from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
-from nnode.models import System
+from nnode.model import System
 from nnode.pages.page import FigureBlock
 from nnode.pages.replay import ReplayBlock
 from nnode.pages.tables import markdown

@@ -10,8 +10,8 @@ import torch
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
-from nnode.models import System, Traffic
-from nnode.solvers import TorchdiffeqSolver
+from nnode.model import System, Traffic
+from nnode.simulate import TorchdiffeqSolver
 
 #: Method and longest step, s: their error is to be seen in no picture.
 METHOD = {"traffic": "rk4", "crowd": "midpoint"}

@@ -18,9 +18,9 @@ from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Found
 from nnode.discover.result import Coefficient, Diagnosis, Laws, NamedEffect
 from nnode.files import write_text
-from nnode.models import FeedForward, System, build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import effects_of
+from nnode.model import FeedForward, System, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import effects_of
 from nnode.program import scripts, typed
 
 REPORT = "report.json"

@@ -10,7 +10,7 @@ import pandas as pd
 from nnode.data.quality import KINDS
 from nnode.discover.report.files import amount, estimate, in_unit
 from nnode.discover.result import Alternative, Diagnosis, Laws, NamedEffect
-from nnode.models.term import short_names
+from nnode.model.term import short_names
 from nnode.pages.page import TableBlock
 
 #: Faults that the page lists; its CSV has all.

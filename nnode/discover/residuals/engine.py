@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from nnode.data.sequence import Batch, Sequence
 from nnode.discover.found import Simulation
-from nnode.models.effects import Effect, IndividualEffect, Probe
-from nnode.models.system import System
-from nnode.models.term import State
+from nnode.model.effects import Effect, IndividualEffect, Probe
+from nnode.model.system import System
+from nnode.model.term import State
 
 if TYPE_CHECKING:
     from nnode.discover.residuals.variables import Variable

@@ -13,8 +13,8 @@ from scipy.sparse import csr_array
 from nnode.calibrate.least_squares import box_step
 from nnode.discover.residuals.engine import Engine, fill, names_of, row_of
 from nnode.errors import SimulationError
-from nnode.models.system import System
-from nnode.models.term import Interval
+from nnode.model.system import System
+from nnode.model.term import Interval
 
 if TYPE_CHECKING:
     from nnode.discover.residuals.variables import Curves

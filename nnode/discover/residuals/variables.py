@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.discover.residuals.comparison import Comparison
-from nnode.models.term import Interval, State, Term
+from nnode.model.term import Interval, State, Term
 
 #: Knots over which a wave is reported, and its lengths that they span.
 WAVE_KNOTS, WAVES = 17, 2.0

@@ -11,8 +11,8 @@ from scipy import stats
 
 from nnode.discover.residuals.engine import Engine, fill
 from nnode.discover.residuals.fit import Fit, refine
-from nnode.models.effects import Effect
-from nnode.models.extend import place_of
+from nnode.model.effects import Effect
+from nnode.model.extend import place_of
 
 #: Places on either side of an edge, the nearest at this share of the whole extent.
 PLACES, NEAREST = 16, 5e-4

@@ -21,9 +21,9 @@ from scipy import stats
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, evaluated, grams, sums
 from nnode.discover.statistics.variance_components import LONGEST, Curve, ratio, seen_in, shares
-from nnode.models.effects import IndividualEffect
-from nnode.models.extend import effects_of, extended, without
-from nnode.models.system import System
+from nnode.model.effects import IndividualEffect
+from nnode.model.extend import effects_of, extended, without
+from nnode.model.system import System
 
 #: Rounds in which numbers are linearised again, and the largest change in one.
 SHARPER, LEAP = 3, 0.1

@@ -34,7 +34,7 @@ from nnode.discover.residuals.fit import grams as grams_of
 from nnode.discover.rules import rules
 from nnode.discover.statistics.leverage import blown_up, orthonormal
 from nnode.discover.statistics.standard import joint, standardised, usual_of
-from nnode.models.effects import Effect, Probe
+from nnode.model.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
 FLIPS = 1999
@@ -331,7 +331,7 @@ def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
     """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
     not say what size is usual, and of an interval of the road or the clock."""
     share = 0.0 if effect.consecutive else rules().minimal
-    found = [share * (one.usual or 0.0) for one in effect.strengths.values()]
+    found = [share * (one.min_effect_size or 0.0) for one in effect.strengths.values()]
     return np.array(found or [0.0] * number)[:number]
 
 

@@ -17,12 +17,12 @@ from torch import Tensor
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import Minimum, least_squares, trajectory_residuals
 from nnode.data.sequence import Batch
-from nnode.models.build import build_model
-from nnode.models.crowd import NetworkForce
-from nnode.models.options import CrowdOptions, NetworkForceOptions, SocialForceOptions
-from nnode.models.system import System
+from nnode.model.build import build_model
+from nnode.model.crowd import NetworkForce
+from nnode.model.options import CrowdOptions, NetworkForceOptions, SocialForceOptions
+from nnode.model.system import System
 from nnode.plots.interaction import interaction
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.simulate.fused import FusedSolver
 from nnode.study.crowd.data import cut
 
 #: Social force and networks; those with the person himself in the sum, j = i, as printed.

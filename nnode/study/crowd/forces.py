@@ -9,8 +9,8 @@ import pandas as pd
 import torch
 
 from nnode.data.sequence import Batch
-from nnode.models.system import System
-from nnode.models.term import State
+from nnode.model.system import System
+from nnode.model.term import State
 from nnode.plots.interaction import evaluate_force, interaction
 
 #: Pairs are looked at up to this distance, m, in bins of this width, m.

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from nnode.data.store import Store
-from nnode.models.system import System
+from nnode.model.system import System
 from nnode.study.crowd import printed
 from nnode.study.crowd.data import ALL, mean_speed, sequences, time_groups
 from nnode.study.crowd.fit import NAMES, named, system_of

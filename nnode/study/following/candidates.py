@@ -10,9 +10,9 @@ import numpy as np
 
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.calibrate.gauss_newton.pooling import scattered
-from nnode.models.build import build_model
-from nnode.models.field import FIELD, NEURONS
-from nnode.models.system import System
+from nnode.model.build import build_model
+from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.system import System
 
 #: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.
 DECAY = 1e-3
@@ -43,7 +43,7 @@ def ballistic(law: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A law of :data:`nnode.models.field.FIELD` and what is added to it.
+    """A law of :data:`nnode.model.field.FIELD` and what is added to it.
 
     Attributes:
         law: its name.
@@ -69,7 +69,9 @@ class Candidate:
                 "term": "formula",
                 "name": self.law,
                 "leader": "measured",
-                "law": ballistic(FIELD[self.law] if self.given is None else self.given),
+                "law": ballistic(
+                    CAR_FOLLOWING_LAWS[self.law] if self.given is None else self.given
+                ),
                 "network": NEURONS.get(self.law, self.network),
                 "effects": [{"name": effect} for effect in self.effects],
             },
@@ -90,7 +92,7 @@ def _effects(law: str, *effects: str) -> list[Candidate]:
 EVERY: dict[str, Candidate] = {
     one.name: one
     for one in (
-        *(Candidate(name) for name in FIELD),
+        *(Candidate(name) for name in CAR_FOLLOWING_LAWS),
         *_effects("idm", "memory", "inertia", "reaction_delay"),
         *_effects("helly", "memory", "inertia", "reaction_delay"),
         *_effects("gipps", "memory"),

@@ -12,9 +12,9 @@ from nnode.calibrate.gauss_newton.method import Fit, TangentCost, pooled
 from nnode.calibrate.gauss_newton.pooling import best_alone
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
-from nnode.models.build import build_model
-from nnode.models.field import FIELD
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.build import build_model
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.simulate.fused import FusedSolver
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import EVERY, Candidate, decay, starts
 
@@ -139,7 +139,7 @@ def reproduced(folder: str) -> Result:
     for law, parameters in printed.PARAMETERS.items():
         for k, objective in enumerate(printed.OBJECTIVES):
             values = {name: each[k] for name, each in parameters.items()}
-            described = printed.clipped(FIELD[law], printed.CLIPPED[law], values)
+            described = printed.clipped(CAR_FOLLOWING_LAWS[law], printed.CLIPPED[law], values)
             system = build_model(
                 {"term": "formula", "name": law, "leader": "measured", "law": described}
             )

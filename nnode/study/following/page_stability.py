@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from nnode.models.system import System
+from nnode.model.system import System
 from nnode.pages.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.plots import study_following as plots
 from nnode.study.following import stability

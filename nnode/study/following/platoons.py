@@ -12,9 +12,9 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.calibrate.gauss_newton.pooling import best_alone
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models.build import build_model
-from nnode.models.field import FIELD
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.build import build_model
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.simulate.fused import FusedSolver
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import Candidate, decay, starts
 from nnode.study.following.data import gap_of
@@ -65,7 +65,7 @@ def reproduced(folder: str) -> Result:
     for pair in followers(folder, printed.PLATOON):
         make = pair.agents[0]
         values = printed.PLATOON_PARAMETERS[make]
-        described = printed.clipped(FIELD["ovm"], printed.CLIPPED["ovm"], values)
+        described = printed.clipped(CAR_FOLLOWING_LAWS["ovm"], printed.CLIPPED["ovm"], values)
         system = build_model(
             {"term": "formula", "name": "ovm", "leader": "measured", "law": described}
         )

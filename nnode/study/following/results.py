@@ -12,8 +12,8 @@ import torch
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 from nnode.study.following import data
 from nnode.study.following.candidates import EVERY, REFERENCE, key
 from nnode.study.options import FollowingStudyOptions

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 
 from nnode.data.sequence import Sequence, collate
-from nnode.models.formula import Law
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.formula import Law
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 
 #: Gaps (m) among which equilibria are looked for.
 GAPS = np.linspace(0.2, 250.0, 5000)

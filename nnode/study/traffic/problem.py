@@ -14,10 +14,10 @@ from nnode.calibrate.quasi_newton import Minima, minimise
 from nnode.data.clusters import GAP, clusters
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
-from nnode.models.build import build_model
-from nnode.models.system import System
+from nnode.model.build import build_model
+from nnode.model.system import System
 from nnode.plots.traffic import follow_law
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.simulate.fused import FusedSolver
 
 #: Step of the first search, s; the best of its finds are then followed at the study's own step.
 COARSE = 0.02

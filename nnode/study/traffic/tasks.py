@@ -15,7 +15,7 @@ from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.quasi_newton import minimise, optimality_residual
 from nnode.data.sequence import Batch
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.simulate.fused import FusedSolver
 from nnode.study.statistics import group_weights
 from nnode.study.traffic.problem import COARSE, Problem, groups, named, recording, speeds
 

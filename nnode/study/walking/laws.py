@@ -7,17 +7,17 @@ from typing import Any
 
 import torch
 
-from nnode.models.build import build_model
-from nnode.models.field_crowd import PEOPLE, without_walls
-from nnode.models.system import System
+from nnode.model.build import build_model
+from nnode.model.field_crowd import PEDESTRIAN_LAWS, without_walls
+from nnode.model.system import System
 
-_FORCE = without_walls(PEOPLE["esf"])
+_FORCE = without_walls(PEDESTRIAN_LAWS["esf"])
 _CIRCLE = {"stride": "0 s", "lam": "1"}
 
 #: Name to the law; the first is without any interaction.
 LAWS: dict[str, dict[str, Any]] = {
     "alone": {
-        "parameters": {"tau": PEOPLE["esf"]["parameters"]["tau"]},
+        "parameters": {"tau": PEDESTRIAN_LAWS["esf"]["parameters"]["tau"]},
         "rate": {"vx": "(pace*way_x - vx)/tau", "vy": "(pace*way_y - vy)/tau"},
     },
     "exponential": {
@@ -25,7 +25,7 @@ LAWS: dict[str, dict[str, Any]] = {
         "parameters": {k: v for k, v in _FORCE["parameters"].items() if k not in _CIRCLE},
         "constants": {**_FORCE["constants"], **_CIRCLE},
     },
-    **{name: without_walls(PEOPLE[name]) for name in ("esf", "ttc", "gcfm", "cfsm")},
+    **{name: without_walls(PEDESTRIAN_LAWS[name]) for name in ("esf", "ttc", "gcfm", "cfsm")},
 }
 #: Values of parameters from all combinations of which a calibration chooses its starts: forces that
 #: jump where people just touch leave many valleys.

@@ -15,9 +15,9 @@ from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import Residuals, least_squares
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
-from nnode.models.scene import Scene, wanted
-from nnode.models.system import System
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.scene import Scene, wanted
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 from nnode.study.walking.data import chosen
 from nnode.study.walking.laws import GRID, new_system
 

@@ -13,7 +13,7 @@ from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver
 from nnode.calibrate.options import FusedOptions
 from nnode.errors import ConfigError
-from nnode.solvers import FusedSolver
+from nnode.simulate import FusedSolver
 from tests.app.conftest import CONF, Script, composed
 
 

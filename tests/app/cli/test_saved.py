@@ -17,7 +17,7 @@ from nnode.app.cli.typed import group_defaults
 from nnode.app.export import groups_of_run
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.errors import CheckpointError, ConfigError
-from nnode.models import build_model
+from nnode.model import build_model
 from nnode.program import choices, configuration
 from tests.app.conftest import composed
 

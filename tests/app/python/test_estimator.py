@@ -19,9 +19,9 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, NotFittedError
-from nnode.models import Linear, Traffic
-from nnode.models.field import FIELD
-from nnode.models.field_crowd import PEOPLE
+from nnode.model import Linear, Traffic
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
 from tests.app.conftest import Script
 from tests.app.following import TRUE, pairs, table
 
@@ -293,7 +293,7 @@ def test_one_call_calibrates_with_some_held_out(tidy: pd.DataFrame) -> None:
 def test_models_bear_the_names_of_the_configuration() -> None:
     files = {p.stem for p in (Path(__file__).parents[3] / "conf" / "model").glob("*.yaml")}
     own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
-    assert own | set(FIELD) | set(PEOPLE) == files
+    assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == files
     assert all(named(name)["name"] == name for name in files)
     with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of lin, log"):
         named("lwr")

@@ -11,7 +11,7 @@ import pytest
 import nnode
 from nnode.app import discover as app
 from nnode.app import nearest_law
-from nnode.models.extend import effects_of
+from nnode.model.extend import effects_of
 from tests.app.following import table
 from tests.discover import stand_in
 from tests.discover.platoons import platoons

@@ -12,9 +12,9 @@ import pytest
 from benchmarks.discovery.fresh import kept_back, on_fresh
 from benchmarks.truths import TABLE, Case, generate
 from nnode.app.python.report import Report
-from nnode.models.build import build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import extended
+from nnode.model.build import build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import extended
 
 NUMBER = 12
 

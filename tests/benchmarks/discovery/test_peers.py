@@ -10,7 +10,7 @@ from benchmarks.discovery.task import diagnose_case
 from benchmarks.truths import Case
 from benchmarks.truths.regression import PEERS
 from nnode.discover.statistics.score import Trace
-from nnode.models.effects import CATALOGUE, Probe
+from nnode.model.effects import CATALOGUE, Probe
 
 
 def test_neighbouring_cells_of_a_regression_become_one_interval():

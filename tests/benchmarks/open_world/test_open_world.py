@@ -13,7 +13,7 @@ from benchmarks.open_world.answers import Answer
 from benchmarks.open_world.page import by_law, criteria, scene_criteria, share, write
 from benchmarks.truths.laws.motion import RANGES
 from nnode.app.nearest_law import LAWS
-from nnode.models.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE
 
 
 def row(law: str, first: str, asked: str = "lin", **more: Any) -> dict[str, Any]:

@@ -21,9 +21,9 @@ from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import refine
 from nnode.errors import ConfigError
-from nnode.models import System, build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import effects_of, extended
+from nnode.model import System, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import effects_of, extended
 from tests.discover import walkers
 from tests.discover.platoons import platoons
 

@@ -18,15 +18,15 @@ from nnode.discover.locate.curves import columns_of
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
-from nnode.models import Crowd, Relaxation, SocialForce
-from nnode.models.crowd_formula import CrowdBase
-from nnode.models.effects import CATALOGUE, Effect
-from nnode.models.effects.crowd_motion import Drift
-from nnode.models.effects.crowd_pairs import Alignment, PairRepulsion
-from nnode.models.extend import extended
-from nnode.models.field_crowd import PEOPLE, without_walls
-from nnode.models.own_law import FormulaForce
-from nnode.models.term import State
+from nnode.model import Crowd, Relaxation, SocialForce
+from nnode.model.crowd_formula import CrowdBase
+from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.effects.crowd_motion import Drift
+from nnode.model.effects.crowd_pairs import Alignment, PairRepulsion
+from nnode.model.extend import extended
+from nnode.model.field_crowd import PEDESTRIAN_LAWS, without_walls
+from nnode.model.formula_law import FormulaForce
+from nnode.model.term import State
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
@@ -94,7 +94,7 @@ def test_compiled_paths_are_those_of_the_model(
 def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
     windows = Windows(plain)
     found = []
-    for law in (PEOPLE["esf"], without_walls(PEOPLE["esf"])):
+    for law in (PEDESTRIAN_LAWS["esf"], without_walls(PEDESTRIAN_LAWS["esf"])):
         for kind in (FormulaForce, Coded):
             system = Crowd([kind("esf", **law)], desired="direction").double()
             walk = Walk(windows, windows.scene(system), system)
@@ -293,7 +293,9 @@ def test_a_hidden_effect_scores_best_and_is_measured(
     engine.settle(fit.system, row_of(fit.system))
     fit = refine(engine, fit.system)
     screen = Screen(fit, engine.cluster)
-    effects = [e for e in CATALOGUE.of("crowd") if not e.individual and e.kin != "place"]
+    effects = [
+        e for e in CATALOGUE.of("crowd") if not e.individual and e.confusable_group != "place"
+    ]
     scores = screen.scores([t for e in effects for t in traces(engine, fit, e)])
     assert scores[0].effect.name == name
     system, place = extended(fit.system, scores[0].effect(**scores[0].options))

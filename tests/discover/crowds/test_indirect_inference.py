@@ -15,8 +15,8 @@ from nnode.discover.crowds.indirect_inference import unbiased
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.errors import SimulationError
-from nnode.models import Crowd, Relaxation, SocialForce
-from nnode.models.effects.crowd_motion import PreferredSpeed
+from nnode.model import Crowd, Relaxation, SocialForce
+from nnode.model.effects.crowd_motion import PreferredSpeed
 from tests.discover import walkers
 
 C, SPEED = 0.8, 1.3

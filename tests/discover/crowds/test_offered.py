@@ -7,9 +7,9 @@ import pytest
 from nnode.app.python.inputs import model_options
 from nnode.discover.able import not_offered
 from nnode.discover.compare.laws import with_effects
-from nnode.models import Crowd, Relaxation, build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import effects_of
+from nnode.model import Crowd, Relaxation, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import effects_of
 
 
 @pytest.mark.parametrize(("desired", "why"), [("last", ""), ("direction", "preferred speed")])

@@ -11,8 +11,8 @@ from scipy import stats
 from nnode.discover.judge.measure_next import COMFORTABLE, POWER, advised, distance, tried
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
-from nnode.models import System
-from nnode.models.build import add_effects, build_model
+from nnode.model import System
+from nnode.model.build import add_effects, build_model
 from tests.discover.platoons import LENGTH, V0, platoons
 
 MEAN, PERIOD = 15.0, 8.0

@@ -17,8 +17,8 @@ from nnode.discover.diagnose import diagnose
 from nnode.discover.division import divide
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report.files import sentence
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import effects_of
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import effects_of
 from tests.discover.platoons import platoons, relative_speed
 from tests.discover.test_diagnose import MANY, law
 

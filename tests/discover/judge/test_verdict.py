@@ -17,9 +17,9 @@ from nnode.discover.result import Absence, Coefficient
 from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.score import Evidence, Score
 from nnode.discover.statistics.standard import standardised as scaled
-from nnode.models.effects import CATALOGUE
-from nnode.models.effects.following import ReactionDelay, RelativeSpeed
-from nnode.models.effects.traffic import FreeFlowSpeed
+from nnode.model.effects import CATALOGUE
+from nnode.model.effects.following import ReactionDelay, RelativeSpeed
+from nnode.model.effects.traffic import FreeFlowSpeed
 
 
 def curves(heights: list[float], errors: list[float], removed: float, name: str = "gap") -> Curves:

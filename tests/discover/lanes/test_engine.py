@@ -15,9 +15,9 @@ from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import Fit, refine, sums
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import traces
-from nnode.models import System
-from nnode.models.build import add_effects, build_model
-from nnode.models.effects import CATALOGUE
+from nnode.model import System
+from nnode.model.build import add_effects, build_model
+from nnode.model.effects import CATALOGUE
 from tests.discover.platoons import LENGTH, V0, delayed, platoons, relative_speed
 
 

@@ -18,15 +18,15 @@ from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.variables import Curve
-from nnode.laws.arrays import straight
-from nnode.laws.parse import parse
-from nnode.laws.tensors import computed
-from nnode.models import System
-from nnode.models.build import add_effects, build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.effects.traffic import DriverHeterogeneity
+from nnode.model import System
+from nnode.model.arrays import numpy_function
+from nnode.model.build import add_effects, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.effects.traffic import DriverHeterogeneity
+from nnode.model.parse import parse
+from nnode.model.tensors import computed
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
-from tests.laws.test_tensors import FORMULAS
+from tests.model.test_tensors import FORMULAS
 
 LIN = {"term": "lin", "name": "lin", "v0": V0, "L": LENGTH, "L_min": 1.0}
 LOG = {"term": "log", "name": "log", "v0": 18.0, "L": LENGTH, "L_min": 1.0}
@@ -111,7 +111,7 @@ def rows_of(system: System) -> Tensor:
 def test_a_straight_line_function(text: str) -> None:
     rng, node = np.random.default_rng(3), parse(text)
     values = {name: rng.uniform(0.3, 2.0, 50) for name in "abc"}
-    (found,) = straight((node,))(values, ())
+    (found,) = numpy_function((node,))(values, ())
     tensors = {name: torch.from_numpy(value) for name, value in values.items()}
     same(torch.from_numpy(found), computed([node], tensors)[0], close=1e-14)
 

@@ -16,13 +16,13 @@ from nnode.discover.able import not_offered
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.engine import names_of, row_of
 from nnode.discover.residuals.variables import Curve
-from nnode.models import System, build_model
-from nnode.models.build import add_effects
-from nnode.models.effects import CATALOGUE
-from nnode.models.effects.following import Memory, RelativeSpeed
-from nnode.models.effects.traffic import DriverHeterogeneity, SpeedZone
-from nnode.models.extend import extended
-from nnode.solvers import TorchdiffeqSolver
+from nnode.model import System, build_model
+from nnode.model.build import add_effects
+from nnode.model.effects import CATALOGUE
+from nnode.model.effects.following import Memory, RelativeSpeed
+from nnode.model.effects.traffic import DriverHeterogeneity, SpeedZone
+from nnode.model.extend import extended
+from nnode.simulate import TorchdiffeqSolver
 from tests.discover.platoons import platoons
 
 LAWS = ["idm", "fvdm", "gipps", "krauss", "helly"]

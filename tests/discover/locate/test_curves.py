@@ -14,7 +14,7 @@ from nnode.discover.name.search import search, settled
 from nnode.discover.residuals.engine import row_of, square_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Variable, hats, lengths_of
-from nnode.models.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE
 from tests.discover.lanes.test_engine import model
 from tests.discover.platoons import platoons
 

@@ -11,9 +11,9 @@ from nnode.app.python.inputs import model_options
 from nnode.discover.name import candidate
 from nnode.discover.name.search import _hinted
 from nnode.errors import SimulationError
-from nnode.models import System, build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import effects_of
+from nnode.model import System, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import effects_of
 
 ZONE = {"name": "speed_zone", "alpha": 0.5, "a": 10.0, "b": 90.0}
 LATE = {"name": "reaction_delay", "T": 0.7}

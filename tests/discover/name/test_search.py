@@ -13,9 +13,9 @@ from nnode.discover.name.search import search, settled
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.rules import rules
 from nnode.discover.statistics.score import Score, Screen, Trace
-from nnode.models import build_model
-from nnode.models.effects import CATALOGUE
-from nnode.models.extend import effects_of
+from nnode.model import build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import effects_of
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 
 LIN = {

@@ -16,9 +16,9 @@ from nnode.discover.report.deviation import (
     simulate,
     smooth_velocity,
 )
-from nnode.models import Crowd, Relaxation, Traffic
-from nnode.models.build import add_effects, build_model
-from nnode.models.traffic import Linear
+from nnode.model import Crowd, Relaxation, Traffic
+from nnode.model.build import add_effects, build_model
+from nnode.model.traffic import Linear
 
 
 def platoon(speed: float, leader: float, n: int = 41) -> Sequence:

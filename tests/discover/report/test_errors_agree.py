@@ -23,7 +23,7 @@ from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report.files import amount, plain_report, verdict, write_report
 from nnode.discover.report.page import draw
-from nnode.models import build_model
+from nnode.model import build_model
 from tests.discover import walkers
 from tests.discover.platoons import platoons, relative_speed
 from tests.discover.report.test_page import CONFIG

@@ -36,10 +36,10 @@ from nnode.discover.result import (
     Gap,
     Verdict,
 )
-from nnode.models import build_model
-from nnode.models.build import add_effects
-from nnode.models.effects.traffic import SpeedZone
-from nnode.models.extend import effects_of, extended
+from nnode.model import build_model
+from nnode.model.build import add_effects
+from nnode.model.effects.traffic import SpeedZone
+from nnode.model.extend import effects_of, extended
 from tests.discover.conftest import Case
 
 

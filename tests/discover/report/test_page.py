@@ -20,8 +20,8 @@ from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
 from nnode.discover.report.replay import telling, zones
 from nnode.discover.result import Coefficient, Confirmation, DataFault
-from nnode.models import build_model
-from nnode.models.build import add_effects
+from nnode.model import build_model
+from nnode.model.build import add_effects
 from nnode.pages.page import Heading, Text
 from tests.discover.conftest import Case
 from tests.discover.recorded import ZONE

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 from nnode.discover.residuals.fit import Fit
-from nnode.models import System
+from nnode.model import System
 
 
 def test_intervals_are_those_of_the_jackknife() -> None:

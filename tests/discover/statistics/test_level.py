@@ -14,10 +14,10 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.score import Screen, Trace, traces
-from nnode.models import System
-from nnode.models.effects import Probe
-from nnode.models.effects.following import RelativeSpeed
-from nnode.models.effects.traffic import TimeGap, VehicleClass
+from nnode.model import System
+from nnode.model.effects import Probe
+from nnode.model.effects.following import RelativeSpeed
+from nnode.model.effects.traffic import TimeGap, VehicleClass
 from tests.discover.lanes.test_engine import model
 from tests.discover.platoons import streams
 

@@ -9,7 +9,7 @@ from scipy import stats
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.paired import clusters_to_tell, compare, heldout, outdone
-from nnode.models.system import System
+from nnode.model.system import System
 
 
 def seen(mean: float, spread: float, clusters: int) -> Comparison:

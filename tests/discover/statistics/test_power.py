@@ -11,9 +11,9 @@ from nnode.discover.rules import Rules
 from nnode.discover.statistics.paired import gains, heldout, leaning, there
 from nnode.discover.statistics.power import RUNS, Way
 from nnode.discover.statistics.score import Score, Screen, Trace
-from nnode.models import System
-from nnode.models.effects import Probe
-from nnode.models.effects.following import RelativeSpeed
+from nnode.model import System
+from nnode.model.effects import Probe
+from nnode.model.effects.following import RelativeSpeed
 
 OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, Rules().level
 

@@ -11,7 +11,7 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.profile import Profile, intervals, moved, profiles
-from nnode.models.build import add_effects, build_model
+from nnode.model.build import add_effects, build_model
 from tests.discover.platoons import LENGTH, V0, platoons
 
 #: Sequences start every 100 s of the clock and last 20 s; those from 300 s and 400 s are slow.

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.models.system import System
-from nnode.solvers.ode import TorchdiffeqSolver
+from nnode.model.system import System
+from nnode.simulate.ode import TorchdiffeqSolver
 
 DT = 0.04
 

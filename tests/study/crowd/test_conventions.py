@@ -12,7 +12,7 @@ import pytest
 from nnode.data.options import JuelichOptions, Velocity
 from nnode.data.prepare import prepare
 from nnode.data.sequence import collate
-from nnode.models import NetworkForce
+from nnode.model import NetworkForce
 from nnode.pages.page import TableBlock, Text
 from nnode.study.crowd import conventions
 from nnode.study.crowd.conventions import EVERY, Convention, Tracks, key

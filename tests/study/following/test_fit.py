@@ -10,9 +10,9 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
-from nnode.models.field import FIELD
-from nnode.models.own_law import law_from
-from nnode.solvers.fused.engine import FusedSolver
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.formula_law import law_from
+from nnode.simulate.fused import FusedSolver
 from nnode.study.following import data, fit, inference, leaders, printed
 from nnode.study.following.candidates import EVERY, decay, key, starts
 
@@ -59,8 +59,11 @@ def test_candidates_are_stepped_as_in_the_published_comparisons() -> None:
     assert {steps[name] for name in maps} == {"semi_implicit"}
     assert {steps[name] for name in steps.keys() - maps} == {"ballistic"}
     for law, limits in printed.CLIPPED.items():
-        values = dict.fromkeys(FIELD[law]["parameters"], 1.0)
-        assert law_from(law, printed.clipped(FIELD[law], limits, values)).step == "ballistic"
+        values = dict.fromkeys(CAR_FOLLOWING_LAWS[law]["parameters"], 1.0)
+        assert (
+            law_from(law, printed.clipped(CAR_FOLLOWING_LAWS[law], limits, values)).step
+            == "ballistic"
+        )
 
 
 def test_clusters_stay_in_one_fold() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nnode.models.build import build_model
-from nnode.models.field import FIELD
-from nnode.models.system import System
+from nnode.model.build import build_model
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.system import System
 from nnode.study.following import stability
 from nnode.study.following.candidates import EVERY
 from nnode.study.following.stability import FREQUENCIES, Slopes, passed
@@ -18,7 +18,7 @@ LENGTH = 4.5
 def system(name: str, effects: tuple[str, ...] = (), leader: str = "measured") -> System:
     return build_model(
         {
-            "term": "formula", "name": name, "leader": leader, "law": FIELD[name],
+            "term": "formula", "name": name, "leader": leader, "law": CAR_FOLLOWING_LAWS[name],
             "effects": [{"name": effect} for effect in effects],
         }
     )  # fmt: skip

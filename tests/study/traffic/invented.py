@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from nnode.data.sequence import Sequence
-from nnode.models import build_model
+from nnode.model import build_model
 from nnode.study.traffic.printed import COSTS, RECORDINGS
 from nnode.study.traffic.problem import GAPS, model_options
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nnode.discover.result import NamedEffect, Place, Structure
-from nnode.models.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE
 from nnode.plots.style import GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
 
 COLUMNS = 3

@@ -1,0 +1,109 @@
+"""Derivatives of formulas, on their own nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+from nnode.model.expression import Expr, apply, const, reciprocal, topological
+
+_ONE, _ZERO = const(1), const(0)
+
+
+def slopes(node: Expr) -> list[Expr]:
+    """The derivative of an operation by each of what it is applied to."""
+    a = node.args
+    match node.op:
+        case "add":
+            return [_ONE, _ONE]
+        case "sub":
+            return [_ONE, const(-1)]
+        case "neg":
+            return [const(-1)]
+        case "mul":
+            return [a[1], a[0]]
+        case "recip":
+            return [-(node * node)]
+        case "sqrt":
+            return [0.5 * reciprocal(node)]
+        case "exp":
+            return [node]
+        case "log":
+            return [reciprocal(a[0])]
+        case "tanh":
+            return [1 - node * node]
+        case "sin":
+            return [apply("cos", a[0])]
+        case "cos":
+            return [-apply("sin", a[0])]
+        case "softplus":
+            return [apply("softplus_slope", a[0])]
+        case "logistic" | "softplus_slope":
+            return [node * (1 - node)]
+        case "max" | "min":
+            less = a[1] - a[0] if node.op == "max" else a[0] - a[1]
+            second = apply("choose", less, _ONE, _ZERO)
+            return [1 - second, second]
+        case "choose":
+            return [_ZERO, apply("choose", a[0], _ONE, _ZERO), apply("choose", a[0], _ZERO, _ONE)]
+    raise ValueError(f"there is no derivative of {node.op}")
+
+
+def _weighted(weight: Expr, slope: Expr) -> Expr:
+    """A product that is 0 where a chosen slope is, whatever the weight."""
+    if slope.op == "choose" and slope.args[1].op == slope.args[2].op == "const":
+        condition, b, c = slope.args
+        return apply("choose", condition, weight * b, weight * c)
+    if slope.op == "sub" and slope.args[1].op == "choose" and slope.args[0].is_number(1):
+        condition, b, c = slope.args[1].args
+        return apply("choose", condition, weight * (1 - b), weight * (1 - c))
+    return weight * slope
+
+
+def vjp(seeds: Mapping[Expr, Expr], ends: Callable[[Expr], bool]) -> dict[Expr, Expr]:
+    """Reverse mode: adjoints of the nodes where ``ends`` says so, and of symbols.
+
+    Args:
+        seeds: weights of the outputs.
+        ends: nodes that are not followed further.
+    """
+    bar, found = dict(seeds), {}
+    for node in reversed(topological(seeds)):
+        if node not in bar or node.op == "const":
+            continue
+        if node.op == "symbol" or ends(node):
+            found[node] = bar[node]
+            continue
+        for part, slope in zip(node.args, slopes(node), strict=True):
+            if part.op == "const" or slope.is_number(0):
+                continue
+            share = _weighted(bar[node], slope)
+            bar[part] = bar[part] + share if part in bar else share
+    return found
+
+
+def derivatives(node: Expr, names: list[str]) -> dict[str, Expr]:
+    """Of one formula by symbols; those that it does not contain are left out."""
+    found = vjp({node: _ONE}, lambda part: False)
+    known = {part.value: bar for part, bar in found.items() if not bar.is_number(0)}
+    return {name: known[name] for name in names if name in known}
+
+
+def shift_slopes(outputs: Sequence[Expr], moved: Collection[str]) -> list[Expr]:
+    """Forward mode: derivatives of formulas by an amount that is added to several symbols at once.
+
+    What depends on differences of these symbols alone has the number 0.
+    """
+    found: dict[Expr, Expr] = {}
+    for node in topological(outputs):
+        if node.op == "symbol":
+            found[node] = _ONE if node.value in moved else _ZERO
+        elif all(found[part].is_number(0) for part in node.args):
+            found[node] = _ZERO
+        elif node.op == "call":  # code, whose slope is not known
+            found[node] = node
+        else:
+            total = _ZERO
+            for part, slope in zip(node.args, slopes(node), strict=True):
+                total = total + _weighted(found[part], slope)
+            found[node] = total
+    return [found[node] for node in outputs]

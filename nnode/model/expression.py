@@ -1,0 +1,273 @@
+"""Formulas as graphs of nodes: equal parts are one node, whoever writes them.
+
+A node is a number, a symbol, or an operation on nodes. Nodes are interned: building the same part
+twice gives the same object, so that what a formula names or repeats is computed once.
+
+=================  ==============================  ==============================================
+operation          value                           slope
+=================  ==============================  ==============================================
+add, sub, mul      a + b, a - b, a b
+neg, recip         -a, 1 / a
+sqrt, exp, log     of a
+tanh, sin, cos     of a
+softplus           log(1 + e^a), a beyond 20       softplus_slope, as PyTorch's
+softplus_slope     logistic(a), 1 beyond 20
+logistic           1 / (1 + e^-a)
+max, min           the larger, the smaller, none   that of a where both are equal
+                   where either is no number
+choose             b where a > 0, c elsewhere      none by a
+call               of code by its name; PyTorch's alone
+=================  ==============================  ==============================================
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Container, Iterable, Mapping
+from contextlib import suppress
+from typing import Any
+from weakref import WeakValueDictionary
+
+#: Functions of one argument, by their names in formulas.
+UNARY: dict[str, Callable[[float], float]] = {
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "tanh": math.tanh,
+    "sin": math.sin,
+    "cos": math.cos,
+    "softplus": lambda a: a if a > 20 else math.log1p(math.exp(a)),
+    "softplus_slope": lambda a: 1.0 if a > 20 else 1 / (1 + math.exp(-a)),
+    "logistic": lambda a: 1 / (1 + math.exp(-a)) if a > 0 else math.exp(a) / (1 + math.exp(a)),
+}
+
+
+class Expr:
+    """A node; made by :func:`symbol`, :func:`const`, arithmetic and :func:`apply`.
+
+    Attributes:
+        op: ``const``, ``symbol``, or an operation of the table above.
+        args: what it is applied to.
+        value: the number, or the symbol's or the code's name.
+        key: a digest of the whole formula below, the same in every process.
+    """
+
+    __slots__ = ("__weakref__", "args", "key", "op", "value")
+    op: str
+    args: tuple[Expr, ...]
+    value: Any
+    key: bytes
+
+    def __add__(self, other: Expr | float) -> Expr:
+        a, b = self, as_expr(other)
+        if a.is_number(0):
+            return b
+        if b.is_number(0):
+            return a
+        if b.op == "neg":
+            return a - b.args[0]
+        if a.op == "neg":
+            return b - a.args[0]
+        return _folded("add", lambda p, q: p + q, a, b)
+
+    def __sub__(self, other: Expr | float) -> Expr:
+        a, b = self, as_expr(other)
+        if b.is_number(0):
+            return a
+        if a.is_number(0):
+            return -b
+        if a is b:
+            return const(0)
+        if b.op == "neg":
+            return a + b.args[0]
+        if a.op == "add" and b in a.args:
+            return a.args[1 - a.args.index(b)]
+        return _folded("sub", lambda p, q: p - q, a, b)
+
+    def __mul__(self, other: Expr | float) -> Expr:
+        a, b = self, as_expr(other)
+        for u, v in ((a, b), (b, a)):
+            if u.is_number(0):
+                return u
+            if u.is_number(1):
+                return v
+            if u.is_number(-1):
+                return -v
+            if u.op == "neg":
+                return -(u.args[0] * v)
+        return _folded("mul", lambda p, q: p * q, a, b)
+
+    def __neg__(self) -> Expr:
+        if self.op == "neg":
+            return self.args[0]
+        return _folded("neg", lambda p: -p, self)
+
+    def __truediv__(self, other: Expr | float) -> Expr:
+        return self * reciprocal(as_expr(other))
+
+    def __pow__(self, exponent: Expr | float) -> Expr:
+        return power(self, as_expr(exponent))
+
+    def __radd__(self, other: float) -> Expr:
+        return as_expr(other) + self
+
+    def __rsub__(self, other: float) -> Expr:
+        return as_expr(other) - self
+
+    def __rmul__(self, other: float) -> Expr:
+        return as_expr(other) * self
+
+    def __rtruediv__(self, other: float) -> Expr:
+        return as_expr(other) / self
+
+    def is_number(self, value: float | None = None) -> bool:
+        """Whether this is a number, or that number."""
+        return self.op == "const" and (value is None or self.value == value)
+
+    def __reduce__(self) -> Any:
+        return _made, (self.op, self.args, self.value)
+
+
+_NODES: WeakValueDictionary[bytes, Expr] = WeakValueDictionary()
+
+
+def _made(op: str, args: tuple[Expr, ...], value: Any = None) -> Expr:
+    text = f"{op}|{value!r}|".encode() + b"".join(a.key for a in args)
+    key = hashlib.blake2b(text, digest_size=16).digest()
+    known = _NODES.get(key)
+    if known is not None:
+        return known
+    node = object.__new__(Expr)
+    node.op, node.args, node.value, node.key = op, args, value, key
+    _NODES[key] = node
+    return node
+
+
+def _folded(op: str, number: Callable[..., float], *args: Expr) -> Expr:
+    if all(a.op == "const" for a in args):
+        with suppress(ValueError, OverflowError, ZeroDivisionError):
+            value = number(*(a.value for a in args))
+            if math.isfinite(value) or not all(math.isfinite(a.value) for a in args):
+                return const(value)
+        # An overflow of finite numbers stays an operation, and says so when it is computed.
+    return _made(op, args)
+
+
+def const(value: float) -> Expr:
+    """A number."""
+    return _made("const", (), float(value) + 0.0)  # no negative zero
+
+
+def symbol(name: str) -> Expr:
+    """A quantity by its name."""
+    return _made("symbol", (), name)
+
+
+def as_expr(value: Expr | float) -> Expr:
+    return value if isinstance(value, Expr) else const(value)
+
+
+def reciprocal(a: Expr) -> Expr:
+    if a.op == "recip":
+        return a.args[0]
+    if a.op == "neg":
+        return -reciprocal(a.args[0])
+    return _folded("recip", lambda p: 1 / p, a)
+
+
+def power(base: Expr, exponent: Expr) -> Expr:
+    """Whole and half exponents by multiplication and roots, others by exp and log."""
+    if exponent.op == "const" and (2 * exponent.value).is_integer() and abs(exponent.value) <= 64:
+        n = exponent.value
+        if n < 0:
+            return reciprocal(power(base, const(-n)))
+        if n.is_integer():
+            return _whole_power(base, int(n))
+        return _whole_power(apply("sqrt", base), int(2 * n))
+    return apply("exp", exponent * apply("log", base))
+
+
+def _whole_power(base: Expr, n: int) -> Expr:
+    if n == 0:
+        return const(1)
+    half = _whole_power(base, n // 2)
+    square = half * half
+    return square * base if n % 2 else square
+
+
+def apply(name: str, *args: Expr) -> Expr:
+    """A function of the table by its name."""
+    if name in UNARY:
+        return _folded(name, UNARY[name], *args)
+    if name == "max":
+        return _folded(name, lambda p, q: q if q > p or q != q else p, *args)
+    if name == "min":
+        return _folded(name, lambda p, q: q if q < p or q != q else p, *args)
+    if name == "choose":
+        a, b, c = args
+        if a.op == "const":
+            return b if a.value > 0 else c
+        return b if b is c else _made("choose", args)
+    raise ValueError(f"there is no function {name}")
+
+
+def call(name: str, *args: Expr) -> Expr:
+    """Code that is no formula, by a name under which it is given when it is computed."""
+    return _made("call", args, name)
+
+
+def topological(outputs: Iterable[Expr], known: Container[Expr] = ()) -> list[Expr]:
+    """All nodes of formulas, each after what it is made of; in the same order every time.
+
+    Args:
+        known: nodes that are left out, with what only they are made of.
+    """
+    found: dict[Expr, None] = {}
+    stack = [(node, False) for node in reversed(list(outputs))]
+    while stack:
+        node, done = stack.pop()
+        if node in found or node in known:
+            continue
+        if done:
+            found[node] = None
+        else:
+            stack.append((node, True))
+            stack += [(a, False) for a in reversed(node.args) if a not in found]
+    return list(found)
+
+
+def symbols(outputs: Iterable[Expr]) -> list[str]:
+    """Names of the quantities in formulas."""
+    return [node.value for node in topological(outputs) if node.op == "symbol"]
+
+
+def rebuild(node: Expr, args: tuple[Expr, ...]) -> Expr:
+    """The same operation on other nodes."""
+    if not node.args or args == node.args:
+        return node
+    binary: dict[str, Callable[[Expr, Expr], Expr]] = {
+        "add": lambda a, b: a + b,
+        "sub": lambda a, b: a - b,
+        "mul": lambda a, b: a * b,
+    }
+    if node.op in binary:
+        return binary[node.op](*args)
+    if node.op == "neg":
+        return -args[0]
+    if node.op == "call":
+        return call(node.value, *args)
+    if node.op == "recip":
+        return reciprocal(args[0])
+    return apply(node.op, *args)
+
+
+def substitute(node: Expr, values: Mapping[str, Expr]) -> Expr:
+    """A formula with other ones in place of symbols, all at once."""
+    done: dict[Expr, Expr] = {}
+    for part in topological([node]):
+        if part.op == "symbol":
+            done[part] = values.get(part.value, part)
+        else:
+            done[part] = rebuild(part, tuple(done[a] for a in part.args))
+    return done[node]

@@ -1,0 +1,91 @@
+"""The feed-forward network of Definition 2 of Göttlich & Totzeck."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nnode.errors import ConfigError
+from nnode.model.expression import Expr, apply, symbol
+
+#: Most neurons of a layer. The paper's networks have 10; formulas write every neuron out.
+NEURONS = 1000
+
+
+class FeedForward(nn.Module):
+    """Feed-forward network with softplus hidden layers and identity output.
+
+    Input and hidden layers carry a bias unit, the output layer none: each layer of weights
+    therefore has a bias. Softplus is log(1 + exp(x)). All weights start independent and
+    uniform on [-1, 1], in float64.
+
+    Args:
+        sizes: neurons per layer without bias units, input first, e.g. ``(4, 4, 2)``.
+        generator: source of the initial weights; None draws from torch's global one.
+
+    Shapes:
+        ``(..., sizes[0])`` to ``(..., sizes[-1])``; ``sum((n_l + 1) * n_{l+1})`` weights.
+
+    Source:
+        Göttlich & Totzeck, Definition 2 and section 5.4 (initial weights).
+    """
+
+    def __init__(self, sizes: tuple[int, ...], generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        if len(sizes) < 2 or min(sizes) < 1:
+            raise ValueError(f"a network needs at least two layers of one neuron, got {sizes}")
+        if max(sizes) > NEURONS:
+            raise ConfigError(
+                f"a network with {max(sizes)} neurons in a layer is too large, expected at most "
+                f"{NEURONS}"
+            )
+        self.sizes = tuple(sizes)
+        self.layers = nn.ModuleList(
+            nn.Linear(n_in, n_out, dtype=torch.float64) for n_in, n_out in pairwise(sizes)
+        )
+        self.reset_parameters(generator)
+
+    @torch.no_grad()
+    def reset_parameters(self, generator: torch.Generator | None = None) -> None:
+        """Draw all weights anew, uniform on [-1, 1]."""
+        for weight in self.parameters():
+            # drawn in float64 so that a seed means the same start in every precision
+            draw = torch.rand(weight.shape, generator=generator, dtype=torch.float64)
+            weight.copy_(2 * draw - 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.layers[:-1]:
+            x = nn.functional.softplus(layer(x))
+        out: Tensor = self.layers[-1](x)
+        return out
+
+    def written(
+        self, inputs: Sequence[Expr], label: str, path: str
+    ) -> tuple[list[Expr], dict[str, Any]]:
+        """Its outputs as formulas, neuron by neuron.
+
+        Args:
+            label: what the symbols of its weights begin with.
+            path: of the network in the model's named parameters.
+
+        Returns:
+            the outputs; the weights' symbols to name, place in it, and number of its axes.
+        """
+        owned: dict[str, Any] = {}
+        values = list(inputs)
+        for i, (n_in, n_out) in enumerate(pairwise(self.sizes)):
+            last, found = i == len(self.layers) - 1, []
+            for u in range(n_out):
+                total = symbol(f"{label}_b{i}_{u}")
+                owned[f"{label}_b{i}_{u}"] = (f"{path}layers.{i}.bias", u, 1)
+                for k in range(n_in):
+                    weight = f"{label}_w{i}_{u}_{k}"
+                    owned[weight] = (f"{path}layers.{i}.weight", u * n_in + k, 2)
+                    total = total + symbol(weight) * values[k]
+                found.append(total if last else apply("softplus", total))
+            values = found
+        return values, owned

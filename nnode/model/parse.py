@@ -1,0 +1,185 @@
+"""Formulas from text: arithmetic on names and numbers, and nothing else.
+
+The text is data: it is read by Python's own grammar, but only what is listed here is taken, and
+nothing of it is ever run. ``law(gap=...)`` stands for the law itself with other quantities in
+place of its own; there may be several such names.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable, Mapping
+
+from nnode.errors import ConfigError
+from nnode.model.expression import UNARY, Expr, apply, const, substitute, symbol, topological
+
+#: Limits of a text's characters, of nested parts, and of exponents.
+LENGTH, DEPTH, EXPONENT = 2000, 60, 64
+#: Limit of the operations of a formula with all the parts that it names. The largest law of the
+#: package has 400. A part that is named with other quantities, as part(dx=...), is built anew, so
+#: that 30 short parts can ask for 10^9 operations. 10,000 are built in half a second; compiling
+#: 1,200 takes more than three minutes.
+OPERATIONS = 10_000
+#: Names of functions and their numbers of arguments.
+FUNCTIONS = {
+    **{name: 1 for name in UNARY if name != "softplus_slope"},
+    "max": 2,
+    "min": 2,
+    "choose": 3,
+    "abs": 1,
+    "clip": 3,
+}
+_BINARY: dict[type, Callable[[Expr, Expr], Expr]] = {
+    ast.Add: lambda a, b: a + b,
+    ast.Sub: lambda a, b: a - b,
+    ast.Mult: lambda a, b: a * b,
+    ast.Div: lambda a, b: a / b,
+    ast.Pow: lambda a, b: a**b,
+}
+#: What a name that is called stands for.
+Part = Expr | Callable[..., Expr]
+_LISTED = "expected + - * / **, brackets, numbers, names, and the functions " + ", ".join(FUNCTIONS)
+
+
+class FormulaError(ConfigError):
+    """A text that is no formula; the message shows the place."""
+
+    def __init__(self, text: str, column: int, problem: str) -> None:
+        shown, column = _around(text, column)
+        super().__init__(f"formula: {problem}\n  {shown}\n  {' ' * column}^")
+        self.problem = problem
+
+
+def _around(text: str, column: int) -> tuple[str, int]:
+    """The part of a text around a column, and the column in it."""
+    first = max(0, column - 50)
+    return text[first : column + 30].replace("\n", " "), column - first
+
+
+def parse(
+    text: str, names: Mapping[str, Expr] | None = None, laws: Mapping[str, Part] | None = None
+) -> Expr:
+    """A formula.
+
+    Args:
+        text: such as ``v0*(1 - L/gap)``.
+        names: what names stand for; None takes every name as a quantity of its own.
+        laws: name to the formula that ``name(...)`` stands for, with other quantities in it; or
+            to what makes a formula of the arguments, as of a network.
+
+    Raises:
+        FormulaError: anything that is no formula, with its place.
+    """
+    if not isinstance(text, str):
+        raise FormulaError(str(text), 0, f"expected text, got {type(text).__name__}")
+    if len(text) > LENGTH:
+        raise FormulaError(text, 0, f"it has {len(text)} characters, at most {LENGTH} are read")
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        at = max(int(getattr(error, "offset", 1) or 1) - 1, 0)
+        raise FormulaError(text.strip(), at, f"this cannot be read; {_LISTED}") from error
+    reader = _Reader(text.strip(), names, laws or {})
+    found = reader.read(tree.body, 0)
+    reader.count(tree.body, found)
+    return found
+
+
+class _Reader:
+    def __init__(
+        self, text: str, names: Mapping[str, Expr] | None, laws: Mapping[str, Part]
+    ) -> None:
+        self.text, self.names, self.laws = text, names, laws
+        self.built = 0
+
+    def count(self, node: ast.AST, *parts: Expr) -> None:
+        """Add the operations of what is built, and refuse more than there may be."""
+        self.built += len(topological(parts))
+        if self.built > OPERATIONS:
+            raise self.fail(
+                node, f"it has more than {OPERATIONS} operations with the parts that it names"
+            )
+
+    def fail(self, node: ast.AST, problem: str) -> FormulaError:
+        return FormulaError(self.text, getattr(node, "col_offset", 0), problem)
+
+    def read(self, node: ast.AST, depth: int) -> Expr:
+        if depth > DEPTH:
+            raise self.fail(node, f"it is nested more than {DEPTH} deep; name parts under where")
+        match node:
+            case ast.BinOp() if type(node.op) in _BINARY:
+                a, b = self.read(node.left, depth + 1), self.read(node.right, depth + 1)
+                if isinstance(node.op, ast.Pow) and b.op == "const" and abs(b.value) > EXPONENT:
+                    raise self.fail(node.right, f"an exponent is at most {EXPONENT}")
+                negative = isinstance(node.op, ast.Pow) and b.op == "const" and b.value < 0
+                if (isinstance(node.op, ast.Div) and b.is_number(0)) or (
+                    negative and a.is_number(0)
+                ):
+                    raise self.fail(node.right, "this divides by 0")
+                return _BINARY[type(node.op)](a, b)
+            case ast.UnaryOp(op=ast.USub()):
+                return -self.read(node.operand, depth + 1)
+            case ast.UnaryOp(op=ast.UAdd()):
+                return self.read(node.operand, depth + 1)
+            case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
+                return self.number(node, value)
+            case ast.Name():
+                return self.name(node)
+            case ast.Call(func=ast.Name(id=name)):
+                return self.call(node, name, depth)
+        raise self.fail(node, f"this is not allowed in a formula; {_LISTED}")
+
+    def number(self, node: ast.AST, value: float) -> Expr:
+        try:
+            found = float(value)
+        except OverflowError:
+            found = math.inf
+        if not math.isfinite(found):
+            raise self.fail(node, "this number is too large")
+        return const(found)
+
+    def name(self, node: ast.Name) -> Expr:
+        if self.names is None:
+            return symbol(node.id)
+        if node.id not in self.names:
+            known = ", ".join(sorted(self.names))
+            raise self.fail(node, f"{node.id} is unknown; there are {known}")
+        return self.names[node.id]
+
+    def call(self, node: ast.Call, name: str, depth: int) -> Expr:
+        if name in self.laws:
+            part = self.laws[name]
+            if isinstance(part, Expr):
+                return self.of_law(node, name, part, depth)
+            if node.keywords or not node.args:
+                raise self.fail(node, f"{name} takes its inputs one after the other")
+            made = part(*(self.read(a, depth + 1) for a in node.args))
+            self.count(node, made)
+            return made
+        if name not in FUNCTIONS:
+            raise self.fail(node, f"there is no function {name}; {_LISTED}")
+        if node.keywords or len(node.args) != FUNCTIONS[name]:
+            raise self.fail(node, f"{name} takes {FUNCTIONS[name]} argument(s)")
+        args = [self.read(a, depth + 1) for a in node.args]
+        if name == "abs":
+            return apply("max", args[0], -args[0])
+        if name == "clip":
+            return apply("min", apply("max", args[0], args[1]), args[2])
+        return apply(name, *args)
+
+    def of_law(self, node: ast.Call, name: str, law: Expr, depth: int) -> Expr:
+        values: dict[str, Expr] = {}
+        if node.args or any(keyword.arg is None for keyword in node.keywords):
+            raise self.fail(node, f"{name} takes what it replaces by name, as {name}(gap=gap_1)")
+        for keyword in node.keywords:
+            assert keyword.arg is not None
+            if self.names is not None and keyword.arg not in self.names:
+                raise self.fail(node, f"the law has no {keyword.arg} that could be replaced")
+            target = self.names.get(keyword.arg) if self.names is not None else None
+            if target is not None and target.op != "symbol":
+                raise self.fail(node, f"{keyword.arg} is made of others and cannot be replaced")
+            place = keyword.arg if target is None else target.value
+            values[place] = self.read(keyword.value, depth + 1)
+        self.count(node, law)
+        return substitute(law, values)

@@ -1,0 +1,331 @@
+"""A model: a sum of terms, of first order (traffic) or of second order (crowds)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import TypeVar, cast
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from nnode.data.sequence import Batch
+from nnode.errors import DataError
+from nnode.model.crowd_dynamics import CrowdDynamics, CrowdRule
+from nnode.model.crowd_formula import crowd_of
+from nnode.model.formula import Law, begins, lane_of, rates_of, starts_of
+from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.scene import DESIRED, Scene, wanted
+from nnode.model.term import Interval, State, Term, physical_parameters, short_names
+
+T = TypeVar("T", bound=Term)
+
+
+class System(nn.Module):
+    """The right-hand side of an ordinary differential equation as a sum of terms.
+
+    A solver sees ``dy/dt = system(t, y, scene)`` with ``y`` of shape ``(B, N, order * D + M)``:
+    positions, in second-order models velocities, and the M additional states that terms own.
+    Terms are summed in their order: each can look at the sum before it.
+
+    Attributes:
+        domain: ``traffic`` or ``crowd``.
+        order: 1, y = x; or 2, y = (x, v).
+        dim: D, the number of space dimensions.
+        terms: the summands.
+        wall_spacing: walls become points this far apart, m.
+    """
+
+    domain: str
+    order: int
+    dim: int
+
+    def __init__(self, terms: Iterable[Term], wall_spacing: float = 0.25) -> None:
+        super().__init__()
+        if not wall_spacing > 0:
+            raise ValueError(f"wall_spacing={wall_spacing} must be a positive number of metres")
+        self.terms = nn.ModuleList(terms)
+        self.wall_spacing = wall_spacing
+
+    @property
+    def step(self) -> str:
+        """The method of stepping where none is asked for: the law's own, or ballistic for
+        accelerations of vehicles and otherwise Euler's; see :mod:`nnode.model.steps`."""
+        return "euler"
+
+    @property
+    def names_places(self) -> bool:
+        """Whether rates depend on where the origin of positions lies, as with a speed zone; also
+        where this is not known, since a term is code."""
+        return True
+
+    def scene(self, batch: Batch) -> Scene:
+        """The fixed surroundings of a batch.
+
+        Raises:
+            DataError: the batch is of another domain.
+        """
+        if batch.x.shape[-1] != self.dim:
+            raise DataError(
+                f"a {self.domain} model needs {self.dim}-dimensional positions, the data have "
+                f"{batch.x.shape[-1]}; choose a model and data of the same domain"
+            )
+        return Scene.of(batch, self.wall_spacing)
+
+    def initial(self, batch: Batch, step: float | None = None) -> Tensor:
+        """``(B, N, order * D)``: the measured state at the first sample.
+
+        Args:
+            step: s, of the solver, for laws whose formula names it.
+        """
+        start = [batch.x[0], batch.v[0]][: self.order]
+        return torch.cat([*start, *self._memories(batch, step)], -1)
+
+    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
+        """``(B, N, M)`` additional states at the start, term by term."""
+        x, v = batch.x[0], batch.v[0]
+        return [term.remember(x, v, self) for term in self._terms() if term.memory]
+
+    def acceleration(self, state: State) -> Tensor:
+        """``(B, N, D)``: the sum of all terms, m/s (first order) or m/s² (second order)."""
+        return self._rates(state, None)[0]
+
+    def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
+        """Positions and, in second-order models, velocities of the states at the samples."""
+        if self.order == 1:
+            return y[..., : self.dim], None
+        return y[..., : self.dim], y[..., self.dim : 2 * self.dim]
+
+    def given(self, batch: Batch) -> Tensor | None:
+        """``(B, N)`` True for agents that follow their measured paths; None: there is none."""
+        return None
+
+    def _terms(self) -> list[Term]:
+        return cast(list[Term], list(self.terms))
+
+    def _rates(self, state: State, memory: Tensor | None) -> tuple[Tensor, list[Tensor]]:
+        """The sum of the terms, and the rates of their additional states ``(B, N, M)``."""
+        total, rates, first = torch.zeros_like(state.x), [], 0
+        for term in self._terms():
+            own = None
+            if term.memory:
+                assert memory is not None
+                own = memory[..., first : first + term.memory]
+                first += term.memory
+            now = replace(state, system=self, rate=total, memory=own)
+            total = self._imposed(total + term(now), state)
+            if term.memory:
+                rates.append(term.memory_rate(now))
+        return total, rates
+
+    def _imposed(self, rate: Tensor, state: State) -> Tensor:
+        """The rates, where some agents' are known from elsewhere."""
+        return rate
+
+    def find(self, kind: type[T]) -> T | None:
+        """The first term of a kind, or None."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
+
+    def extra_repr(self) -> str:
+        """The parameters that have a physical meaning, for those who print a model."""
+        values = self.physical()
+        short = short_names(values)
+        return ", ".join(f"{short[name]}={float(x):.5g} {u}" for name, (x, u) in values.items())
+
+    def physical(self) -> dict[str, tuple[Tensor, str]]:
+        """Address, as ``lin.v0``, to (value, unit) of the parameters with a physical meaning."""
+        return physical_parameters(self)
+
+    def bounds(self) -> dict[str, Interval]:
+        """Admissible values by the names of ``named_parameters()``; others are free."""
+        return {
+            f"terms.{i}.{name}": interval
+            for i, term in enumerate(self._terms())
+            for name, interval in term.bounds.items()
+        }
+
+    def project_(self) -> None:
+        """Move every parameter into its admissible set."""
+        for term in self._terms():
+            term.project_()
+
+
+class Traffic(System):
+    """One lane: dx_i/dt is the sum of the terms, or dv_i/dt where the law says an acceleration.
+
+    Args:
+        leader: ``constant``: the leader drives at its law's v0; ``measured``: it follows its
+            recorded trajectory, and v0 acts only where the followers' law contains it.
+    """
+
+    domain = "traffic"
+    order = 1
+    dim = 1
+
+    def __init__(self, terms: Iterable[Term], leader: str = "constant") -> None:
+        super().__init__(terms)
+        if leader not in ("constant", "measured"):
+            raise ValueError(f"leader={leader} is unknown, expected constant or measured")
+        self.leader = leader
+        first = self.terms[0] if len(self.terms) else None
+        self.order = first.order if isinstance(first, Law) else 1
+
+    @property
+    def step(self) -> str:
+        law = self.terms[0] if len(self.terms) else None
+        own = law.step if isinstance(law, Law) else None
+        if own == "rk4" and self.lane is not None and "dt" in self.lane.symbols:
+            own = None  # an effect that remembers step by step has no stages in between
+        return own or ("ballistic" if self.order > 1 else "euler")
+
+    @property
+    def lane(self) -> LaneDynamics | None:
+        """The model's formula; None where a term is code without one."""
+        return lane_of(self._terms())
+
+    @property
+    def names_places(self) -> bool:
+        lane = self.lane
+        return lane is None or lane.names_places
+
+    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
+        lane, terms = self.lane, self._terms()
+        if lane is None:  # what is code and remembers nothing does not matter at the start
+            terms = [term for i, term in enumerate(terms) if not i or term.memory]
+            lane = lane_of(terms)
+        if lane is None or not lane.starts:
+            return super()._memories(batch, step)
+        x, v, scene = batch.x[0], batch.v[0], self.scene(batch)
+        scene = scene if step is None else replace(scene, step=step)
+        known = starts_of(terms, lane, x, v, scene)
+        told = [t.remember(x, v, self) for t in terms if t.memory and not begins(t, self.order)]
+        others = iter(torch.cat(told, -1).unbind(-1) if told else ())
+        added = list(lane.rates)[self.order :]
+        return [torch.stack([known[s] if s in known else next(others) for s in added], -1)]
+
+    def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
+        place = scene.measured_at(t) if self.leader == "measured" else None
+        return self.rates_behind(t, y, scene, place)
+
+    def rates_behind(self, t: Tensor, y: Tensor, scene: Scene, place: Tensor | None) -> Tensor:
+        """The right-hand side where the leader's ``place`` (m) is given, if it is measured."""
+        lead = scene.leader[..., None]
+        if place is not None:
+            measured = [place, scene.measured_rate_at(t)][: self.order]
+            y = torch.cat(
+                [
+                    torch.where(lead, torch.cat(measured, -1), y[..., : self.order]),
+                    y[..., self.order :],
+                ],
+                -1,
+            )
+        # a law that is a class of its own is what it computes anyway
+        alone = len(self.terms) == 1 and "rule" not in vars(self.terms[0])
+        lane = None if alone else self.lane
+        if lane is not None:
+            rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
+            return rate if place is None else rate.masked_fill(lead, 0.0)
+        x, memory = y[..., :1], y[..., 1:]
+        rate, own = self._rates(State(t, x, None, scene), memory)
+        if place is not None:
+            # the leader's state is never read: its place is known at every time
+            rate = rate.masked_fill(lead, 0.0)
+        return torch.cat([rate, *own], -1) if own else rate
+
+    def _imposed(self, rate: Tensor, state: State) -> Tensor:
+        # of no account for laws of the gap, but effects look at the speed of the vehicle ahead
+        if self.leader == "constant" or len(self.terms) == 1:
+            return rate
+        speed = state.scene.measured_rate_at(state.t)
+        return torch.where(state.scene.leader[..., None], speed, rate)
+
+    def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
+        x, v = y[..., :1], y[..., 1:2] if self.order > 1 else None
+        given = self.given(batch)
+        if given is None:
+            return x, v
+        lead = given[..., None]
+        return torch.where(lead, batch.x, x), None if v is None else torch.where(lead, batch.v, v)
+
+    def given(self, batch: Batch) -> Tensor | None:
+        if self.leader == "constant":
+            return None
+        index = torch.arange(batch.agent.shape[1], device=batch.agent.device)
+        return index == (batch.agent.sum(1) - 1)[:, None]
+
+
+class Crowd(System):
+    """Two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms; or dx_i/dt, of a law of
+    first order.
+
+    Args:
+        desired: where people want to go, see :func:`nnode.model.scene.desired`.
+        neighbours: ``simulated``: people react to each other's simulated states;
+            ``measured``: each is simulated alone among the measured paths of the others.
+    """
+
+    domain = "crowd"
+    order = 2
+    dim = 2
+
+    def __init__(
+        self,
+        terms: Iterable[Term],
+        wall_spacing: float = 0.25,
+        neighbours: str = "simulated",
+        desired: str = "last",
+    ) -> None:
+        super().__init__(terms, wall_spacing)
+        if desired not in DESIRED:
+            raise ValueError(f"desired={desired} is unknown, expected {', '.join(DESIRED)}")
+        self.desired = desired
+        if any(isinstance(rule := term.rule, CrowdRule) and rule.order == 1 for term in terms):
+            self.order = 1
+        if neighbours not in ("simulated", "measured"):
+            raise ValueError(f"neighbours={neighbours} is unknown, expected simulated or measured")
+        self.neighbours = neighbours
+
+    @property
+    def formula(self) -> CrowdDynamics | None:
+        """The model's formula; None where a term is code without one."""
+        return crowd_of(self._terms())
+
+    @property
+    def names_places(self) -> bool:
+        law = self.formula
+        return law is None or law.names_places
+
+    def scene(self, batch: Batch) -> Scene:
+        return wanted(super().scene(batch), batch, self.desired)
+
+    def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
+        if self.order == 1:
+            seen = (scene.measured_at(t),) * 2 if self.neighbours == "measured" else None
+            return self._rates(State(t, y, None, scene, seen=seen), None)[0]
+        x, v, memory = y[..., :2], y[..., 2:4], y[..., 4:]
+        seen = None
+        if self.neighbours == "measured":
+            seen = scene.measured_at(t), scene.measured_rate_at(t)
+        rate, own = self._rates(State(t, x, v, scene, seen=seen), memory)
+        return torch.cat([v, rate, *own], -1)
+
+
+class _Initial(nn.Module):
+    """The start of a model as a module, so that its parameters can be replaced."""
+
+    def __init__(self, system: System) -> None:
+        super().__init__()
+        self.system = system
+
+    def forward(self, batch: Batch, step: float | None) -> Tensor:
+        return self.system.initial(batch, step)
+
+
+def initial_with(
+    system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
+) -> Tensor:
+    """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
+    own = {f"system.{name}": value for name, value in parameters.items()}
+    found: Tensor = functional_call(_Initial(system), own, (batch, step))
+    return found

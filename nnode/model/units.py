@@ -1,0 +1,200 @@
+"""Whether the parts of a formula have units that go together.
+
+Dimensions are exponents of metre, second and kilogram; ``*`` is any unit, as weights of a network
+have.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+from nnode.errors import ConfigError
+from nnode.model.expression import Expr, topological
+from nnode.model.text import plain
+
+Dimension = tuple[Fraction, Fraction, Fraction]
+NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
+_BASE = ("[length]", "[time]", "[mass]")
+_NAMES = ("m", "s", "kg")
+
+# Pint computes the text of a quantity: a tower of powers such as 9**9**9 would never end. Only
+# names of units may be raised, once each, to one digit: the package's laws need m⁴ at most.
+#: Characters of a quantity or unit; the longest of the package's laws has 11.
+LONGEST = 100
+_DIGIT = r"[+-]?\d(?:\.\d{1,3})?"
+_POWER = rf"(?:\s*(?:\*\*|\^)\s*(?:{_DIGIT}|\(\s*{_DIGIT}\s*\))|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹])(?![\w.]|\s*\()"
+_TOKEN = re.compile(
+    rf"[A-Za-zµμΩΩÅ%°][A-Za-z0-9_µμ]*(?:{_POWER})?"  # a unit
+    r"|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])"  # a number
+    r"|\*(?!\s*\*)|[/·()\s]"
+)
+#: Words by which Pint raises as well.
+_POWER_WORDS = re.compile(r"squared|cubed|square|cubic|sq\b")
+_EXPECTED_UNIT = (
+    "expected one such as m/s² or kg/(m s), of names of units, *, / and powers of one digit"
+)
+#: Powers of units in the parts of a formula; beyond them they are no quantities of mechanics.
+_HIGHEST_POWER = 1000
+
+
+def _readable(text: str) -> bool:
+    """Whether Pint may compute a text: its size is bounded, and so is every power in it."""
+    if len(text) > LONGEST or _POWER_WORDS.search(text):
+        return False
+    place = len(text) - len(text.lstrip().removeprefix("-"))
+    while place < len(text):
+        token = _TOKEN.match(text, place)
+        if token is None:
+            return False
+        place = token.end()
+    return True
+
+
+@cache
+def _registry() -> Any:
+    import pint  # takes a third of a second: only who checks units waits for it
+
+    return pint.UnitRegistry()
+
+
+@cache
+def dimension(unit: str) -> Dimension | None:
+    """Of a unit such as ``m/s²``; None for ``*``.
+
+    Raises:
+        ConfigError: it is no unit of length, time and mass.
+    """
+    if unit == "*":
+        return None
+    if not _readable(unit):
+        raise ConfigError(f"{unit[:LONGEST]!r} is no unit; {_EXPECTED_UNIT}")
+    try:
+        found = _registry().Unit("dimensionless" if unit == "1" else unit).dimensionality
+    except Exception as error:
+        raise ConfigError(f"{unit!r} is no unit; {_EXPECTED_UNIT}") from error
+    if set(found) - set(_BASE):
+        raise ConfigError(f"the unit {unit} is not made of metre, second and kilogram")
+    return _powers(found)
+
+
+@cache
+def in_si(value: str) -> tuple[float, str]:
+    """A quantity such as ``120 km/h`` in SI units, and its unit's name as written in them.
+
+    Raises:
+        ConfigError: it is no number with a unit.
+    """
+    wrong = (
+        f"{value[:LONGEST]!r} is no quantity; expected a finite number and a unit, such as 30 m/s "
+        "or 1.2 m/s², with powers of one digit"
+    )
+    if not _readable(value):
+        raise ConfigError(wrong)
+    try:
+        found = _registry().Quantity(value)
+        size, unit = float(found.to_base_units().magnitude), _powers(found.dimensionality)
+    except Exception as error:
+        raise ConfigError(wrong) from error
+    if not math.isfinite(size):
+        raise ConfigError(wrong)
+    return size, shown(unit)
+
+
+def _powers(found: Mapping[str, Any]) -> Dimension:
+    """Of metre, second and kilogram."""
+    length, time, mass = (Fraction(found.get(b, 0)).limit_denominator(8) for b in _BASE)
+    return length, time, mass
+
+
+def shown(found: Dimension) -> str:
+    """A dimension as a unit, such as m/s²."""
+    order = sorted(zip(_NAMES, found, strict=True), key=lambda one: one[0] != "kg")
+    over = [_raised(name, power) for name, power in order if power > 0]
+    under = [_raised(name, -power) for name, power in order if power < 0]
+    top = " ".join(over) or "1"
+    if not under:
+        return top
+    return f"{top}/{under[0]}" if len(under) == 1 else f"{top}/({' '.join(under)})"
+
+
+def _raised(name: str, power: Fraction) -> str:
+    whole = {1: "", 2: "²", 3: "³"}
+    return name + (whole[int(power)] if power in whole else f"^{float(power):g}")
+
+
+def unit_of(node: Expr, units: Mapping[str, str]) -> Dimension | None:
+    """Of a formula, from the units of its symbols; None: any.
+
+    Raises:
+        ConfigError: parts whose units do not go together, with both of them.
+    """
+    found: dict[Expr, Dimension | None] = {}
+    for part in topological([node]):
+        found[part] = _one(part, [found[a] for a in part.args], units)
+    return found[node]
+
+
+def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
+    """That a formula has a unit.
+
+    Raises:
+        ConfigError: it has not, or its parts do not go together.
+    """
+    found, expected = unit_of(node, units), dimension(wanted)
+    if found is not None and expected is not None and found != expected and not node.is_number(0):
+        raise ConfigError(f"{name} = {plain(node)} has the unit {shown(found)}, expected {wanted}")
+
+
+def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Dimension | None:
+    match part.op:
+        case "const":
+            return NONE
+        case "symbol":
+            return dimension(units[part.value])
+        case "call":
+            return None
+        case "add" | "sub" | "max" | "min" | "choose":
+            pairs = list(zip(part.args, of, strict=True))[part.op == "choose" :]
+            return _same(part, pairs)
+        case "mul":
+            if None in of:
+                return None
+            a, b = of
+            assert a is not None
+            assert b is not None
+            total = (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+            if max(map(abs, total)) > _HIGHEST_POWER:
+                raise ConfigError(
+                    f"{plain(part)} has a unit to a power above {_HIGHEST_POWER}; divide by a "
+                    "scale of the same unit first"
+                )
+            return total
+        case "neg":
+            return of[0]
+        case "recip" | "sqrt":
+            factor = Fraction(-1) if part.op == "recip" else Fraction(1, 2)
+            own = of[0]
+            return own and (factor * own[0], factor * own[1], factor * own[2])
+    if of[0] not in (None, NONE):
+        argument = plain(part.args[0])
+        raise ConfigError(
+            f"{plain(part)}: the argument {argument} of {part.op} has the unit {shown(of[0])}, "
+            "expected a number without one; divide by a scale of the same unit"
+        )
+    return NONE
+
+
+def _same(part: Expr, pairs: list[tuple[Expr, Dimension | None]]) -> Dimension | None:
+    known = [(a, own) for a, own in pairs if own is not None and not a.is_number(0)]
+    for a, own in known[1:]:
+        if own != known[0][1]:
+            raise ConfigError(
+                f"{plain(part)} puts together {plain(known[0][0])}, which has the unit "
+                f"{shown(known[0][1])}, and {plain(a)}, which has the unit {shown(own)}"
+            )
+    return known[0][1] if known else (None if any(o is None for _, o in pairs) else NONE)

@@ -1,0 +1,326 @@
+"""Effects on accelerations against formulas written out, and refusals of laws and effects."""
+
+from __future__ import annotations
+
+from math import exp, sqrt
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError
+from nnode.model import build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.simulate import TorchdiffeqSolver
+from tests.model.following import DT, accelerations, behind, model, numbers
+
+LONG, TRUCK = 4.0, 10.0
+GAPS, SPEEDS = [20.0, 31.0, 27.0], [14.0, 11.0, 13.0, 12.0]
+SECOND = [e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None]
+LIN = {"term": "lin", "name": "lin", "leader": "measured", "v0": 30.0, "L": 6.0, "L_min": 1.0}
+
+
+def platoon() -> Batch:
+    """Four vehicles, the second from behind a truck; at 50 s of the clock."""
+    time, v = 50 + DT * np.arange(3), np.array(SPEEDS)
+    x = np.cumsum([0.0, *GAPS]) + v * DT * np.arange(3)[:, None]
+    return collate([
+        Sequence(
+            name="r/0", recording="r", time=time, x=x[..., None],
+            v=np.broadcast_to(v, x.shape)[..., None].copy(),
+            length=np.where(np.arange(4) == 1, TRUCK, LONG),
+            kind=tuple("truck" if i == 1 else "car" for i in range(4)),
+        )
+    ])  # fmt: skip
+
+
+def idm(
+    i: int, p: Any, *, gap: float | None = None, dv: float | None = None, **other: float
+) -> float:
+    """Acceleration of vehicle i (Treiber, Hennecke & Helbing 2000), with other numbers in it."""
+    q = SimpleNamespace(**{**vars(p), **other})
+    net = (GAPS[i] if gap is None else gap) - (TRUCK if i == 0 else LONG)
+    v, closing = SPEEDS[i], SPEEDS[i] - SPEEDS[i + 1] if dv is None else dv
+    wish = q.s0 + max(0.0, v * q.T + v * closing / (2 * sqrt(q.a * q.b)))
+    return q.a * (1 - (v / q.v0) ** 4 - (wish / net) ** 2)
+
+
+P = numbers(model("idm"))
+BARE = [idm(i, P) for i in range(3)]
+DV = -np.diff(SPEEDS)
+
+
+@pytest.mark.parametrize(
+    ("effect", "expected"),
+    [
+        # places 0, 20 and 51 m; edges of a zone are 12 m wide
+        (
+            {"name": "speed_zone", "alpha": 0.6, "a": 10.0, "b": 35.0},
+            [BARE[0], idm(1, P, v0=0.6 * P.v0), BARE[2]],
+        ),
+        (
+            {"name": "speed_zone", "alpha": 0.6, "a": 20.0, "b": 90.0},  # half inside
+            [BARE[0], idm(1, P, v0=0.8 * P.v0), idm(2, P, v0=0.6 * P.v0)],
+        ),
+        (
+            {"name": "slope", "grade": 0.04, "a": 10.0, "b": 35.0},
+            [BARE[0], BARE[1] - 9.81 * 0.04, BARE[2]],
+        ),
+        (
+            {"name": "speed_period", "alpha": 0.7, "a": 40.0, "b": 60.0},
+            [idm(i, P, v0=0.7 * P.v0) for i in range(3)],
+        ),
+        ({"name": "speed_period", "alpha": 0.7, "a": 60.0, "b": 90.0}, BARE),
+        (
+            {"name": "vehicle_class", "kind": "truck", "phi": 1.4},
+            [BARE[0], idm(1, P, T=1.4 * P.T), BARE[2]],
+        ),
+        (
+            {"name": "driver_heterogeneity", "people": {"r/0": [0.1, 0.0, -0.2, 0.0]}},
+            [idm(0, P, T=1.1 * P.T), BARE[1], idm(2, P, T=0.8 * P.T)],
+        ),
+        # the truck is 4.5 m longer than the mean of all, the cars 1.5 m shorter
+        (
+            {"name": "leader_length", "beta": 0.5},
+            [idm(0, P, gap=20 - 2.25), idm(1, P, gap=31 + 0.75), idm(2, P, gap=27 + 0.75)],
+        ),
+        (
+            {"name": "multi_anticipation", "c": 0.3},
+            [
+                BARE[0] + 0.3 * (idm(0, P, gap=51 / 2, dv=14 - 13.0) - BARE[0]),
+                BARE[1] + 0.3 * (idm(1, P, gap=58 / 2, dv=11 - 12.0) - BARE[1]),
+                BARE[2],
+            ],
+        ),
+        ({"name": "relative_speed", "kappa": 0.4}, np.array(BARE) - 0.4 * DV),
+        (
+            {"name": "asymmetric_response", "kappa_open": 0.3, "kappa_close": 0.8},
+            np.array(BARE) - np.where(DV < 0, 0.3, 0.8) * DV,
+        ),
+    ],
+    ids=lambda value: value["name"] if isinstance(value, dict) else "",
+)  # fmt: skip
+def test_accelerations_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
+    system, batch = model("idm", effect), platoon()
+    assert system.lane is not None
+    found = accelerations(system, batch)[0, :3]
+    np.testing.assert_allclose(found, np.array(expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_neutral_strengths_change_nothing(name: str) -> None:
+    effect = CATALOGUE.effects[name]
+    neutral = {k: s.at(0) for k, s in effect.strengths.items() if s.at(0) == s.neutral}
+    system = model("idm", {"name": name, **neutral})
+    found = accelerations(system, platoon())[0, :3]
+    # what remembers begins with what the law says; memory with the driver's own time gap
+    own = [idm(i, P, T=_seen(i)) for i in range(3)] if name == "memory" else BARE
+    np.testing.assert_allclose(found, own if name != "inertia" else BARE, rtol=1e-12)
+
+
+def _seen(i: int) -> float:
+    """The time gap that a driver is seen to have in the first state."""
+    net = GAPS[i] - (TRUCK if i == 0 else LONG)
+    return float(np.clip((net - P.s0) / max(SPEEDS[i], 2.0), 0.1, 5.0))
+
+
+@pytest.mark.parametrize("share", [0.4, 1.0, -0.2])
+def test_a_lasting_time_gap_is_a_share_of_what_was_seen_and_stays(share: float) -> None:
+    system = model("idm", {"name": "lasting_time_gap", "share": share})
+    own = [idm(i, P, T=P.T + share * (_seen(i) - P.T)) for i in range(3)]
+    np.testing.assert_allclose(accelerations(system, platoon())[0, :3], own, rtol=1e-12)
+    batch = path(6.0)
+    start = [(gap - LONG - P.s0) / float(batch.v[0, 0, 0, 0]) for gap in (26.0, 30.0)]
+    found = simulated(system, batch)
+    # a memory that never fades, from the same share
+    kept = [P.T + share * (one - P.T) for one in start]
+    wanted = _remembered(batch, kept, np.inf, DT)
+    np.testing.assert_allclose(found.x[-1, 0, :2, 0], wanted, rtol=1e-12)
+
+
+def simulated(system: Any, batch: Batch, step: float = DT) -> Any:
+    """In ballistic steps, which are easily written out by hand."""
+    with torch.no_grad():
+        return TorchdiffeqSolver("ballistic", "discrete", step)(system, batch)
+
+
+def path(seconds: float) -> Batch:
+    return behind(lambda t: 14 * t + 5 * (1 - np.cos(0.8 * t)) * (t > 0), [30.0, 26.0], seconds)
+
+
+@pytest.mark.parametrize("T", [0.0, 0.04, 0.3, 0.37, 1.5])
+def test_a_pure_delay_is_a_list_of_what_was(T: float) -> None:
+    """A plain loop with a ring buffer: the law's acceleration some whole steps ago, and linear
+    between two of them."""
+    batch, steps = path(6.0), 15
+    found = simulated(model("idm", {"name": "pure_delay", "T": T}), batch)
+    x, v = batch.x[:, 0, :, 0].numpy().copy(), batch.v[:, 0, :, 0].numpy().copy()
+    past: list[np.ndarray] = []
+    for k in range(len(x) - 1):
+        gap, dv = np.diff(x[k]) - LONG, -np.diff(v[k])
+        wish = P.s0 + np.maximum(v[k, :2] * P.T + v[k, :2] * dv / (2 * sqrt(P.a * P.b)), 0)
+        now = P.a * (1 - (v[k, :2] / P.v0) ** 4 - (wish / gap) ** 2)
+        past = [now] * (steps + 1) if k == 0 else [now, *past[:steps]]
+        whole = min(int(T / DT + 1e-9), steps - 1)
+        part = T / DT - whole
+        a = (1 - part) * past[whole] + part * past[whole + 1]
+        x[k + 1, :2] = x[k, :2] + DT * v[k, :2] + DT**2 / 2 * a
+        v[k + 1, :2] = v[k, :2] + DT * a
+    np.testing.assert_allclose(found.x[:, 0, :, 0], x, rtol=1e-12)
+    np.testing.assert_allclose(found.v[:, 0, :, 0], v, rtol=1e-12)
+
+
+def test_memory_relaxes_exponentially() -> None:
+    """q(t) = T + (q(0) - T) exp(-t/tau_m), in Euler's steps (1 - h/tau_m)^k."""
+    batch, tau = path(6.0), 2.5
+    system = model("idm", {"name": "memory", "tau_m": tau})
+    start = [(gap - LONG - P.s0) / float(batch.v[0, 0, 0, 0]) for gap in (26.0, 30.0)]
+    y = system.initial(batch)
+    np.testing.assert_allclose(y[0, :2, 2].detach(), start, rtol=1e-9)
+    gaps = []
+    for step in (DT, DT / 2):
+        found = simulated(system, batch, step)
+        k = round(6.0 / step)
+        left = (np.array(start) - P.T) * (1 - step / tau) ** k
+        gaps.append(np.abs(left - (np.array(start) - P.T) * exp(-6.0 / tau)).max())
+        # the same by hand: a time gap of every driver's own, step by step
+        wanted = _remembered(batch, start, tau, step)
+        np.testing.assert_allclose(found.x[-1, 0, :2, 0], wanted, rtol=1e-12)
+    assert gaps[1] < 0.55 * gaps[0]
+
+
+def _remembered(batch: Batch, start: list[float], tau: float, step: float) -> np.ndarray:
+    per = round(batch.dt / step)
+    place, speed = batch.x[:, 0, 2, 0].numpy(), batch.v[:, 0, 2, 0].numpy()
+    x, v, q = batch.x[0, 0, :2, 0].numpy(), batch.v[0, 0, :2, 0].numpy(), np.array(start)
+    for s in range(per * (len(place) - 1)):
+        at = s / per
+        ahead, u = (np.interp(at, np.arange(len(place)), z) for z in (place, speed))
+        gap, dv = np.diff([*x, ahead]) - LONG, -np.diff([*v, u])
+        wish = P.s0 + np.maximum(v * q + v * dv / (2 * sqrt(P.a * P.b)), 0)
+        a = P.a * (1 - (v / P.v0) ** 4 - (wish / gap) ** 2)
+        x, v, q = x + step * v + step**2 / 2 * a, v + step * a, q + step * (P.T - q) / tau
+    return x
+
+
+def test_inertia_passes_on_accelerations_late() -> None:
+    """tau du/dt = a - u: the acceleration comes e-fold closer in each tau."""
+    push = {
+        "parameters": {"c": "1.5 m/s²"},
+        "rate": {"v": "c*choose(clip(t/dt - 10.5, 0, 1), 1, 0)"},
+    }
+    system = model(push, {"name": "inertia", "tau_v": 0.5})
+    found = simulated(system, behind(lambda t: 10 * t, [60.0], 3.0))
+    a = np.diff(found.v[:, 0, 0, 0].numpy()) / DT
+    k = np.maximum(np.arange(30) - 11, 0)
+    np.testing.assert_allclose(a, 1.5 * (1 - (1 - DT / 0.5) ** k), atol=1e-12)
+
+
+def test_maps_from_step_to_step_take_effects_that_remember() -> None:
+    """What is remembered begins with what the law says of the solver's step: the first step is
+    the law's own."""
+    half = DT / 2
+    batch = behind(lambda t: 14 * t, [14.0, 13.0], 0.5, LONG, half)
+    bare = simulated(model("krauss"), batch, half)
+    assert (bare.v[1, 0, :2] - 14).max() < -1
+    delayed = simulated(model("krauss", {"name": "pure_delay", "T": 0.0}), batch, half)
+    torch.testing.assert_close(delayed.x, bare.x, rtol=1e-13, atol=1e-12)
+    for effect in ({"name": "pure_delay", "T": 0.2}, {"name": "inertia", "tau_v": 0.4}):
+        late = simulated(model("krauss", effect), batch, half)
+        torch.testing.assert_close(late.v[1], bare.v[1], rtol=1e-13, atol=0)
+        assert (late.v[2] - bare.v[2]).abs().max() > 0.01
+
+
+def test_nobody_drives_faster_than_the_zone_allows() -> None:
+    """In a zone IDM's desired speed is alpha v0: free cars come down to it, and up again behind."""
+    zone = {"name": "speed_zone", "alpha": 0.5, "a": 100.0, "b": 700.0}
+    # a leader far ahead that is faster than everybody
+    batch = behind(lambda t: 3000 + 33 * t, [3000.0], 80.0)
+    found = simulated(model("idm", zone), batch)
+    x, v = found.x[:, 0, 0, 0].numpy(), found.v[:, 0, 0, 0].numpy()
+    inside = (x > 500) & (x < 690)
+    assert inside.sum() > 50
+    np.testing.assert_allclose(v[inside], 15.0, rtol=0.02)
+    assert v[-1] > 20
+
+
+@pytest.mark.parametrize(
+    "name", sorted({e.name for e in CATALOGUE.of("traffic", every=True)} - set(SECOND))
+)
+def test_what_changes_speeds_is_refused_where_a_law_says_accelerations(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{name} changes a speed.*for those there are .*memory"):
+        model("idm", {"name": name})
+
+
+@pytest.mark.parametrize("name", ["memory", "pure_delay"])
+def test_what_changes_accelerations_is_refused_where_a_law_says_speeds(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{name} changes an acceleration.*model=idm"):
+        build_model({**LIN, "effects": [{"name": name}]})
+
+
+@pytest.mark.parametrize(
+    ("law", "effect", "lacks"),
+    [
+        ("helly", {"name": "speed_zone", "alpha": 0.5}, "v0"),
+        ("ovm", {"name": "vehicle_class", "phi": 0.8}, "T"),
+        ("ovm", {"name": "driver_heterogeneity"}, "T"),
+        ("fvdm", {"name": "memory"}, "T"),
+        ("a4", {"name": "speed_period", "alpha": 0.5}, "v0"),
+        ("newell", {"name": "memory"}, "s0"),
+    ],
+)
+def test_effects_need_what_they_change_in_the_law(
+    law: str, effect: dict[str, Any], lacks: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"{effect['name']} cannot act: .*{lacks}\b"):
+        model(law, effect)
+
+
+PUSH = {"parameters": {"c": "1 m/s²", "T": "1 s"}, "rate": {"v": "c*late/v"}}
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"delayed": {"late": ["v_1", "m", "T"]}}, "late = v_1 has the unit m/s, expected m"),
+        ({"delayed": {"late": ["v_1", "m/s", "c"]}}, r"the delay of late .*m/s².*expected s"),
+        ({"delayed": {"late": ["v_1", "m/s"]}}, r"must be \[formula, unit, delay\]"),
+        ({"delayed": {"late": "v_1"}}, r"model\.law\.delayed\.late=v_1 must be"),
+        ({"delayed": {"late": ["open('x')", "m/s", "T"]}}, "there is no function open"),
+        ({"delayed": {"late": ["v_1.real", "m/s", "T"]}}, "not allowed"),
+        ({"delayed": {"late": ["v_1", "m/s", "__import__('os')"]}}, "no function __import__"),
+        ({"delayed": {"late": ["v_1", "os.system('x')", "T"]}}, "no unit"),
+        ({"states": {"late": ["m/s", "v_1/T", "gap"]}}, "late of mine at the start"),
+        ({"states": {"late": ["m/s", "v_1", "v"]}}, "dlate/dt of mine .*expected m/s/s"),
+        ({"states": {"late": ["m/s", "v_1/T"]}}, r"must be \[unit, rate, start\]"),
+        ({"states": {"late": ["m/s", "(lambda: v)()", "v"]}}, "not allowed"),
+        ({"constants": {"late": "fast"}}, "no quantity"),
+        ({"constants": {"late": "3 m"}}, r"expected m/s\^2"),
+        ({"parameters": {"late": "3 m/s"}}, "c is unknown"),
+    ],
+)
+def test_what_is_wrong_with_delays_states_and_constants_is_said(
+    change: dict[str, Any], problem: str
+) -> None:
+    law = {**PUSH, "remembered": 3 if "delayed" in change else 0, **change}
+    with pytest.raises(ConfigError, match=problem):
+        model(law)
+
+
+def test_networks_in_formulas_need_their_size() -> None:
+    law = {"parameters": {"c": "1 m/s²"}, "rate": {"v": "c*NN(gap/20)"}}
+    with pytest.raises(ConfigError, match=r"calls NN, a network: .*model\.network=4"):
+        model(law)
+    assert model(law, network=3).terms[0].network.sizes == (1, 3, 1)
+    twice = {**law, "rate": {"v": "c*NN(gap/20) - c*NN(v/10, dv/2)"}}
+    with pytest.raises(ConfigError, match=r"NN is called with \[1, 2\] inputs"):
+        model(twice, network=3)
+
+
+def test_a_law_with_an_unknown_entry_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"unknown entries delay; there are .*delayed"):
+        model({**CAR_FOLLOWING_LAWS["idm"], "delay": {}})

@@ -1,0 +1,207 @@
+"""Effects in a lane against closed forms."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call, vmap
+
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError
+from nnode.model import System, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.extend import extended, without
+from nnode.simulate import TorchdiffeqSolver
+
+NAMES = [effect.name for effect in CATALOGUE.of("traffic")]
+V0, LENGTH = 30.0, 6.0
+
+
+def batch(vehicles: int = 4, more: int = 0) -> Batch:
+    """A platoon with gaps 20, 30, 40 ... m, its leader at 12 m/s; kinds and lengths known."""
+    x = np.cumsum([0.0, *(20.0 + 10 * i for i in range(vehicles - 1))])
+    time = 0.2 * np.arange(11)
+    place = x + 12 * time[:, None]
+    kind = tuple("truck" if i == 1 else "car" for i in range(vehicles))
+    length = np.where(np.arange(vehicles) == 1, 10.0, 4.0)
+    items = [
+        Sequence(name="r/0", recording="r", time=time + 50, x=place[..., None], kind=kind,
+                 length=length)
+    ]  # fmt: skip
+    if more:
+        wide = np.arange(vehicles + more) * 25.0 + 12 * time[:, None]
+        items.append(Sequence(name="r/1", recording="r", time=time, x=wide[..., None]))
+    return collate(items)
+
+
+def model(*effects: dict[str, Any]) -> System:
+    options = {"leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0}
+    return build_model({"term": "lin", "name": "lin", **options, "effects": list(effects)})
+
+
+def rates(system: System, data: Batch, t: float = 0.0) -> np.ndarray:
+    """Speeds of the followers of the first sequence."""
+    y = system.initial(data)
+    found = system(torch.tensor(t).double(), y, system.scene(data))
+    followers = int(data.agent[0].sum()) - 1
+    return found[0, :followers, 0].detach().numpy()
+
+
+def law(gap: float) -> float:
+    return V0 * (1 - LENGTH / gap)
+
+
+W = np.array([law(20), law(30), law(40)])
+
+
+@pytest.mark.parametrize(
+    ("effect", "expected"),
+    [
+        ({"name": "speed_zone", "alpha": 0.5, "a": 10.0, "b": 35.0}, W * [1, 0.5, 1]),
+        ({"name": "speed_period", "alpha": 0.5, "a": 0.0, "b": 60.0}, W * 0.5),
+        ({"name": "speed_period", "alpha": 0.5, "a": 60.0, "b": 90.0}, W),
+        ({"name": "vehicle_class", "kind": "truck", "phi": 0.8}, W * [1, 0.8, 1]),
+        ({"name": "vehicle_class", "kind": "bus", "phi": 0.8}, W),
+        ({"name": "free_flow_speed", "v_max": 22.0}, np.minimum(W, 22.0)),
+        ({"name": "multi_anticipation", "c": 0.3}, [*(W[:2] + 0.3 * np.diff(W)), W[2]]),
+        (
+            {"name": "driver_heterogeneity", "people": {"r/0": [0.1, 0.0, -0.1, 0.0]}},
+            W * [1.1, 1, 0.9],
+        ),
+        # the leader drives at 12 m/s, and each sees the one ahead of him
+        (
+            {"name": "relative_speed", "kappa": 0.5},
+            [
+                (W[0] + (W[1] + (W[2] + 12) / 2) / 2) / 2,
+                (W[1] + (W[2] + 12) / 2) / 2,
+                (W[2] + 12) / 2,
+            ],
+        ),
+        (
+            {"name": "leader_length", "beta": 1.0},
+            [law(20 - 4.5), law(30 + 1.5), law(40 + 1.5)],
+        ),
+    ],
+)  # fmt: skip
+def test_rates_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
+    assert rates(model(effect), batch()) == pytest.approx(np.array(expected), rel=1e-9)
+
+
+def test_response_is_asymmetric() -> None:
+    effect = {"name": "asymmetric_response", "kappa_open": 0.6, "kappa_close": 0.1}
+    found = rates(model(effect), batch())
+    assert found[2] == pytest.approx(W[2] + 0.1 * (12 - W[2]))  # closing in on the leader
+    ahead = found[2]
+    factor = 0.6 if ahead > W[1] else 0.1
+    assert found[1] == pytest.approx(W[1] + factor * (ahead - W[1]))
+
+
+def test_time_gap_lengthens_with_the_speed_ahead() -> None:
+    found = rates(model({"name": "time_gap", "h": 0.2}), batch())
+    last = V0 * (1 - (LENGTH + 0.2 * 12) / 40)
+    assert found[2] == pytest.approx(last)
+    assert found[1] == pytest.approx(V0 * (1 - (LENGTH + 0.2 * last) / 30))
+
+
+def ramp(opening: float) -> Batch:
+    """One car behind a leader that draws away steadily, over 8 s."""
+    time = 0.05 * np.arange(161)
+    own = 10.0 * time
+    lead = 40 + (10 + opening) * time
+    x = np.stack([own, lead], 1)[..., None]
+    return collate([Sequence(name="r/0", recording="r", time=time, x=x)])
+
+
+def test_a_delayed_driver_sees_the_gap_of_before() -> None:
+    """With both paths given the delayed gap of a steady ramp is exact after the start."""
+    system = model({"name": "reaction_delay", "T": 0.8})
+    data = ramp(2.0)
+    scene, term = system.scene(data), system.terms[1]
+    z = term.remember(data.x[0], torch.tensor([[[10.0], [12.0]]]).double(), system).detach()
+    from nnode.model.term import State
+
+    h = 0.005
+    for i in range(1400):
+        t = torch.tensor(i * h).double()
+        state = State(t, scene.measured_at(t), None, scene, system, None, z)
+        z = z + h * term.memory_rate(state).detach()
+    gap = 40 + 2.0 * 7.0
+    seen = gap - float(z[0, 0, 1])
+    assert seen == pytest.approx(gap - 2.0 * 0.8, abs=0.02)
+
+
+def test_inertia_approaches_the_law_exponentially() -> None:
+    system = model({"name": "inertia", "tau_v": 0.5})
+    data = batch()
+    y = system.initial(data)
+    y[..., 1] = 0.0  # at rest
+    found = system(torch.tensor(0.0).double(), y, system.scene(data)).detach()
+    assert found[0, :3, 0].tolist() == [0.0, 0.0, 0.0]
+    assert found[0, :3, 1].numpy() == pytest.approx(W / 0.5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_padding_does_not_matter_and_all_is_finite(name: str) -> None:
+    system = model({"name": name})
+    alone, padded = rates(system, batch()), rates(system, batch(more=3))
+    # the mean length of vehicles is that of the batch
+    if name != "leader_length":
+        assert padded == pytest.approx(alone)
+    y = system.initial(batch(more=3))
+    found = system(torch.tensor(0.3).double(), y, system.scene(batch(more=3)))
+    assert torch.isfinite(found).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_effects_run_side_by_side_and_have_gradients(name: str) -> None:
+    system, data = model({"name": name}), batch()
+    own = {n: p.detach() for n, p in system.named_parameters()}
+    rows = {n: torch.stack([p, p * 1.01]) for n, p in own.items()}
+    y, scene, t = system.initial(data).detach(), system.scene(data), torch.tensor(0.1).double()
+    both = vmap(lambda p: functional_call(system, p, (t, y, scene)))(rows)
+    for i in range(2):
+        single = functional_call(system, {n: p[i] for n, p in rows.items()}, (t, y, scene))
+        assert torch.allclose(both[i], single, rtol=1e-12)
+    trained = tuple(p for p in system.parameters() if p.requires_grad)
+    x = TorchdiffeqSolver(gradient="discrete", dt=0.05)(system, data).x
+    gradient = torch.autograd.grad(x[-1, 0, :3].sum(), trained, allow_unused=True)
+    assert all(g is None or torch.isfinite(g).all() for g in gradient)
+
+
+def test_a_driven_leader_is_measured() -> None:
+    options = {"leader": "constant", "v0": V0, "L": LENGTH, "L_min": 1.0}
+    effect = {"name": "leader_speed", "weight": 0.25}
+    system = build_model({"term": "lin", "name": "lin", **options, "effects": [effect]})
+    data = batch()
+    found = system(torch.tensor(0.0).double(), system.initial(data), system.scene(data))
+    assert float(found[0, 3, 0]) == pytest.approx(0.75 * V0 + 0.25 * 12)
+
+
+def test_effects_stand_in_the_order_of_their_ranks_and_can_be_removed() -> None:
+    system = model({"name": "inertia"}, {"name": "speed_zone"})
+    assert [t.name for t in system.terms] == ["lin", "speed_zone", "inertia"]
+    more, place = extended(system, CATALOGUE.effects["relative_speed"](kappa=0.1))
+    assert place == 2
+    assert [t.name for t in more.terms] == ["lin", "speed_zone", "relative_speed", "inertia"]
+    assert [t.name for t in without(more, "inertia").terms] == [
+        "lin", "speed_zone", "relative_speed",
+    ]  # fmt: skip
+    assert copy.deepcopy(more).terms[1].options() == system.terms[1].options()
+
+
+@pytest.mark.parametrize(
+    ("effect", "words"),
+    [
+        ({"name": "relativ_speed"}, "did you mean relative_speed"),
+        ({"name": "drift"}, "there is no traffic effect drift"),
+        ({"name": "inertia", "tau": 0.5}, "no parameter tau"),
+        ({"kappa": 0.3}, "expected a name"),
+    ],
+)
+def test_errors_say_what_is_expected(effect: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        model(effect)

@@ -1,0 +1,106 @@
+"""Platoons and models of second order that tests of laws, effects and steps share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Many
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.model import Traffic, build_model
+from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+
+DT = 0.1
+
+
+def model(law: str | dict[str, Any], *effects: dict[str, Any], **options: Any) -> Traffic:
+    """A law of the field by its name, or another one, behind a measured leader."""
+    name = law if isinstance(law, str) else "mine"
+    more = {"network": NEURONS[name]} if name in NEURONS else {}
+    found = build_model(
+        {"term": "formula", "name": name, "leader": "measured", "effects": list(effects),
+         "law": CAR_FOLLOWING_LAWS[name] if isinstance(law, str) else law, **more, **options}
+    )  # fmt: skip
+    assert isinstance(found, Traffic)
+    return found
+
+
+def set_(system: Traffic, **values: float) -> Traffic:
+    """The same model with other values of its law's parameters."""
+    with torch.no_grad():
+        for name, value in values.items():
+            getattr(system.terms[0], name).fill_(value)
+    return system
+
+
+def numbers(system: Traffic) -> SimpleNamespace:
+    """The law's parameters as plain numbers."""
+    law = system.terms[0]
+    return SimpleNamespace(**{name: float(getattr(law, name).detach()) for name in law.scalars})
+
+
+def driven(
+    time: np.ndarray,
+    x: np.ndarray,
+    v: np.ndarray | None = None,
+    length: Any = None,
+    name: str = "a",
+) -> Sequence:
+    """A platoon from places ``(K, N)``, speeds, and one length, m, of all vehicles."""
+    lengths = None if length is None else np.broadcast_to(np.asarray(length, float), x.shape[1:])
+    return Sequence(
+        name=name, recording=name, time=time, x=x[..., None],
+        v=None if v is None else v[..., None], length=lengths,
+    )  # fmt: skip
+
+
+def behind(
+    lead: Any, gaps: Many[float], seconds: float, length: float = 4.0, dt: float = DT
+) -> Batch:
+    """Vehicles that all start with their leader's speed; he drives ``lead(t)`` m."""
+    time = dt * np.arange(round(seconds / dt) + 1)
+    place, hair = lead(time), 1e-4
+    speed = (lead(time + hair) - lead(time - hair)) / (2 * hair)
+    apart = np.cumsum([0.0, *gaps])[::-1]
+    x = place[:, None] - apart
+    return collate([driven(time, x, np.repeat(speed[:, None], len(apart), 1), length)])
+
+
+def states(seed: int = 3, platoons: int = 40) -> Batch:
+    """Random states of platoons of one to five vehicles: some stand, some touch, some tie."""
+    draw, found = np.random.default_rng(seed), []
+    for number in range(platoons):
+        n = 1 + number % 5
+        gap = draw.uniform(0.0, 60.0, n - 1)
+        gap[draw.random(n - 1) < 0.15] = 4.0  # bumper to bumper
+        v = draw.uniform(0.0, 35.0, n)
+        v[draw.random(n) < 0.15] = 0.0
+        if number % 4 == 0:
+            v[:] = v[0]  # ties of speeds
+        x = 100 + np.cumsum([0.0, *gap])
+        x = x + v * np.array([[0.0], [DT]])
+        found.append(driven(DT * np.arange(2), x, np.stack([v, v]), 4.0, f"s{number}"))
+    return collate(found)
+
+
+def accelerations(system: Traffic, batch: Batch, method: str = "euler") -> np.ndarray:
+    """``(B, N)`` rates of speeds at the start, as a step of ``DT`` takes them; NaN of others
+    than followers."""
+    scene = replace(system.scene(batch), step=DT, method=method)
+    with torch.no_grad():
+        rate = system(torch.zeros((), dtype=torch.float64), system.initial(batch), scene)
+    return torch.where(scene.follower, rate[..., 1], torch.nan).numpy()
+
+
+def each_follower(batch: Batch) -> list[tuple[int, int, float, float, float]]:
+    """Per follower sequence, number, gap (front to front, m), speed, speed ahead (m/s)."""
+    x, v = batch.x[0, ..., 0].numpy(), batch.v[0, ..., 0].numpy()
+    return [
+        (b, i, float(x[b, i + 1] - x[b, i]), float(v[b, i]), float(v[b, i + 1]))
+        for b in range(len(batch.names))
+        for i in range(int(batch.agent[b].sum()) - 1)
+    ]

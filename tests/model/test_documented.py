@@ -1,0 +1,75 @@
+"""What the pages say of formulas holds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from nnode.model import arrays, build_model, differentiate, expression, parse, tensors
+from nnode.model.effects import CATALOGUE
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.simulate.kernels import loops, source
+
+METHOD = (
+    Path("docs/method.md").read_text("utf-8").split("## A law is one formula")[1].split("\n## ")[0]
+)
+
+
+def test_your_own_law_in_one_line() -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", METHOD, re.S)
+    given = {k: v for k, v in yaml.safe_load(text).items() if k != "defaults"}
+    model = build_model({"term": "formula", "effects": [], **given})
+    values = {name: float(value) for name, (value, _) in model.physical().items()}
+    assert values == pytest.approx({"saturation.v0": 30.0, "saturation.reach": 12.0})
+    gap = torch.tensor([6.0, 12.0], dtype=torch.float64)
+    speed = model.terms[0].speed(gap).detach()  # type: ignore[union-attr, operator]
+    torch.testing.assert_close(speed, 30 * (1 - torch.exp(-gap / 12)), rtol=1e-14, atol=0)
+    assert "saturation.reach" in source(model)  # type: ignore[arg-type]
+
+
+def test_laws_on_the_command_line() -> None:
+    laws = re.findall(r"'model\.law=(\{parameters.*\})'", METHOD)
+    assert len(laws) == 2
+    lane, people = (
+        build_model({"term": "formula", "name": "mine", "leader": "measured", "effects": [],
+                     "law": yaml.safe_load(text)}) for text in laws
+    )  # fmt: skip
+    assert (lane.domain, people.domain) == ("traffic", "crowd")
+    assert list(lane.physical()) == ["mine.v0", "mine.L"]
+    assert list(people.physical()) == ["mine.A", "mine.B", "mine.tau"]
+
+
+@pytest.mark.parametrize("name", CAR_FOLLOWING_LAWS)
+def test_the_field_s_laws_stand_in_the_page_with_their_parameters(name: str) -> None:
+    rows = [line.split("|") for line in METHOD.splitlines() if line.startswith("| `")]
+    (row,) = [row for row in rows if f"`{name}`" in row[1]]
+    shown = row[3].replace("κ", "kappa").replace("λ", "lam")
+    names = {part.strip() for part in shown.split(",")}
+    assert names == (set(CAR_FOLLOWING_LAWS[name]["parameters"]) or {"weights"})
+    assert Path(f"conf/model/{name}.yaml").is_file()
+    assert f"`{name}`" in Path("README.md").read_text("utf-8")
+
+
+def test_effects_on_accelerations_stand_in_the_page() -> None:
+    table = METHOD.split("what becomes of an acceleration W")[1].split("\n\n")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert names == {e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None}
+
+
+def test_every_function_is_known_everywhere() -> None:
+    operations = set(tensors.OPERATIONS)
+    assert operations == set(loops.OPERATIONS) == set(arrays.OPERATIONS)
+    assert set(expression.UNARY) < operations
+    for name in operations:
+        arguments = {"choose": 3, "max": 2, "min": 2, "add": 2, "sub": 2, "mul": 2}.get(name, 1)
+        args = tuple(expression.symbol(n) for n in "abc"[:arguments])
+        node = expression._made(name, args)
+        assert len(differentiate.slopes(node)) == arguments
+    for name in set(parse.FUNCTIONS) - {"abs", "clip"}:
+        assert name in operations
+        assert name in METHOD

@@ -1,0 +1,160 @@
+"""Names in formulas: what may become a name in generated source."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from nnode.errors import ConfigError
+from nnode.model.crowd_dynamics import CrowdRule
+from nnode.model.crowd_formula import formula_of
+from nnode.model.effects import CATALOGUE
+from nnode.model.expression import symbol
+from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.formula_law import FormulaForce, FormulaLaw, law_from
+from nnode.model.lane_dynamics import Rule
+from nnode.model.names import check_names, check_symbols
+from nnode.model.term import Term
+from nnode.model.traffic import Linear
+from nnode.simulate.kernels.crowds.alone import WalkSource
+from nnode.simulate.kernels.crowds.source import CrowdSource
+from nnode.simulate.kernels.lanes.source import LaneSource
+
+CODE = '__import__("os").abort()'
+#: An annotation, an index, a default, a second line, letters and digits that are not ASCII.
+WRONG = [
+    f"a: {CODE}", f"[{CODE}]", f"a={CODE}", f"a\n{CODE}", CODE, "", "_a", "a_", "a__b", "2a", "a b",
+    "a-b", "a.b", "ä", "a²", "a٣", "a\n", "lambda", "None", "class",
+]  # fmt: skip
+
+LAW: dict[str, Any] = {
+    "parameters": {"v0": "30 m/s", "T": "1.2 s"},
+    "rate": {"v": "(v0*(1 - v*T/gap) - v)/T"},
+}
+PERSON: dict[str, Any] = {
+    "parameters": {"A": "2 m/s²", "B": "1 m"},
+    "others": {"push": "A*exp(-d/B)*n_x"},
+    "rate": {"vx": "push", "vy": "push"},
+}
+ENTRIES: list[tuple[dict[str, Any], str, Any]] = [
+    (LAW, "parameters", "1 m"),
+    (LAW, "constants", "1 m"),
+    (LAW, "where", "gap"),
+    (LAW, "states", ["m", "v", "gap"]),
+    (LAW, "delayed", ["gap", "m", "T"]),
+    (PERSON, "parameters", "1 m"),
+    (PERSON, "constants", "1 m"),
+    (PERSON, "where", "d/B"),
+    *((PERSON, over, "A*n_x") for over in ("others", "points", "walls")),
+    *((PERSON, over, "A") for over in ("smallest", "largest")),
+]
+
+
+@pytest.mark.parametrize("name", ["v0", "T", "time_gap", "a_1", "A2_b3_c", "lambda_0"])
+def test_a_name_is_letters_digits_and_single_underscores(name: str) -> None:
+    check_names("it", [name])
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_anything_else_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"^it: .* cannot be a name; expected ASCII letters"):
+        check_names("it", ["good", name])
+    with pytest.raises(ConfigError, match=r"^model\.name: "):
+        law_from(name, LAW)
+    with pytest.raises(ConfigError, match=r"^model\.name: "):
+        law_from(name, PERSON)
+    if name != "a_":  # as lambda_, in Python code
+        with pytest.raises(ConfigError, match=r"^parameters: "):
+            Term().declare(name, 1.0, unit="m")
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize(("law", "kind", "entry"), ENTRIES)
+def test_no_entry_of_a_law_has_such_a_name(
+    law: dict[str, Any], kind: str, entry: Any, name: str
+) -> None:
+    good = {**law, kind: {**law.get(kind, {}), "other": entry}, "remembered": 2}
+    if law is PERSON:
+        del good["remembered"]
+    law_from("mine", good)
+    with pytest.raises(ConfigError, match=rf"^model\.law\.{kind}: .* cannot be a name"):
+        law_from("mine", {**good, kind: {**law.get(kind, {}), name: entry}})
+
+
+@pytest.mark.parametrize("kind", ["states", "delayed", "where", "constants", "inputs"])
+def test_nor_has_a_rule(kind: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^{kind}: "):
+        Rule(**{kind: {f"a: {CODE}": ("m", "v", "x")}})  # type: ignore[arg-type]
+    if kind not in ("states", "delayed"):
+        with pytest.raises(ConfigError, match=rf"^{kind}: "):
+            CrowdRule(("0", "0"), **{kind: {f"a: {CODE}": "m"}})  # type: ignore[arg-type]
+
+
+def test_nor_has_an_effect() -> None:
+    class Wrong(CATALOGUE.effects["relative_speed"]):  # type: ignore[misc, name-defined]
+        name = f"a: {CODE}"
+
+    from nnode.model.system import Traffic
+
+    model = Traffic([Linear(), Wrong(kappa=0.3)])
+    with pytest.raises(ConfigError, match=r"^terms: "):
+        model.lane  # noqa: B018
+
+
+def test_all_names_of_the_package_are_such_names() -> None:
+    laws: list[FormulaLaw | FormulaForce] = [
+        *(
+            law_from(name, law, network=NEURONS.get(name))
+            for name, law in CAR_FOLLOWING_LAWS.items()
+        ),
+        *(law_from(name, law) for name, law in PEDESTRIAN_LAWS.items()),
+    ]
+    assert len(laws) >= 14
+    for term in [*laws, *(effect() for effect in CATALOGUE.effects.values())]:
+        check_names(type(term).__name__, [term.name])
+        check_names(type(term).__name__, term.scalars, in_code=True)
+    for law in laws:
+        if isinstance(law, FormulaLaw):
+            LaneSource(law.lane(law.name).flat()).text()
+        else:
+            CrowdSource(formula_of(law)).text()
+
+
+@pytest.mark.parametrize("name", ["x__d0", "mine__v0", "D_mine__v0__d1_1", "who_mine__a", "G_a__b"])
+def test_symbols_are_owner_and_name(name: str) -> None:
+    check_symbols([name])
+
+
+@pytest.mark.parametrize("name", [*WRONG[:5], "_a", "pass", "a__ä"])
+def test_generated_source_takes_no_other_name(name: str) -> None:
+    with pytest.raises(ConfigError, match="no source is generated with the name"):
+        check_symbols(["x", name])
+
+
+def test_each_generator_checks_the_names_itself() -> None:
+    """Also where a formula did not come by way of a law."""
+    law = law_from("mine", LAW)
+    assert isinstance(law, FormulaLaw)
+    lane, bad = law.lane("mine").flat(), symbol(f"a: {CODE}")
+    lane.rates["v"] = lane.rates["v"] + bad
+    with pytest.raises(ConfigError, match="no source is generated"):
+        LaneSource(lane).text()
+    force = law_from("mine", PERSON)
+    assert isinstance(force, FormulaForce)
+    for source in (CrowdSource, WalkSource):
+        crowd = formula_of(force)
+        object.__setattr__(crowd, "sums", {**crowd.sums, "walls": {bad.value: crowd.rate[0]}})
+        with pytest.raises(ConfigError, match="no source is generated"):
+            source(crowd).text()
+
+
+def test_numbers_too_large_for_floats_stay_operations() -> None:
+    """``inf`` would be a name in generated source."""
+    law = law_from("mine", {**LAW, "rate": {"v": "(v0 - v)/T*min(1e308*10, 1)"}})
+    assert isinstance(law, FormulaLaw)
+    assert "inf" not in LaneSource(law.lane("mine").flat()).text()
+    gap = torch.tensor([10.0], dtype=torch.float64)
+    assert law.speed(gap).item() == pytest.approx(30.0)

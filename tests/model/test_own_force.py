@@ -1,0 +1,99 @@
+"""A law of people of one's own, written as a formula."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from nnode.data.sequence import Batch, collate
+from nnode.errors import ConfigError
+from nnode.model import Crowd, Relaxation, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from tests.model.test_forces import people
+
+LAW: dict[str, Any] = {
+    "parameters": {"A": {"value": "2 m/s²", "low": "0 m/s²"}, "B": "40 cm", "tau": "0.7 s"},
+    "where": {"push": "A*exp((2*r - d)/B)"},
+    "others": {"push_x": "push*n_x", "push_y": "push*n_y"},
+    "rate": {
+        "vx": "(speed*way_x - vx)/tau + push_x",
+        "vy": "(speed*way_y - vy)/tau + push_y",
+    },
+}
+
+
+def own(**changes: Any) -> Crowd:
+    options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
+    model = build_model({**options, "law": {**LAW, **changes}})
+    assert isinstance(model, Crowd)
+    return model
+
+
+def same() -> Crowd:
+    """The same of terms of the package."""
+    more = CATALOGUE.effects["pair_repulsion"](A_2=2.0, B_2=0.4)
+    return Crowd([Relaxation(0.7), more])
+
+
+def rates(model: Crowd, batch: Batch) -> torch.Tensor:
+    found = model(torch.zeros((), dtype=torch.float64), model.initial(batch), model.scene(batch))
+    return torch.as_tensor(found[batch.agent]).detach()
+
+
+def test_it_computes_what_it_says() -> None:
+    batch, model = collate([people(5, 1), people(3, 2)]), own()
+    torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)
+    found = {name: (float(value), unit) for name, (value, unit) in model.physical().items()}
+    assert found == {
+        "mine.A": (2.0, "m/s²"), "mine.B": (pytest.approx(0.4), "m"), "mine.tau": (0.7, "s"),
+    }  # fmt: skip
+    with torch.no_grad():
+        model.terms[0].A.fill_(-1.0)  # type: ignore[union-attr, operator]
+    model.project_()
+    assert float(model.physical()["mine.A"][0]) == 0.0
+
+
+def test_it_is_compiled() -> None:
+    batch, model, solver = collate([people(5, 1), people(3, 2)]), own(), FusedSolver(0.02)
+    exact = TorchdiffeqSolver("euler", "discrete", 0.02)(model, batch)
+    wanted = torch.autograd.grad(exact.x[batch.valid].square().sum(), list(model.parameters()))
+    found = solver(model, batch)
+    assert not solver.uncompiled
+    torch.testing.assert_close(found.x[batch.valid], exact.x[batch.valid], rtol=1e-12, atol=1e-12)
+    share = torch.autograd.grad(found.x[batch.valid].square().sum(), list(model.parameters()))
+    torch.testing.assert_close(share, wanted, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rate": {"vx": "push_x"}}, "must have two entries, vx and vy"),
+        ({"rate": {"vx": "push_x", "vy": "speed"}}, "has the unit m/s, expected m/s"),
+        ({"rate": {"vx": "dx/tau**2", "vy": "push_y"}}, "names dx, which there is not in a rate"),
+        ({"others": {"push_x": "normal_x", "push_y": "n_y"}}, "not in a sum over others"),
+        ({"where": {"push": "A*exp(d)"}}, "the argument .* of exp has the unit m"),
+        ({"where": {"push": "A*exp(gap)"}}, "gap is unknown; there are A, B, along_x"),
+        ({"others": {"push_x": "A + B", "push_y": "n_y"}}, "which has the unit m/s², and mine.B"),
+        ({"crowds": {}}, "unknown entries crowds; there are .*others, points, walls"),
+    ],
+)
+def test_what_is_wrong_is_told(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        own(**changes)
+
+
+def test_without_interaction_it_is_its_drive() -> None:
+    batch, model = collate([people(5, 1), people(3, 2)]), own()
+    bare = Crowd([model.terms[0].alone()])  # type: ignore[union-attr, operator]
+    wanted = rates(Crowd([Relaxation(0.7)]), batch)
+    torch.testing.assert_close(rates(bare, batch), wanted, rtol=1e-12, atol=1e-12)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            FusedSolver(0.02)(bare, batch).x[batch.valid],
+            FusedSolver(0.02)(Crowd([Relaxation(0.7)]), batch).x[batch.valid],
+            rtol=1e-12, atol=1e-12,
+        )  # fmt: skip
+    torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)

@@ -1,0 +1,117 @@
+"""Wall points, leaders, and measured positions between samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import Sequence, collate
+from nnode.errors import DataError
+from nnode.model import Crowd, Linear, Relaxation, Scene, Traffic
+from nnode.model.scene import wall_points
+
+NAN = float("nan")
+
+
+def test_points_are_equally_spaced_and_closer_than_asked() -> None:
+    walls = torch.tensor([[[0.0, 0.0, 3.0, 4.0]]], dtype=torch.float64)  # 5 m long
+    points, _, real = wall_points(walls, 0.3)
+    # ceil(5 / 0.3) = 17 pieces
+    expected = np.linspace([0, 0], [3, 4], 18)
+    np.testing.assert_allclose(points[0], expected, atol=1e-14)
+    assert bool(real.all())
+
+
+@pytest.mark.parametrize("spacing", [0.5, 0.25, 0.1])
+def test_a_spacing_that_divides_is_met(spacing: float) -> None:
+    walls = torch.tensor([[[1.0, -2.0, 1.0, 2.0]]], dtype=torch.float64)
+    points, _, _ = wall_points(walls, spacing)
+    steps = points[0].diff(dim=0).norm(dim=1)
+    np.testing.assert_allclose(steps, spacing, rtol=1e-12)
+
+
+def test_a_wall_shorter_than_the_spacing_keeps_its_ends() -> None:
+    points, _, _ = wall_points(torch.tensor([[[1.0, 2.0, 1.1, 2.0]]], dtype=torch.float64), 0.25)
+    np.testing.assert_allclose(points[0], [[1.0, 2.0], [1.1, 2.0]])
+
+
+@pytest.mark.parametrize(
+    ("wall", "normal"),
+    [
+        ([0, 0, 1, 0], (0, 1)),
+        ([1, 0, 0, 0], (0, -1)),
+        ([0, 0, 0, 1], (-1, 0)),
+        ([0, 0, 3, 4], (-0.8, 0.6)),
+    ],
+)
+def test_normals_point_to_the_left(wall: list[float], normal: tuple[float, float]) -> None:
+    _, found, _ = wall_points(torch.tensor([[wall]], dtype=torch.float64), 0.5)
+    np.testing.assert_allclose(found[0], np.tile(normal, (found.shape[1], 1)), atol=1e-15)
+
+
+def test_padding_is_marked() -> None:
+    walls = torch.tensor(
+        [
+            [[0.0, 0, 1, 0], [1.0, 1, 0, 1]],
+            [[0.0, 0, 1, 0], [NAN, NAN, NAN, NAN]],
+            [[NAN, NAN, NAN, NAN], [NAN, NAN, NAN, NAN]],
+        ]
+    )
+    points, normals, real = wall_points(walls, 0.5)
+    assert real.sum(1).tolist() == [6, 3, 0]
+    assert points.isfinite().all()
+    assert normals.isfinite().all()
+    assert points.dtype == walls.dtype
+    # nobody who walks among the real walls comes near a padding point
+    assert points[~real].abs().min() > 1e3
+
+
+def test_no_walls_at_all() -> None:
+    points, normals, real = wall_points(torch.empty(2, 0, 4), 0.5)
+    assert points.shape == normals.shape == (2, 0, 2)
+    assert real.shape == (2, 0)
+
+
+def ramp(name: str, samples: int, agents: int) -> Sequence:
+    t = 0.2 * np.arange(samples)
+    x = 10.0 * np.arange(agents)[None] + (t**2)[:, None]
+    return Sequence(name=name, recording="r", time=t, x=x[:, :, None])
+
+
+def test_who_leads_and_who_follows() -> None:
+    scene = Scene.of(collate([ramp("a", 3, 4), ramp("b", 3, 2), ramp("c", 3, 1)]))
+    assert scene.leader.tolist() == [
+        [False, False, False, True],
+        [False, True, False, False],
+        [True, False, False, False],
+    ]
+    assert scene.follower.tolist() == [
+        [True, True, True, False],
+        [True, False, False, False],
+        [False, False, False, False],
+    ]
+    assert scene.count.flatten().tolist() == [4, 2, 1]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_measured_positions_between_samples(dtype: torch.dtype) -> None:
+    items = [ramp("a", 15, 2), ramp("b", 4, 1)]
+    scene = Scene.of(collate(items).to(dtype=dtype))
+    for t in [0.0, 0.2, 0.6, 1.4, 0.07, 0.333, 2.55, 2.8, 3.5]:
+        found = scene.measured_at(torch.tensor(t, dtype=dtype))
+        for b, item in enumerate(items):
+            for i in range(item.n_agents):
+                # np.interp holds the last value, as a sequence shorter than its batch does
+                expected = np.interp(t, item.time, item.x[:, i, 0])
+                precision = 1e-5 if dtype == torch.float32 else 1e-12
+                assert found[b, i, 0].item() == pytest.approx(expected, abs=precision)
+
+
+def test_models_refuse_data_of_the_other_domain() -> None:
+    batch = collate([ramp("a", 3, 2)])
+    with pytest.raises(DataError, match="2-dimensional"):
+        Crowd([Relaxation()]).scene(batch)
+    flat = Sequence(name="p", recording="r", time=np.arange(3.0), x=np.zeros((3, 2, 2)))
+    with pytest.raises(DataError, match="1-dimensional"):
+        Traffic([Linear()]).scene(collate([flat]))

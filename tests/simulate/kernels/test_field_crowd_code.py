@@ -1,0 +1,151 @@
+"""Compiled laws of people, smallest values over others included, against PyTorch's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.app.python.inputs import model_options
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError
+from nnode.model import System, build_model
+from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.simulate import FusedSolver, TorchdiffeqSolver
+
+DT = 0.02
+#: Two sides of the room, and a wall in it; x1, y1, x2, y2 in m.
+WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
+
+
+def people(n: int, seed: int, samples: int = 6) -> Sequence:
+    draw = np.random.default_rng(seed)
+    x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
+    time = 0.04 * np.arange(samples)
+    wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
+    return Sequence(
+        name=f"{n}-{seed}", recording="r", time=time, x=x + time[:, None, None] * v,
+        v=np.broadcast_to(v, (samples, n, 2)), preferred=wish, walls=WALLS[: seed % 4],
+    )  # fmt: skip
+
+
+def batch() -> Batch:
+    return collate([people(6, 1), people(9, 2, 4), people(1, 3), people(2, 4)])
+
+
+def both(model: System, batch: Batch) -> None:
+    """States, and gradients by all parameters and the start, agree to rounding."""
+    seen: list[tuple[torch.Tensor, tuple[torch.Tensor, ...]]] = []
+    fused = FusedSolver(DT)
+    for solver in (TorchdiffeqSolver("euler", "discrete", DT), fused):
+        x = batch.x.clone().requires_grad_()
+        found = solver(model, Batch(**{**vars(batch), "x": x})).x[batch.valid]
+        weight = torch.linspace(0.5, 2.0, found.numel(), dtype=found.dtype).reshape(found.shape)
+        cost = (weight * (found - 1.0) ** 2).sum()
+        seen.append((found.detach(), torch.autograd.grad(cost, [*model.parameters(), x])))
+    assert not fused.uncompiled
+    torch.testing.assert_close(seen[1][0], seen[0][0], rtol=1e-12, atol=1e-12)
+    for share, wanted in zip(seen[1][1], seen[0][1], strict=True):
+        assert float(wanted.abs().max()) > 1e-4
+        torch.testing.assert_close(share, wanted, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cfsm",
+        pytest.param("ttc", marks=pytest.mark.thorough),
+        pytest.param("gcfm", marks=pytest.mark.thorough),
+        pytest.param("esf", marks=pytest.mark.thorough),
+    ],
+)
+def test_a_law_of_the_field(name: str) -> None:
+    options = model_options(
+        {"term": "formula", "name": name, "law": PEDESTRIAN_LAWS[name]}, "measured"
+    )
+    model = build_model({**options, "desired": "direction"})
+    if name == "ttc":
+        with torch.no_grad():
+            model.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
+    both(model, batch())
+
+
+#: of second order, with two smallest values and a largest that names the former's inputs
+MANY: dict[str, Any] = {
+    "parameters": {"A": "0.6 1/s", "B": "0.5 m", "C": "0.3 1/s²", "tau": "0.7 s"},
+    "where": {
+        "crowded": "1 + number",
+        "near": "d*crowded",
+        "push": "A*max(2*B - closest, 0)/tau",
+    },
+    "others": {"number": "exp(-d/B)"},
+    "smallest": {"closest": "near", "slow": "sqrt(dvx**2 + dvy**2 + small_v**2)"},
+    "largest": {"right": "choose(2.5*B - d, dx, -nobody)"},
+    "rate": {
+        "vx": "(speed*way_x - vx)/tau + push + C*max(right, -B)",
+        "vy": "(speed*way_y - vy)/tau + 0.1*A*min(slow, speed)",
+    },
+}
+
+
+def many() -> System:
+    options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
+    return build_model({**options, "law": MANY})
+
+
+@pytest.mark.thorough
+def test_several_smallest_values_that_depend_on_sums() -> None:
+    both(many(), batch())
+
+
+def test_a_smallest_value_by_loops() -> None:
+    item = people(6, 7)
+    model, one = many(), collate([item])
+    found = model(torch.zeros(()), model.initial(one), model.scene(one))[0, :, 2].detach().numpy()
+    x, v = item.x[0], item.v[0]  # type: ignore[index]
+    goal = item.x[-1]
+    for i in range(6):
+        d = np.array([np.hypot(*(x[i] - x[j])) for j in range(6) if j != i])
+        dx = np.array([x[i, 0] - x[j, 0] for j in range(6) if j != i])
+        closest = (d * (1 + np.exp(-d / 0.5).sum())).min()
+        right = dx[d < 1.25].max(initial=-1e6)
+        way = (goal[i] - x[i]) / np.hypot(*(goal[i] - x[i]))
+        drive = (np.hypot(*v[i]) * way[0] - v[i, 0]) / 0.7
+        push = 0.6 * max(1.0 - closest, 0) / 0.7
+        np.testing.assert_allclose(found[i], drive + push + 0.3 * max(right, -0.5), rtol=1e-4)
+
+
+def test_the_first_of_several_has_the_slope() -> None:
+    # two others at the same distance: the slope by x is that of the first of them alone
+    law = {
+        "parameters": {"A": "1 1/s"}, "smallest": {"closest": "d"},
+        "rate": {"x": "A*closest", "y": "0*A*closest"},
+    }  # fmt: skip
+    options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
+    model = build_model({**options, "law": law})
+    place = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]], dtype=torch.float64)
+    still = Sequence(
+        name="a", recording="a", time=0.04 * np.arange(2.0), x=place.repeat(2, 1, 1).numpy()
+    )
+    one = collate([still])
+    y = place.clone().requires_grad_()
+    model(torch.zeros(()), y, model.scene(one))[0, 0, 0].backward()
+    assert y.grad is not None
+    np.testing.assert_allclose(y.grad[0], [[-1, 0], [1, 0], [0, 0]], atol=1e-5)
+
+
+def test_derivatives_of_a_law_with_a_smallest_value() -> None:
+    options = model_options(
+        {"term": "formula", "name": "c", "law": PEDESTRIAN_LAWS["cfsm"]}, "measured"
+    )
+    model, one = build_model({**options, "desired": "direction"}), collate([people(4, 9)])
+    scene, zero = model.scene(one), torch.zeros((), dtype=torch.float64)
+    y = model.initial(one).requires_grad_()
+    assert torch.autograd.gradcheck(lambda y: model(zero, y, scene), (y,), eps=1e-7, atol=1e-5)
+
+
+def test_a_cutoff_is_refused() -> None:
+    with pytest.raises(ConfigError, match="smallest values"):
+        FusedSolver(DT, cutoff=3.0)(many(), batch())

@@ -1,0 +1,311 @@
+"""Gradients of every method, law, leader, and engine of lanes, against float64 autograd.
+
+Most cases run the generated source in Python's interpreter, which takes less time than to compile
+it; those that are compiled are a selection here, and all of them among the thorough tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.model import Traffic, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.steps import METHODS
+from nnode.simulate import TorchdiffeqSolver, Trajectory
+from nnode.simulate.kernels import lanes
+from nnode.simulate.kernels.lanes import runs
+from tests.model.following import model
+from tests.simulate.fused.compare import RungeKutta
+from tests.simulate.kernels.interpreted import interpreted
+
+LEADERS = ("constant", "measured")
+SUBSTEPS = 2
+#: Laws of the paper; networks start at random weights.
+PAPER: dict[str, dict[str, Any]] = {
+    "lin": {"term": "lin", "v0": 21.0, "L": 4.0, "L_min": 2.0},
+    "log": {"term": "log", "v0": 21.0, "L": 4.0, "L_min": 2.0},
+    **{
+        f"n{n}": {"term": "network_speed", "v0": 21.0, "hidden": n, "box": None} for n in (2, 4, 10)
+    },
+}
+#: What a user's law may have: a state, a delay, a network, the time, the second vehicle ahead.
+OWN: dict[str, dict[str, Any]] = {
+    "speed": {"parameters": {"v0": "21 m/s", "L": "4 m"}, "rate": {"x": "v0*(1 - L/gap)"}},
+    "speed_ahead": {
+        "parameters": {"v0": "21 m/s", "L": "4 m", "c": "0.3"},
+        "rate": {"x": "(1 - c)*v0*(1 - L/gap) + c*dx_1"},
+    },
+    "speed_network": {
+        "parameters": {"v0": "21 m/s"}, "rate": {"x": "v0*NN(gap/20)"}, "network": 3,
+    },
+    "state": {
+        "parameters": {"c": "0.8 1/s", "T": "1.1 s", "tau": "0.7 s"},
+        "states": {"late": ["m/s", "(gap/T - late)/tau", "v*T/T"]},
+        "rate": {"v": "c*(late - v)"},
+    },
+    "delay": {
+        "parameters": {"c": "0.8 1/s", "T": "1.1 s", "wait": "0.13 s"},
+        "delayed": {"late": ["gap", "m", "wait"]}, "remembered": 4,
+        "rate": {"v": "c*(late/T - v)"},
+    },
+    "network": {
+        "parameters": {"unit": "1 m/s²"}, "network": 3,
+        "rate": {"v": "unit*NN(gap/20, v/10, dv/2)"},
+    },
+    "second": {
+        "parameters": {"c": "0.1 1/s²", "k": "0.4 1/s"},
+        "rate": {"v": "c*(gap_1 - gap) + k*(v_2 - v)"},
+    },
+    "beside": {**CAR_FOLLOWING_LAWS["idm"], "network": 2},
+}  # fmt: skip
+#: One value that is not neutral of every effect.
+EFFECTS: dict[str, dict[str, Any]] = {
+    "speed_zone": {"alpha": 0.7, "a": 10.0, "b": 40.0},
+    "speed_period": {"alpha": 0.7, "a": 0.1, "b": 2.0},
+    "vehicle_class": {"kind": "truck", "phi": 1.3},
+    "driver_heterogeneity": {"people": {"p0": [0.1, 0.0, -0.2, 0.0], "p1": [0.1, 0.1]}},
+    "slope": {"grade": 0.04, "a": 10.0, "b": 45.0},
+    "pure_delay": {"T": 0.13},
+}
+#: Laws that are compiled in the thorough tests: one of each kind.
+COMPILED = ("lin", "speed_ahead", "state", "beside", "idm", "ovm", "fvdm", "helly", "gipps", "a2")
+
+
+def platoons() -> Batch:
+    """Three platoons of different numbers of vehicles and of samples, in a wave; of cars and
+    trucks."""
+    found = []
+    for i, n in enumerate((4, 2, 3)):
+        t = 0.1 * torch.arange(6 - i, dtype=torch.float64)[:, None]
+        late = t - 0.3 * torch.arange(n - 1, -1, -1)
+        x = 12 * late + 2 * torch.sin(late + i) + (22.3 + i) * torch.arange(n)
+        v = 12 + 2 * torch.cos(late + i)
+        found.append(
+            Sequence(
+                name=f"p{i}", recording="r", time=t[:, 0].numpy(),
+                x=x[..., None].numpy(), v=v[..., None].numpy(),
+                length=torch.where(torch.arange(n) == 1, 9.0, 4.0).numpy(),
+                kind=tuple("truck" if j == 1 else "car" for j in range(n)),
+            )
+        )  # fmt: skip
+    return collate(found)
+
+
+def lane_of(law: str, leader: str, *effects: str) -> Traffic:
+    chosen = [{"name": e, **EFFECTS.get(e, {})} for e in effects]
+    if law in CAR_FOLLOWING_LAWS:
+        own = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
+        found = model(own, *chosen, leader=leader)
+    elif law in OWN:
+        given = dict(OWN[law])
+        more = {"network": given.pop("network")} if "network" in given else {}
+        found = model(given, *chosen, leader=leader, **more)
+    else:
+        built = build_model({"name": law, "leader": leader, "effects": chosen, **PAPER[law]})
+        assert isinstance(built, Traffic)
+        found = built
+    with torch.no_grad():  # nothing stays at a kink, or at the neutral value of a network
+        for i, p in enumerate(found.parameters()):
+            if p.ndim:
+                p.add_(0.05 * torch.cos(torch.arange(p.numel()) + i).reshape(p.shape))
+    return found
+
+
+def moving(batch: Batch) -> tuple[Batch, Tensor, Tensor]:
+    """The same batch with places and speeds of the start of which a gradient can be taken."""
+    x, v = (t[0].clone().requires_grad_() for t in (batch.x, batch.v))
+    both = [torch.cat([start[None], t[1:]]) for start, t in ((x, batch.x), (v, batch.v))]
+    return Batch(**{**vars(batch), "x": both[0], "v": both[1]}), x, v
+
+
+def weights(batch: Batch, states: int) -> Tensor:
+    """``(K, B, N, M)`` different weights of all valid states."""
+    shape = (*batch.x.shape[:3], states)
+    found = torch.cos(torch.arange(batch.x[..., 0].numel() * states).double()).reshape(shape)
+    return torch.where(batch.valid[..., None], found, 0.0)
+
+
+def exact(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """States at the samples, and the gradient of their weighted sum, by autograd."""
+    scene, x, v = moving(batch)
+    dt = batch.dt / SUBSTEPS
+    solver = RungeKutta(SUBSTEPS) if method == "rk4" else TorchdiffeqSolver(method, "discrete", dt)
+    states = _states(solver(system, scene))
+    return states, _slopes(system, batch, states, x, v)
+
+
+def _states(path: Trajectory) -> Tensor:
+    return path.x if path.v is None else torch.cat([path.x, path.v], -1)
+
+
+def _slopes(
+    system: Traffic, batch: Batch, states: Tensor, x: Tensor, v: Tensor
+) -> dict[str, Tensor]:
+    own = {name: p for name, p in system.named_parameters() if p.requires_grad}
+    total = (weights(batch, states.shape[-1]) * states).sum()
+    found = torch.autograd.grad(total, [*own.values(), x, v], allow_unused=True)
+    named = {
+        name: torch.zeros_like(p) if slope is None else slope
+        for (name, p), slope in zip({**own, "x": x, "v": v}.items(), found, strict=True)
+    }
+    if system.leader == "measured":  # the leader's places and speeds are data
+        follower = system.scene(batch).follower[..., None]
+        named |= {name: torch.where(follower, named[name], 0.0) for name in ("x", "v")}
+    return named
+
+
+def compiled(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same by the generated code."""
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    scene, x, v = moving(batch)
+    y = lanes.simulate(system, lane, scene, SUBSTEPS, method=method)[:, 0]
+    found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
+    return found, _slopes(system, batch, found, x, v)
+
+
+def ensemble(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same with two runs at once, whose parameters are rows of numbers; of the second one,
+    which has other parameters, nothing is returned."""
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    scene, x, v = moving(batch)
+    own = dict(system.named_parameters())
+    both = {name: torch.stack([p, 1.01 * p]) for name, p in own.items()}
+    y = lanes.simulate(system, lane, scene, SUBSTEPS, parameters=both, method=method)[:, 0]
+    found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
+    return found, _slopes(system, batch, found, x, v)
+
+
+def by_tangents(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same by the derivatives of all states, of the parameters alone."""
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    own = {name: torch.zeros_like(p) for name, p in system.named_parameters() if p.requires_grad}
+    owned = {symbol: at for symbol, at in lane.owned.items() if at[0] in own}
+    y, slopes = lanes.tangents(system, lane, batch, SUBSTEPS, list(owned), method=method)
+    weight = weights(batch, system.order)
+    if system.leader == "measured":
+        weight = torch.where(system.scene(batch).follower[..., None], weight, 0.0)
+    for slope, (name, place, _) in zip(slopes, owned.values(), strict=True):
+        own[name].view(-1)[place] = (weight * slope[..., : system.order]).sum()
+    found = torch.cat([part for part in system.observe(y, batch) if part is not None], -1)
+    return found, own
+
+
+def check(system: Traffic, method: str, *engines: Any) -> None:
+    """Compare states, and every part of the gradient by itself."""
+    batch = platoons()
+    states, wanted = exact(system, batch, method)
+    assert wanted["x"].abs().max() > 0
+    for engine in engines:
+        found, own = engine(system, batch, method)
+        torch.testing.assert_close(found[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11)
+        for name, slope in own.items():
+            size = float(wanted[name].abs().max())
+            away = float((slope - wanted[name]).abs().max())
+            # of cancelling sums rounding remains, in units of the largest part of the gradient
+            assert away <= 1e-9 * size + 1e-12, (engine.__name__, name, slope, wanted[name])
+
+
+def cases(laws: Iterable[str]) -> list[Any]:
+    """Laws with the methods that they have: a map has no stages in between. Large networks are
+    formulas like small ones."""
+    found = []
+    for law in laws:
+        for method in METHODS:
+            large = law in ("n4", "n10", "a4", "a10") and method != "rk4"
+            if not (method == "rk4" and _is_map(law)):
+                marks = [pytest.mark.thorough] if large else []
+                found.append(pytest.param(law, method, marks=marks))
+    return found
+
+
+def _is_map(law: str, *effects: str) -> bool:
+    lane = lane_of(law, "measured", *effects).lane
+    assert lane is not None
+    return "dt" in lane.symbols
+
+
+def with_effects() -> list[Any]:
+    """One effect of each kind on a law of each order."""
+    found = []
+    for law, order in (("lin", 1), ("idm", 2)):
+        for effect in CATALOGUE.of("traffic", every=True):
+            if (effect.rule if order == 1 else effect.second) is None:
+                continue
+            for method in METHODS:
+                if method == "rk4" and _is_map(law, effect.name):
+                    continue
+                often = method in ("rk4", "ballistic" if effect.name == "pure_delay" else "")
+                marks = [] if often else [pytest.mark.thorough]
+                found.append(pytest.param(law, effect.name, method, marks=marks))
+    return found
+
+
+@pytest.fixture
+def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "compiled", interpreted)
+
+
+@pytest.mark.usefixtures("without_compiler")
+@pytest.mark.parametrize("leader", LEADERS)
+@pytest.mark.parametrize(("law", "method"), cases([*PAPER, *OWN, *CAR_FOLLOWING_LAWS]))
+def test_every_law_and_method(law: str, method: str, leader: str) -> None:
+    check(lane_of(law, leader), method, compiled, ensemble, by_tangents)
+
+
+@pytest.mark.usefixtures("without_compiler")
+@pytest.mark.parametrize("leader", LEADERS)
+@pytest.mark.parametrize(("law", "effect", "method"), with_effects())
+def test_every_effect(law: str, effect: str, method: str, leader: str) -> None:
+    system = lane_of(law, leader, effect)
+    lane = system.lane
+    assert lane is not None
+    exact_start = set(list(lane.rates)[lane.order :]) <= set(lane.starts)
+    check(system, method, compiled, *([by_tangents] if exact_start else []))
+
+
+@pytest.mark.parametrize(
+    "law", ["n4", *(pytest.param(n, marks=pytest.mark.thorough) for n in COMPILED)]
+)
+def test_compiled_stages(law: str) -> None:
+    """A leader that drives by itself, in vehicles side by side and in vehicles one after the
+    other."""
+    check(lane_of(law, "constant"), "rk4", compiled)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("law", ["lin", "idm", "speed_ahead"])
+@pytest.mark.parametrize("method", METHODS)
+def test_compiled_runs_and_tangents(law: str, method: str) -> None:
+    check(lane_of(law, "constant"), method, ensemble, by_tangents)
+
+
+@pytest.mark.parametrize("leader", LEADERS)
+@pytest.mark.parametrize("law", ["lin", "idm"])
+@pytest.mark.parametrize(("method", "order"), [("euler", 1), ("ballistic", 1), ("rk4", 4)])
+def test_the_adjoint_equation(law: str, method: str, order: int, leader: str) -> None:
+    """torchdiffeq's adjoint approaches the gradient of the solution with the order of the method:
+    a finer step by a factor of four divides its distance to that of the next one by 4**order."""
+    system, batch = lane_of(law, leader), platoons()
+    found = []
+    for substeps in (1, 4, 16):
+        scene, x, v = moving(batch)
+        path = TorchdiffeqSolver(method, "adjoint", batch.dt / substeps)(system, scene)
+        slopes = _slopes(system, batch, _states(path), x, v)
+        found.append(torch.cat([slopes[name].flatten() for name in slopes]))
+    coarse, fine = (float((one - found[2]).norm()) for one in found[:2])
+    assert fine > 0
+    # of errors c, c/r and c/r² with r = 4**order the distances to the last one have the ratio r + 1
+    assert coarse / fine > 0.7 * (4**order + 1), (coarse, fine)
+    wanted = exact(system, batch, "rk4")[1]
+    away = torch.cat([wanted[name].flatten() for name in slopes]) - found[2]
+    assert away.norm() < 2 * coarse / 4**order + 1e-7 * found[2].norm()
