@@ -1,14 +1,16 @@
-"""Stored results, computed again: ``python -m benchmarks.regression [PART ...] [--store]``.
+"""Stored results, computed again: ``python -m benchmarks.regression [WORD ...] [--store]``.
 
-Parts are ``diagnosis`` (30 small data sets with fixed seeds: cars by ``lin`` and ``idm``, people by
-``sf``), ``calibration`` (a few epochs of every model), ``checkpoint`` (files of an earlier version
-are loaded and simulated), ``study`` (quick studies of real recordings, where ``NNODE_DATA`` names
-their folder) and ``speed`` (gradients of the compiled code against ``odeint_adjoint``, in turns).
-Words must be equal, numbers to 1e-6 of their size, ratios of times within a factor of two: they
-differ between machines. What differs is printed, and the exit status is 1. ``--store`` writes the
-computed results of the chosen parts, checkpoints too, in place of the stored ones.
+Only what has one of the words in its name is computed. Names begin with ``diagnosis`` (30 small
+data sets with fixed seeds: cars by ``lin`` and ``idm``, people by ``sf``), ``calibration`` (a few
+epochs of every model, or until Gauss and Newton's method converges), ``checkpoint`` (files of an
+earlier version are loaded and simulated), ``study`` (the quick study of traffic, where
+``NNODE_DATA`` names the recordings) and ``speed`` (gradients of the compiled code against
+``odeint_adjoint``, in turns). Words must be equal, numbers to 1e-6 of their size, ratios of times
+within a factor of two, because they differ between machines. Differences are printed, and the exit
+status is 1 if there are any. ``--store`` replaces the stored results, checkpoints included.
 
-Data are integrated here, by code that is not the package's; all else is its public interface.
+The data are integrated here, by code that is not the package's; everything else is its public
+interface.
 """
 
 from __future__ import annotations
@@ -36,7 +38,6 @@ STORED = Path(__file__).with_suffix(".json")
 CHECKPOINTS = Path(__file__).with_name("regression_checkpoints.zip")
 #: Names the folder that checkpoints are written to, for the processes.
 FOLDER = "NNODE_REGRESSION_STORE"
-PARTS = ("diagnosis", "calibration", "checkpoint", "study", "speed")
 TOLERANCE = 1e-6
 #: Ratios of times may lie this factor apart.
 LOOSE = 2.0
@@ -281,7 +282,7 @@ def tasks() -> list[tuple[Any, ...]]:
     found += [("diagnosis", *what, seed) for seed, what in enumerate(hidden)]
     for law in (*LAWS, *CROWD_LAWS):
         found += [("calibration", law, "lbfgs", "fused")]
-        if law not in ("lin", "log", "n2", "n4", "n10", "nn"):
+        if law not in ("lin", "log", "n2", "n4", "n10", "nn", "newell", "a2", "a4", "a10"):
             found += [("calibration", law, "gauss_newton", "fused")]
         found += [("calibration", law, "adadelta", "torchdiffeq")]
     found += [("calibration", law, "adadelta", "fused", *effects) for law, *effects in EXTENDED]
@@ -325,12 +326,23 @@ def differences(old: Any, new: Any, where: str) -> list[str]:
     return [] if old == new else [f"{where}: {old!r} -> {new!r}"]
 
 
+def _keep(folder: Path) -> None:
+    """Put new checkpoints into the archive, in place of those of the same names."""
+    content = {file.name: file.read_bytes() for file in folder.iterdir()}
+    if CHECKPOINTS.exists():
+        with zipfile.ZipFile(CHECKPOINTS) as archive:
+            content = {name: archive.read(name) for name in archive.namelist()} | content
+    with zipfile.ZipFile(CHECKPOINTS, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in sorted(content.items()):
+            archive.writestr(name, data)
+
+
 def main() -> int:
     """Compute, compare or store."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("parts", nargs="*", help="of all, these")
+    parser.add_argument("words", nargs="*", help="only what has one of these in its name")
     parser.add_argument("--store", action="store_true", help="write what is computed")
     chosen = parser.parse_args()
     stored = json.loads(STORED.read_text()) if STORED.exists() else {}
@@ -339,8 +351,14 @@ def main() -> int:
         if chosen.store:
             os.environ[FOLDER] = folder  # for the processes
         for loads in (False, True):
-            todo = [task for task in tasks() if task[0] in (chosen.parts or PARTS)]
-            todo = [task for task in todo if (task[0] == "checkpoint") == loads]
+            todo = [task for task in tasks() if (task[0] == "checkpoint") == loads]
+            names = [" ".join(map(str, task)) for task in todo]
+            every = not chosen.words
+            todo = [
+                task
+                for task, name in zip(todo, names, strict=True)
+                if every or any(word in name for word in chosen.words)
+            ]
             if not chosen.store:  # what there is to compare with
                 todo = [t for t in todo if " ".join(map(str, t[1:])) in stored.get(t[0], {})]
             with multiprocessing.get_context("spawn").Pool(2) as pool:
@@ -352,11 +370,8 @@ def main() -> int:
                     if chosen.store:
                         stored.setdefault(part, {})[name] = result
                         STORED.write_text(json.dumps(stored, indent=1, sort_keys=True) + "\n")
-            files = sorted(Path(folder).iterdir())
-            if files and not loads:
-                with zipfile.ZipFile(CHECKPOINTS, "w", zipfile.ZIP_DEFLATED) as archive:
-                    for file in files:
-                        archive.write(file, file.name)
+            if chosen.store and not loads:
+                _keep(Path(folder))
     print("\n".join(lines) or "nothing differs")
     return 1 if lines else 0
 
