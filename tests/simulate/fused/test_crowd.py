@@ -16,8 +16,7 @@ from nnode.errors import ConfigError, SimulationError
 from nnode.model import Crowd, Linear, NetworkForce, Relaxation, SocialForce, System, Traffic
 from nnode.model.effects import CATALOGUE
 from nnode.model.network import FeedForward
-from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
-from nnode.simulate import fused
+from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, fused
 from nnode.simulate.kernels.crowds import runs as compiled
 from nnode.simulate.kernels.crowds.rows import SIZE
 from nnode.simulate.kernels.crowds.source import CrowdSource

@@ -10,8 +10,7 @@ import torch
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.model import Linear, Logarithmic, NetworkSpeed, Traffic
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from nnode.simulate import fused
+from nnode.simulate import FusedSolver, TorchdiffeqSolver, fused
 from nnode.simulate.kernels import lanes
 from tests.simulate.fused.compare import difference, gradient, single
 
