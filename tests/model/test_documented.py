@@ -11,7 +11,7 @@ import yaml
 
 from nnode.model import arrays, build_model, differentiate, expression, parse, tensors
 from nnode.model.effects import CATALOGUE
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulate.kernels import loops, source
 
 METHOD = (
