@@ -45,10 +45,9 @@ law:
   rate: {vx: (speed*way_x - vx)/tau + push_x, vy: (speed*way_y - vy)/tau + push_y}
 """
 EFFECTS = """
-from nnode.model.crowd_dynamics import CrowdRule
 from nnode.model.effects import CATALOGUE, Effect, Strength
-from nnode.model.lane_dynamics import Rule
 from nnode.model.term import Interval
+from nnode.model.terms import Rule
 
 
 @CATALOGUE.add
@@ -63,7 +62,7 @@ class Hills(Effect):
 class Current(Effect):
     name, domain, source, rank = "current", "crowd", "none", 20
     formula = "+ c (ẏ, -ẋ)"
-    rule = CrowdRule(rate=("c*vy", "-c*vx"))
+    rule = Rule(rate=("c*vy", "-c*vx"))
     strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "1/s", min_effect_size=0.2)}
 """
 NAMES = ("hills", "current")
