@@ -17,6 +17,7 @@ from nnode.calibrate.least_squares import (
     least_squares,
     trajectory_residuals,
 )
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Crowd, Traffic
 from nnode.model.formula_law import law_from
@@ -106,8 +107,8 @@ def recover(
     batch = collate(sequences)
     system = _system(law, typed, batch.x.shape[-1])
     cost = EnsembleCost(system, batch, FusedSolver(dt=dt, method=method))
-    names = tuple(name.rpartition(".")[2] for name in cost.names)
-    truth = cost.row(system).numpy()
+    names = tuple(name.rpartition(".")[2] for name in cost.vector.names)
+    truth = ParameterVector(system).row.numpy()
     metres = _in_metres(cost)
     exact = metres(truth)
     assert exact is not None, "the typed parameters cannot be simulated"

@@ -66,7 +66,7 @@ def trajectory_residuals(cost: EnsembleCost, weights: np.ndarray | None = None) 
     measured = batch.x[1:][seen]
 
     def residuals(row: np.ndarray) -> Tensor | None:
-        system = cost.fill_(cost.system, torch.from_numpy(row))
+        system = cost.vector.fill_(row)
         try:
             with torch.no_grad():
                 away = cost.solver(system, batch).x[1:][seen] - measured

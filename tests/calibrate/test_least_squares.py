@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import least_squares, trajectory_residuals
+from nnode.calibrate.parameters import ParameterVector
 from nnode.errors import SimulationError
 from nnode.simulate.fused import FusedSolver
 from nnode.study.crowd.fit import new_system
@@ -62,7 +63,7 @@ def test_a_start_that_cannot_be_simulated_is_said():
 def test_residuals_square_to_the_cost(weighted):
     system, batch = new_system("nn", 1), corridor(seed=2)
     cost = EnsembleCost(system, batch, FusedSolver())
-    row = cost.row(new_system("nn", 3))
+    row = ParameterVector(new_system("nn", 3)).row
     weights = np.array([0.7, 0.1, 0.2]) if weighted else None
     each = cost.costs(row[None])[0].numpy()
     expected = each.mean() if weights is None else weights @ each

@@ -131,7 +131,7 @@ def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
     parts = [part for whole in first for part in by_jupedsim.pieces(whole, seconds=1.0)]
     cost = EnsembleCost(system, collate(parts), FusedSolver(dt=dt))
     end = least_squares(
-        trajectory_residuals(cost), cost.row(system).numpy(), cost.low.numpy(), cost.high.numpy(),
+        trajectory_residuals(cost), cost.vector.row.numpy(), cost.low.numpy(), cost.high.numpy(),
         steps=30,
     )  # fmt: skip
     assert end.row == pytest.approx(16.0, rel=2e-3)

@@ -11,10 +11,10 @@ from scipy import stats
 from scipy.sparse import csr_array
 
 from nnode.calibrate.least_squares import box_step
-from nnode.discover.residuals.engine import Engine, fill, names_of, row_of
+from nnode.calibrate.parameters import ParameterVector
+from nnode.discover.residuals.engine import Engine
 from nnode.errors import SimulationError
 from nnode.model.system import System
-from nnode.model.term import Interval
 
 if TYPE_CHECKING:
     from nnode.discover.residuals.variables import Curves
@@ -154,19 +154,12 @@ def grams(z: np.ndarray, label: np.ndarray) -> np.ndarray:
     return np.stack([z[rows].T @ z[rows] for rows in members(label)])
 
 
-def limits(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """``(K,)`` lower and upper bounds of the parameters that are calibrated."""
-    known, free = system.bounds(), Interval()
-    both = [known.get(name, free) for name in names_of(system)]
-    return np.array([one.low for one in both]), np.array([one.high for one in both])
-
-
 class _Linear:
     """Residuals and their derivatives; derivatives come with the first of several trials."""
 
     def __init__(self, engine: Engine, system: System) -> None:
         self.engine, self.system = engine, system
-        self.low, self.high = limits(system)
+        self.low, self.high = ParameterVector(system).bounds
 
     def at(self, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals ``(T, n)`` of all trials ``(T, K)``, derivatives ``(n, K)`` at the first.
@@ -200,7 +193,7 @@ def refine(
     """
     linear = _Linear(engine, system)
     low, high = linear.low, linear.high
-    row = np.clip(row_of(system).numpy(), low, high)
+    row = np.clip(ParameterVector(system).row.numpy(), low, high)
     found, jacobian = linear.at(row[None])
     residual = found[0]
     if not np.isfinite(residual).all():
@@ -228,14 +221,14 @@ def refine(
                 jacobian = ahead
             break
         jacobian = ahead if best == 0 else linear.at(row[None])[1]
-    fill(system, torch.from_numpy(row))
+    ParameterVector(system).fill_(torch.from_numpy(row))
     return _fit(system, row, residual, jacobian, low, high)
 
 
 def evaluated(engine: Engine, system: System) -> Fit:
     """A model as it is, in the residuals of an engine."""
     linear = _Linear(engine, system)
-    row = row_of(system).numpy()
+    row = ParameterVector(system).row.numpy()
     found, jacobian = linear.at(row[None])
     return _fit(system, row, found[0], jacobian, linear.low, linear.high)
 
@@ -251,4 +244,6 @@ def _fit(
     gradient = jacobian.T @ residual
     at_low, at_high = (row <= low) & (gradient > 0), (row >= high) & (gradient < 0)
     moves = (jacobian**2).sum(0) > 0
-    return Fit(system, names_of(system), row, residual, jacobian, ~(at_low | at_high) & moves)
+    return Fit(
+        system, ParameterVector(system).names, row, residual, jacobian, ~(at_low | at_high) & moves
+    )

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import Minimum, least_squares, trajectory_residuals
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.model.build import build_model
 from nnode.model.crowd import NetworkForce
@@ -93,10 +94,10 @@ def calibrate(
         limit = steps if samples == batch.n_samples else min(steps, SHORT_STEPS[model])
         cost = EnsembleCost(system, cut(batch, samples).to(dtype=dtype), FusedSolver())
         found = least_squares(
-            trajectory_residuals(cost, weights), cost.row(system).numpy(), cost.low.numpy(),
+            trajectory_residuals(cost, weights), cost.vector.row.numpy(), cost.low.numpy(),
             cost.high.numpy(), steps=limit, least=LEAST[model],
         )  # fmt: skip
-        cost.fill_(system, torch.from_numpy(found.row))
+        cost.vector.fill_(found.row)
         number += found.evaluations
     return replace(found, row=row_of(system), evaluations=number)
 
@@ -115,7 +116,7 @@ def costs(model: str, row: np.ndarray | list[float], batch: Batch) -> Tensor:
     """``(B,)`` cost of every sequence, m² s, in float64."""
     system = system_of(model, row)
     cost = EnsembleCost(system, batch, FusedSolver())
-    return cost.costs(cost.row(system)[None])[0]
+    return cost.costs(ParameterVector(system).row[None])[0]
 
 
 def named(model: str, row: np.ndarray | list[float]) -> dict[str, Any]:

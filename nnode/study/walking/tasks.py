@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import Residuals, least_squares
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.model.scene import Scene, wanted
@@ -41,7 +42,7 @@ def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
     costs = [EnsembleCost(system, batch, FusedSolver()) for batch in train]
     first = costs[0]
     names = [name for name, _ in system.terms[0].named_parameters()]
-    own = dict(zip(names, first.row(system).tolist(), strict=True))
+    own = dict(zip(names, ParameterVector(system).row.tolist(), strict=True))
     grid = [dict(zip(GRID[law], each, strict=True)) for each in product(*GRID[law].values())]
     starts = [np.array(list({**own, **more}.values())) for more in [{}, *grid]]
     away = residuals(costs)
@@ -51,7 +52,7 @@ def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
         for row in starts[:BEST]
     ]
     found = min(minima, key=lambda one: one.cost)
-    first.fill_(system, torch.from_numpy(found.row))
+    ParameterVector(system).fill_(found.row)
     return {
         "row": dict(zip(names, found.row.tolist(), strict=True)),
         "train": found.cost,
@@ -85,7 +86,7 @@ def residuals(costs: list[EnsembleCost]) -> Residuals:
         parts = []
         for cost in costs:
             batch = cost.batch
-            system = cost.fill_(cost.system, torch.from_numpy(row))
+            system = ParameterVector(cost.system).fill_(row)
             seen = batch.valid[1:]
             try:
                 with torch.no_grad():
