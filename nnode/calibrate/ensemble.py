@@ -8,24 +8,39 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.cost import Convention, sequence_costs
 from nnode.calibrate.parameters import ParameterVector
-from nnode.calibrate.problem import Problem
+from nnode.data.sequence import Batch
+from nnode.model.system import System
+from nnode.simulate.fused import FusedSolver
 
 
-class EnsembleCost(Problem):
+class EnsembleCost:
     """Cost of R runs of a model on one batch, each run with parameters of its own.
 
     A run is a row of K numbers: all parameters that are calibrated, one after the other.
     Rows are in float64 whatever the precision of the simulation.
 
+    Args:
+        system: the model; it is not changed. Parameters that need no gradient stay its own.
+        batch: the sequences, in the precision of the system.
+        solver: its step, method and threads.
+        convention: what is minimised.
+
     Attributes:
-        names: parameters by their names in ``system.named_parameters()``.
-        low, high: ``(K,)`` admissible set, from the model's terms; infinite where it is open.
+        vector: the parameters that are calibrated.
+        low, high: ``(K,)`` the admissible set.
     """
 
-    def __post_init__(self) -> None:
-        self.vector = ParameterVector(self.system)
+    def __init__(
+        self,
+        system: System,
+        batch: Batch,
+        solver: FusedSolver,
+        convention: Convention = Convention.integral,
+    ) -> None:
+        self.system, self.batch, self.solver = system, batch, solver
+        self.convention, self.vector = convention, ParameterVector(system)
         self.low, self.high = (torch.from_numpy(end) for end in self.vector.bounds)
 
     def costs(self, rows: Tensor) -> Tensor:

@@ -32,9 +32,9 @@ class ParameterVector:
         self.parameters = {n: p for n, p in system.named_parameters() if p.requires_grad}
         every = [(name, k) for name, p in self.parameters.items() for k in range(p.numel())]
         number = {place: i for i, place in enumerate(every)}
-        chosen = every if places is None else list(places)
-        self.names = [name for name, _ in chosen]
-        self._order = [number[place] for place in chosen]
+        self.places = every if places is None else list(places)
+        self.names = [name for name, _ in self.places]
+        self._order = [number[place] for place in self.places]
 
     @property
     def row(self) -> Tensor:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.bfgs import Minima, minimise
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.parameters import ParameterVector
-from nnode.calibrate.quasi_newton import Minima, minimise
 from nnode.data.clusters import GAP, clusters
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.bfgs import minimise, optimality_residual
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.evaluate import best_common_speed, constant_velocity, no_interaction
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.parameters import ParameterVector
-from nnode.calibrate.quasi_newton import minimise, optimality_residual
 from nnode.data.sequence import Batch
 from nnode.simulate.fused import FusedSolver
 from nnode.study.statistics import group_weights
