@@ -11,7 +11,7 @@ import yaml
 
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.operations import FUNCTIONS
 from nnode.simulate.kernels import source
 
