@@ -36,7 +36,7 @@ PACKED = {
 #: Calls into the mathematical library, which stay scalar.
 LIBRARY = r"\b(call\w*|movabsq|bl|adrp)\s[^\n]*\b(exp2?|expm1|log1p|log2?|pow)f?\b"
 #: Calls of our own functions that were not inlined.
-CALLED = r"\b(call\w*|movabsq|bl)\s[^\n]*\b_ZN5nnode8simulate\w*(functions|polynomials)"
+CALLED = r"\b(call\w*|movabsq|bl)\s[^\n]*\b_ZN5nnode8simulate\w*functions"
 
 
 def is_vector_code(text: str, loops: int = 1) -> bool:

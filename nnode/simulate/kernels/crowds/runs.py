@@ -21,7 +21,7 @@ from nnode.model.laws import InteractionForce
 from nnode.model.scene import Scene
 from nnode.model.system import Crowd, System
 from nnode.model.term import Term
-from nnode.simulate.kernels import functions, polynomials
+from nnode.simulate.kernels import functions
 from nnode.simulate.kernels.cache import digest, keep
 from nnode.simulate.kernels.crowds import cells, least
 from nnode.simulate.kernels.crowds import rows as crowd_rows
@@ -34,7 +34,7 @@ from nnode.simulate.kernels.threads import run_all
 #: crowds, and so most recordings, are exact to rounding instead.
 LISTS_FROM = 200
 #: Compiled into every module besides its own text.
-_COMPILED_IN = (crowd_rows, least, cells, functions, polynomials)
+_COMPILED_IN = (crowd_rows, least, cells, functions)
 
 
 @cache
