@@ -13,7 +13,7 @@ from nnode.calibrate.least_squares import Minimum
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Traffic
-from nnode.model.formula_law import law_from
+from nnode.model.laws import law_from
 from nnode.model.system import System
 from nnode.simulate.fused import FusedSolver
 

@@ -13,7 +13,7 @@ from nnode.calibrate.problem import ResidualProblem, alone, pooled
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System, Traffic, build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.term import State, Term
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.simulate.fused.compare import RungeKutta

@@ -12,7 +12,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.calibrate.pooling import scattered
 from nnode.calibrate.problem import ResidualProblem
 from nnode.model.build import build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.system import System
 
 #: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.
