@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
+from nnode.data.sequence import Domain
 from nnode.model import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
-from nnode.model.crowd_dynamics import CrowdRule
 from nnode.model.effects import CATALOGUE
-from nnode.model.effects.base import Effect
 from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.field_crowd import PEDESTRIAN_LAWS
-from nnode.model.formula import rule_of
 from nnode.model.formula_law import FormulaForce, FormulaLaw, law_from
-from nnode.model.lane_dynamics import Rule
-from nnode.model.term import Interval, Term
+from nnode.model.term import Interval, Term, described
 
 
 def main() -> None:
@@ -31,81 +27,41 @@ def lines() -> Iterator[str]:
     for name, description in CAR_FOLLOWING_LAWS.items():
         own = law_from(name, description, network=NEURONS.get(name))
         yield from _of(own, "dx/dt = " if own.order == 1 else "dv/dt = ")
-    for domain, title in (("traffic", "Effects in lanes; W is what law and effects before say"),
-                          ("crowd", "Effects in crowds")):  # fmt: skip
-        if domain == "crowd":
-            yield "Forces on people"
-            for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
-                yield from _of(force, "dv/dt = ")
-            for name, description in PEDESTRIAN_LAWS.items():
-                yield from _of(law_from(name, description), "")
-        yield title
-        for effect in CATALOGUE.of(domain, every=True):  # type: ignore[arg-type]
-            yield from _of(effect(), "W becomes " if domain == "traffic" else "")
+    yield "Effects in lanes; W is what law and effects before say"
+    yield from _effects("traffic")
+    yield "Forces on people"
+    for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
+        yield from _of(force, "dv/dt = ")
+    for name, description in PEDESTRIAN_LAWS.items():
+        yield from _of(law_from(name, description), "")
+    yield "Effects in crowds"
+    yield from _effects("crowd")
+
+
+def _effects(domain: Domain) -> Iterator[str]:
+    for effect in CATALOGUE.of(domain, every=True):
+        yield from _printed(effect(), inspect.getdoc(effect), effect.formulas())
 
 
 def _of(term: Term, left: str) -> Iterator[str]:
-    rule = rule_of(term)
-    networks = isinstance(term, NetworkSpeed | NetworkForce)
-    about = (
-        ""
-        if isinstance(term, FormulaLaw | FormulaForce)
-        else (inspect.getdoc(term) or "").splitlines()[0]
-    )
-    yield f"  {term.name}: {about}".rstrip()
-    if networks or (rule is None and term.second is None):
-        yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
-    elif rule is not None:
-        yield from _ruled(rule, left)
-    if term.second is not None:
-        of = "of an acceleration, "
-        if rule is not None and rule == term.second:
-            yield f"    {of}the same"
-        else:
-            yield from _ruled(term.second, of + left, rule or Rule())
+    about = None if isinstance(term, FormulaLaw | FormulaForce) else inspect.getdoc(term)
+    formulas = [left + term.formula]
+    if term.rule is not None and not isinstance(term, NetworkSpeed | NetworkForce):
+        formulas = described(term.rule, left)
     if isinstance(term, FormulaLaw) and term.network is not None:
-        yield f"    NN: {term.network.sizes[1]} neurons in one hidden layer, softplus"
+        formulas.append(f"NN: {term.network.sizes[1]} neurons in one hidden layer, softplus")
+    yield from _printed(term, about, formulas)
+
+
+def _printed(term: Term, about: str | None, formulas: list[str]) -> Iterator[str]:
+    yield f"  {term.name}: {(about or '').partition(chr(10))[0]}".rstrip()
+    for formula in formulas:
+        yield f"    {formula}"
     for name, unit in term.units.items():
         yield f"    {name}: {'a number' if unit == '1' else unit}{_bounds(term.bounds.get(name))}"
     if isinstance(term, FormulaLaw) and term.step is not None:
         yield f"    steps: {term.step}"
     yield f"    source: {term.source}"
-
-
-def _ruled(
-    rule: Rule | CrowdRule, left: str, told: Rule | CrowdRule | None = None
-) -> Iterator[str]:
-    """A rule, line by line; parts that are told already are left out."""
-    told = told or Rule()
-    if isinstance(rule, CrowdRule):
-        for axis, text in zip("xy", rule.rate, strict=True):
-            yield f"    dv{axis}/dt: + {text}" if rule.order == 2 else f"    d{axis}/dt = {text}"
-        for over, what in _REDUCED.items():
-            for name, (_, text) in getattr(rule, over).items():
-                yield f"    {name} = {what} of {text}"
-    else:
-        yield f"    {left}{rule.rate}" if rule.rate else f"    a leader's W becomes {rule.leader}"
-        for name, (text, _, delay) in rule.delayed.items():
-            yield f"    {name} = {text}, {delay} ago (at most {rule.remembered} steps)"
-        for name, (_, rate, *start) in rule.states.items():
-            begins = f", at the start {start[0]}" if start else ""
-            yield f"    d{name}/dt = {rate}{begins}"
-    for name, text in _new(rule.where, told.where):
-        yield f"    {name} = {text}"
-    for name, (value, unit) in _new(rule.constants, told.constants):
-        yield f"    {name} = {value:g} {'' if unit == '1' else unit}".rstrip()
-    for name, unit in _new(rule.inputs, told.inputs):
-        yield f"    {name}: of each agent, from the data{'' if unit == '1' else f' ({unit})'}"
-
-
-def _new(parts: Mapping[str, Any], told: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    return [(name, part) for name, part in parts.items() if told.get(name) != part]
-
-
-_REDUCED = {
-    "others": "sum over others", "points": "sum over wall points", "walls": "sum over walls",
-    "smallest": "smallest over others", "largest": "largest over others",
-}  # fmt: skip
 
 
 def _bounds(interval: Interval | None) -> str:

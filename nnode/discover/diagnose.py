@@ -202,10 +202,14 @@ def _diagnosed(
     effects_found = [
         named(engine, final, step, sealed.tried[step.chosen.name].p_value) for step in found.steps
     ]
-    effects_found += [named_agents(one, agent.confirmed) for one, agent in both if agent.named]
+    effects_found += [
+        named_agents(one, final.system.order, agent.confirmed) for one, agent in both if agent.named
+    ]
     leads_found = [*leads, *imitations]
     leads_found += [
-        named_agents(one, agent.confirmed) for one, agent in both if agent.found and not agent.named
+        named_agents(one, final.system.order, agent.confirmed)
+        for one, agent in both
+        if agent.found and not agent.named
     ]
     diagnosis = Diagnosis(
         verdict=_verdict(

@@ -39,7 +39,7 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 from nnode.errors import ConfigError
 from nnode.model.differentiate import shift_slopes
@@ -136,6 +136,7 @@ class CrowdRule:
     force: tuple[str, str] | None = None
     drive: bool = False
     order: int = 2
+    memory: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         for kind in (*SEEN, _LARGEST, "where", "constants", "settings", "inputs"):

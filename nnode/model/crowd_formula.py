@@ -38,6 +38,9 @@ class CrowdBase(Term):
         """A law with what others may name of this term; its acceleration does not matter."""
         return self.written(law, owner, place)
 
+    def rule_for(self, order: int) -> Any:
+        return rule_of(self)
+
     def code(self) -> dict[str, Code]:
         """What calls in its formula stand for, by name."""
         return {}
@@ -51,7 +54,7 @@ def ruled(
     law: CrowdDynamics, term: Term, owner: str, place: int, own: CrowdRule | None = None
 ) -> CrowdDynamics:
     """A law with a term that has a rule, or ``own`` in its place."""
-    rule = own or term.rule
+    rule = own or (term.rule if isinstance(term, CrowdBase) else term.rule_for(2))
     if not isinstance(rule, CrowdRule):
         raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
     parameters, owned, units = parameters_of(term, owner, place)
@@ -72,7 +75,7 @@ _ALONE: dict[tuple[Any, ...], CrowdDynamics] = {}
 
 def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
     """The formula of a model with these terms; None where one is code without a formula."""
-    if any(rule_of(term) is None or term.memory for term in terms):
+    if any(term.rule_for(2) is None for term in terms):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _KNOWN:
@@ -91,9 +94,8 @@ def _ruled(term: Term) -> Callable[[CrowdDynamics, str, int], CrowdDynamics]:
 
 def contribution(term: Term, state: State) -> Tensor:
     """``(B, N, 2)`` m/s²: what one term adds to the accelerations, by its rule."""
-    around = [] if state.system is None else list(state.system.terms)
     effect = not isinstance(term, CrowdBase)
-    bases = [t for t in around if effect and isinstance(t, CrowdBase)]
+    bases = [t for t in state.terms if effect and isinstance(t, CrowdBase)]
     terms = [term, *bases]
     key = tuple(t.shape for t in terms)
     if key not in _ALONE:

@@ -6,14 +6,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from nnode.errors import ConfigError
 from nnode.model.crowd_dynamics import CrowdDynamics
 from nnode.model.expression import Expr, const, substitute, symbol
-from nnode.model.lane_dynamics import UNITS, LaneDynamics, add_effect
+from nnode.model.lane_dynamics import UNITS, LaneDynamics, Rule, add_effect
 from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
@@ -31,6 +32,9 @@ class Law(Term):
 
     order = 1
     step: str | None = None
+
+    def rule_for(self, order: int) -> Any:
+        return rule_of(self)
 
     @property
     def has_formula(self) -> bool:
@@ -77,20 +81,9 @@ def rule_of(term: Term) -> Any:
     return None
 
 
-def _effect_rule(term: Term, order: int) -> Any:
-    """What an effect does to a law of an order."""
-    return rule_of(term) if order == 1 else term.second
-
-
-def begins(term: Term, order: int) -> bool:
-    """Whether the start of a term's states is a formula."""
-    rule = rule_of(term) if isinstance(term, Law) else _effect_rule(term, order)
-    return bool(rule) and bool(rule.delayed or any(len(s) > 2 for s in rule.states.values()))
-
-
 #: What computes a term.
 _CODE = {
-    "forward", "speed", "memory_rate", "pair_force", "wall_force", "pairs", "components",
+    "forward", "speed", "pair_force", "wall_force", "pairs", "components",
 }  # fmt: skip
 
 
@@ -99,7 +92,7 @@ def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
     if not terms or not isinstance(terms[0], Law) or not terms[0].has_formula:
         return None
     order = terms[0].order
-    if any(isinstance(e, Law) or _effect_rule(e, order) is None for e in terms[1:]):
+    if any(isinstance(e, Law) or e.rule_for(order) is None for e in terms[1:]):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _KNOWN:
@@ -127,8 +120,8 @@ def with_effect(lane: LaneDynamics, term: Term, owner: str, place: int) -> LaneD
         place: of the term in the model.
     """
     parameters, owned, units = parameters_of(term, owner, place)
-    rule = _effect_rule(term, lane.order)
-    assert rule is not None
+    rule = term.rule_for(lane.order)
+    assert isinstance(rule, Rule)
     return add_effect(lane, owner, rule, parameters, owned, units, whose=place)
 
 
@@ -216,39 +209,53 @@ def rates_of(
     return _rates(stepped(lane, scene.method))(y, values, scene.follower, scene.leader, lead, code)
 
 
+def effect_alone(law: Term, term: Term) -> LaneDynamics:
+    """The formula of one effect beside a law, where other terms are code: ``before`` is the sum of
+    the terms before it.
+
+    Raises:
+        ConfigError: the effect changes a law of the gap, and the model has none.
+    """
+    key = (law.shape, term.shape)
+    if key not in _ALONE:
+        before, units = symbol("before"), {**UNITS, "before": "m/s"}
+        alone = LaneDynamics(1, {"x": before}, before, None, {}, {}, units)
+        if isinstance(law, Law) and law.has_formula:
+            own = law.lane(law.name)
+            alone = replace(own, rates=alone.rates, leader=before, units={**own.units, **units})
+        elif "law(" in str(term.rule_for(1)):
+            raise ConfigError(
+                f"effect {term.name} modifies the law of the gap and needs a model with one; "
+                "derive the model's own term from FollowTheLeader, or leave the effect out"
+            )
+        _ALONE[key] = with_effect(alone, term, term.name, 1).flat()
+    return _ALONE[key]
+
+
 def effect_increment(term: Term, state: State) -> Tensor:
     """``(B, N, 1 + M)`` what one effect changes of the sum of the terms before it, and the rates
     of its states: for models with other terms that are code."""
-    assert state.system is not None
-    before = torch.zeros_like(state.x) if state.rate is None else state.rate
-    law = state.system.terms[0]
-    if rule_of(term) is None:
+    if term.rule_for(1) is None:
         raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
-    key = (law.shape, term.shape)
-    if key not in _BEYOND:
-        before_it, units = symbol("before"), {**UNITS, "before": "m/s"}
-        alone = LaneDynamics(1, {"x": before_it}, before_it, None, {}, {}, units)
-        if isinstance(law, Law) and law.has_formula:
-            own = law.lane(law.name)
-            alone = replace(own, rates=alone.rates, leader=before_it, units={**own.units, **units})
-        _BEYOND[key] = with_effect(alone, term, term.name, 1).flat()
+    before = torch.zeros_like(state.x) if state.rate is None else state.rate
+    law = state.terms[0]
     y = state.x if state.memory is None else torch.cat([state.x, state.memory], -1)
-    more = {"before": before[..., 0]}
-    found = rates_of([cast(Term, law), term], _BEYOND[key], y, state.t, state.scene, False, more)
+    more, lane = {"before": before[..., 0]}, effect_alone(law, term)
+    found = rates_of([law, term], lane, y, state.t, state.scene, False, more)
     followers = state.scene.follower | state.scene.leader
     change = torch.where(followers, found[..., 0] - before[..., 0], 0.0)
     return torch.cat([change[..., None], found[..., 1:]], -1)
 
 
 #: A law and an effect to the formula of what the effect changes.
-_BEYOND: dict[tuple[Any, ...], LaneDynamics] = {}
+_ALONE: dict[tuple[Any, ...], LaneDynamics] = {}
 
 
 def starts_of(
     terms: Sequence[Term], lane: LaneDynamics, x: Tensor, v: Tensor, scene: Scene,
     parameters: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """``(B, N)`` values at the start of a lane's added states, of those whose start is a formula.
+    """``(B, N)`` values at the start of a lane's added states.
 
     Args:
         x, v: ``(B, N, 1)`` measured at the start.
@@ -256,23 +263,24 @@ def starts_of(
     """
     if not lane.starts:
         return {}
-    start = [x, v][: lane.order]
-    y = torch.cat([*start, x.new_zeros(*x.shape[:2], len(lane.rates) - lane.order)], -1)
+    rates = _starts(lane)
+    y = torch.cat([x, v, x.new_zeros(*x.shape[:2], len(lane.starts))], -1)
     values = dict(parameters or {})
     if parameters is None:
         values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
-    values |= inputs_of(terms, lane, scene)
+    values |= inputs_of(terms, rates.lane, scene)
     values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
     values["dt"] = y.new_tensor(scene.step)
-    found = _starts(lane)(y, values, scene.follower, scene.leader, None)
-    return {name: found[..., i] for i, name in enumerate(lane.rates) if name in lane.starts}
+    code = terms[0].code() if isinstance(terms[0], Law) else None
+    found = rates(y, values, scene.follower, scene.leader, None, code)
+    return {name: found[..., i] for i, name in enumerate(lane.starts, start=2)}
 
 
 @cache
 def _starts(lane: LaneDynamics) -> LaneRates:
-    zero = const(0)
-    rates = {state: lane.starts.get(state, zero) for state in lane.rates}
-    return LaneRates(replace(lane, rates=rates, leads={}))
+    """Starts in the place of rates; positions and speeds are measured."""
+    rates = {"x": const(0), "v": const(0), **lane.starts}
+    return LaneRates(replace(lane, rates=rates, leader=const(0), leads={}, chained={}))
 
 
 @cache

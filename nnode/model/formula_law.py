@@ -173,7 +173,6 @@ class FormulaLaw(_Own, Law):
             delayed={str(k): _three("delayed", k, v) for k, v in (delayed or {}).items()},
             remembered=int(remembered),
         )
-        self.memory = len(self.rule.states) + len(self.rule.delayed) * self.rule.remembered  # type: ignore[misc]
         self.step = step
         if step is not None and step not in METHODS:
             raise ConfigError(f"model.law.step={step} is unknown, expected {', '.join(METHODS)}")

@@ -71,8 +71,8 @@ class Rule:
             it does nothing to followers.
         leader: what becomes of the speed of a leader that drives by itself, ``W`` before;
             empty: it stays.
-        states: name to (unit, rate) of states that the term adds, or (unit, rate, start); without
-            a start the term's ``remember`` tells it.
+        states: name to (unit, rate, start) of states that the term adds. A start may name v, v_1
+            and v_2 in laws of first order as well: measured speeds at the first sample.
         delayed: name to (formula, unit, delay), the formula's value some time ago; the delay
             in s, from none to as many steps as the term remembers. Before the first sample
             it was what it is there.
@@ -84,7 +84,7 @@ class Rule:
 
     rate: str = ""
     leader: str = ""
-    states: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    states: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     delayed: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     where: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, tuple[float, str]] = field(default_factory=dict)
@@ -101,6 +101,11 @@ class Rule:
                 f"are {steps} states of every vehicle, expected at most {REMEMBERED}; take a "
                 "larger step or a shorter delay"
             )
+
+    @property
+    def memory(self) -> int:
+        """Number of states that the term adds to each vehicle."""
+        return len(self.states) + len(self.delayed) * self.remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +148,7 @@ class LaneDynamics:
     @cached_property
     def symbols(self) -> frozenset[str]:
         """Names in the rates."""
-        every = [*self.rates.values(), self.leader, *self.leads.values(), *self.starts.values()]
-        return frozenset(symbols(every))
+        return frozenset(symbols([*self.rates.values(), self.leader, *self.leads.values()]))
 
     @cached_property
     def names_places(self) -> bool:
@@ -182,8 +186,9 @@ class LaneDynamics:
             made["dx_1"] = symbol("v_1")
         rates = {state: substitute(rate, made) for state, rate in self.rates.items()}
         starts: dict[str, Expr] = {}
+        at_start = {**made, "dx_1": symbol("v_1")}
         for state, start in self.starts.items():  # one may name those before it
-            starts[state] = substitute(substitute(start, made), starts)
+            starts[state] = substitute(substitute(start, at_start), starts)
         lead = substitute(self.leader, made)
         chained = {"x": "dx_1"} if "dx_1" in symbols([*rates.values(), lead]) else {}
         return replace(self, rates=rates, leader=lead, starts=starts, chained=chained)
@@ -247,13 +252,13 @@ def _add_states(
     rates: dict[str, Expr], starts: dict[str, Expr], laws: Mapping[str, Any] | None,
 ) -> None:  # fmt: skip
     """Add rates and starts of a rule's states to those that there are."""
-    for part, (unit, formula, *start) in rule.states.items():
+    at_start = {**{v: symbol(v) for v in _SECOND}, **names}
+    for part, (unit, rate, start) in rule.states.items():
         own = f"{name}__{part}"
-        rates[own] = parse(formula, names, laws)
+        rates[own] = parse(rate, names, laws)
         check(f"d{part}/dt of {name}", rates[own], units, f"{unit}/s")
-        for text in start:
-            starts[own] = parse(text, names, laws)
-            check(f"{part} of {name} at the start", starts[own], units, unit)
+        starts[own] = parse(start, at_start, laws)
+        check(f"{part} of {name} at the start", starts[own], units, unit)
 
 
 def _delays(

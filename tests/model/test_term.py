@@ -6,7 +6,7 @@ import pytest
 
 from nnode.model import System, build_model
 from nnode.model.build import add_effects
-from nnode.model.effects.traffic import SpeedZone
+from nnode.model.effects.lane import SpeedZone
 from nnode.model.term import short_names
 from nnode.model.traffic import Linear
 

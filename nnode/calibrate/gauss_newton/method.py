@@ -77,11 +77,10 @@ class TangentCost(Problem):
     def _owned(self) -> dict[str, Any]:
         """Symbols of the formula's parameters to where they are in the model."""
         lane = lanes.supports(self.system, self.batch)
-        added = [] if lane is None else list(lane.rates)[lane.order :]
-        if lane is None or any(state not in lane.starts for state in added):
+        if lane is None:
             raise ConfigError(
                 "optimizer=gauss_newton needs a model of a lane whose law and effects are "
-                "formulas, starts of their memory as well; take another optimizer, or "
+                "formulas; take another optimizer, or "
                 "nnode.calibrate.least_squares, which takes differences"
             )
         self.lane = lane

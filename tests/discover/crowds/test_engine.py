@@ -21,8 +21,7 @@ from nnode.discover.statistics.score import Screen, traces
 from nnode.model import Crowd, Relaxation, SocialForce
 from nnode.model.crowd_formula import CrowdBase
 from nnode.model.effects import CATALOGUE, Effect
-from nnode.model.effects.crowd_motion import Drift
-from nnode.model.effects.crowd_pairs import Alignment, PairRepulsion
+from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
 from nnode.model.field_crowd import PEDESTRIAN_LAWS, without_walls
 from nnode.model.formula_law import FormulaForce

@@ -71,7 +71,7 @@ def system(name: str) -> Crowd:
 def state(model: Crowd, x: torch.Tensor | None = None, v: torch.Tensor | None = None) -> State:
     x = BATCH.x[0] if x is None else x
     v = BATCH.v[0] if v is None else v
-    return State(torch.tensor(0.2), x, v, Scene.of(BATCH), system=model)
+    return State(torch.tensor(0.2), x, v, Scene.of(BATCH), terms=list(model.terms))
 
 
 def effect_of(name: str) -> tuple[Effect, Crowd]:
@@ -276,7 +276,9 @@ def test_turning_and_moving_everything_turns_the_acceleration(name: str) -> None
         )
     other = collate(items)
     effect, model = effect_of(name)
-    there = State(torch.tensor(0.2), other.x[0], other.v[0], Scene.of(other), system=model)
+    there = State(
+        torch.tensor(0.2), other.x[0], other.v[0], Scene.of(other), terms=list(model.terms)
+    )
     found, here = effect(there).detach().numpy(), effect(state(model)).detach().numpy()
     real = BATCH.agent.numpy()
     np.testing.assert_allclose(found[real], turn(here[real]), rtol=1e-8, atol=1e-9)
@@ -329,7 +331,7 @@ def test_effects_that_cannot_act_have_no_probes() -> None:
 def test_an_effect_on_a_force_that_is_not_there() -> None:
     model = Crowd([Relaxation(0.5)])
     add_effects(model, [{"name": "field_of_view", "lambda_": 0.5}])
-    with pytest.raises(ValueError, match="social_force or network_force"):
+    with pytest.raises(ValueError, match="SocialForce, NetworkForce"):
         model(torch.tensor(0.0), torch.cat([BATCH.x[0], BATCH.v[0]], -1), Scene.of(BATCH))
 
 
