@@ -6,12 +6,12 @@ import copy
 
 from nnode.errors import ConfigError
 from nnode.model.build import add_effects
-from nnode.model.crowd import InteractionForce
 from nnode.model.crowd_dynamics import SMALLEST
-from nnode.model.crowd_formula import CrowdBase, crowd_of
 from nnode.model.effects import Effect, IndividualEffect
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of
+from nnode.model.formula import crowd_of
+from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
 
 
@@ -37,7 +37,7 @@ def not_offered(effect: type[Effect], system: System) -> str:
             f"with desired={system.desired} everybody has a preferred speed already, measured in "
             "the seconds before: one for all would mend its errors and be no effect"
         )
-    if effect.acts_on is InteractionForce and system.find(InteractionForce) is None:
+    if effect.acts_on == "force" and not effect.finds(system.terms):
         return "the law has no force between people of its own that it could change"
     if system.domain != "traffic" or system.order == 1:
         return ""
@@ -54,7 +54,7 @@ def check_model(system: System) -> None:
     Raises:
         ConfigError: names the term and what to do.
     """
-    law = crowd_of([t for t in system.terms if isinstance(t, CrowdBase)])
+    law = crowd_of([t for t in system.terms if isinstance(t, Law)])
     if system.domain == "crowd" and law is not None and (law.order == 1 or law.sums[SMALLEST]):
         what = "of first order" if law.order == 1 else "with smallest values over others"
         raise ConfigError(

@@ -64,7 +64,7 @@ def _row(effect: type[Effect]) -> str:
     cells = (
         f"`{effect.name}`",
         what,
-        "; ".join(effect.formulas()),
+        "; ".join(effect.formula_lines()),
         "; ".join(ranges),
         effect.source,
     )

@@ -21,11 +21,11 @@ from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.crowd import GaitSway
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.formula import effect_increment
-from nnode.model.formula_law import law_from
-from nnode.model.lane_dynamics import Rule
+from nnode.model.laws import law_from
 from nnode.model.steps import STAGES
 from nnode.model.system import System
 from nnode.model.term import State, Term
+from nnode.model.terms import Rule
 from nnode.simulate.base import Trajectory, check_finite, substeps
 from nnode.simulate.ode import whole_steps
 from nnode.simulate.rates import Rates

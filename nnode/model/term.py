@@ -11,10 +11,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from nnode.model.crowd_dynamics import CrowdRule
-from nnode.model.lane_dynamics import Rule
 from nnode.model.names import check_names
 from nnode.model.scene import Scene
+from nnode.model.terms import Rule
 
 
 @dataclass
@@ -83,8 +82,8 @@ class Term(nn.Module):
     name: ClassVar[str]
     formula: ClassVar[str] = ""
     source: ClassVar[str]
-    rule: Rule | CrowdRule | None = None
-    rules: ClassVar[Mapping[int, Rule | CrowdRule]] = {}
+    rule: Rule | None = None
+    rules: ClassVar[Mapping[int, Rule]] = {}
     fast: ClassVar[dict[str, float]] = {}
 
     def __init__(self) -> None:
@@ -133,7 +132,7 @@ class Term(nn.Module):
             if bounds is not None:
                 parameter.clamp_(bounds.low, bounds.high)
 
-    def rule_for(self, order: int) -> Rule | CrowdRule | None:
+    def rule_for(self, order: int) -> Rule | None:
         """Its formulas in a model of an order; None: there are none, or it is code."""
         return self.rules.get(order)
 
@@ -144,12 +143,12 @@ class Term(nn.Module):
         return cls.formula if rule is None else "; ".join(described(rule))
 
     @classmethod
-    def formulas(cls) -> list[str]:
+    def formula_lines(cls) -> list[str]:
         """Its formulas in all orders, line by line; lines that repeat are left out."""
         found: list[str] = []
         for order, rule in sorted(cls.rules.items()):
             lines = described(rule)
-            of = "of an acceleration, " if order == 2 and isinstance(rule, Rule) else ""
+            of = "of an acceleration, " if order == 2 and not rule.of_crowd else ""
             new = [of + lines[0], *(line for line in lines[1:] if line not in found)]
             found += [f"{of}the same"] if lines == found else new
         return found or [cls.formula]
@@ -173,13 +172,13 @@ _REDUCED = {
 }
 
 
-def described(rule: Rule | CrowdRule, left: str = "W becomes ") -> list[str]:
+def described(rule: Rule, left: str = "W becomes ") -> list[str]:
     """The formulas of a rule, line by line.
 
     Args:
         left: what stands before the rate of a lane.
     """
-    if isinstance(rule, CrowdRule):
+    if rule.of_crowd:
         change = "dv{}/dt: {}{}" if rule.order == 2 else "d{}/dt = {}{}"
         found = [
             change.format(axis, "" if rule.order == 1 or text.startswith("-") else "+ ", text)

@@ -77,7 +77,7 @@ def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profil
     return advised(engine, fit.system, rival.fit.system, level)
 
 
-def named_agents(one: Individuals, order: int, confirmed: float) -> NamedEffect:
+def named_agents(one: Individuals, confirmed: float, order: int) -> NamedEffect:
     """An individual effect that was confirmed, in a law of an order."""
     effect = one.effect
     found = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -10,8 +11,8 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch, Domain
-from nnode.model.crowd_formula import contribution
-from nnode.model.formula import effect_increment
+from nnode.model.formula import contribution, effect_increment
+from nnode.model.laws import Law, entries
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import Interval, State, Term
@@ -92,7 +93,8 @@ class Effect(Term):
         settings: parameter name to :class:`Setting`.
         tried: one setting to the values, or one strength to the amounts, of a probe each; empty:
             there is one probe, of all strengths at the settings' own values.
-        acts_on: kind of the term that it changes; None: it acts on every model.
+        acts_on: what of the laws of people it changes, ``force`` or ``drive``, see
+            :class:`nnode.model.terms.Rule`; empty: it acts on every model.
         rank: place in the sum of terms; one that modifies the sum before it comes later.
         confusable_group: name of the class of effects that data often cannot tell apart from it;
             empty: none.
@@ -115,7 +117,7 @@ class Effect(Term):
     strengths: ClassVar[dict[str, Strength]] = {}
     settings: ClassVar[dict[str, Setting]] = {}
     tried: ClassVar[dict[str, tuple[float, ...]]] = {}
-    acts_on: ClassVar[type[Term] | None] = None
+    acts_on: ClassVar[str] = ""
     rank: ClassVar[int] = 0
     confusable_group: ClassVar[str] = ""
     distinguishing_data: ClassVar[str] = ""
@@ -154,12 +156,11 @@ class Effect(Term):
         Raises:
             ValueError: the model lacks the term that it acts on.
         """
-        kind = self.acts_on
-        if kind is not None and not any(isinstance(term, kind) for term in state.terms):
-            names = ", ".join(own.__name__ for own in kind.__subclasses__() or [kind])
+        if not self.finds(state.terms):
+            names = [name for name, entry in entries().items() if entry.get(self.acts_on)]
             raise ValueError(
-                f"effect {self.name} changes a term that the model does not have; add one of "
-                f"these to its terms: {names}"
+                f"effect {self.name} changes the {self.acts_on} of a law, but the model has none; "
+                f"add {' or '.join(names)} to its terms"
             )
         return (
             contribution(self, state) if self.domain == "crowd" else effect_increment(self, state)
@@ -171,9 +172,15 @@ class Effect(Term):
         return any(rule.memory for rule in cls.rules.values())
 
     @classmethod
+    def finds(cls, terms: Iterable[object]) -> bool:
+        """Whether these terms have what it acts on."""
+        laws = (term for term in terms if isinstance(term, Law))
+        return not cls.acts_on or any(getattr(law.formulas, cls.acts_on) for law in laws)
+
+    @classmethod
     def applies(cls, batch: Batch, system: System) -> bool:
         """Whether it can act on ``system``, and ``batch`` can show it."""
-        return cls.acts_on is None or system.find(cls.acts_on) is not None
+        return cls.finds(system.terms)
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:

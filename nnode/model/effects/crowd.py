@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.model.crowd import InteractionForce, Relaxation, norm
-from nnode.model.crowd_dynamics import CrowdRule
+from nnode.model.crowd import norm
 from nnode.model.effects.base import (
     CATALOGUE,
     Effect,
@@ -26,6 +25,7 @@ from nnode.model.effects.base import (
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import Interval
+from nnode.model.terms import Rule
 
 #: Places are looked for this far apart, m, but in no more than this many cells.
 SPACING, CELLS = 0.8, 170
@@ -59,7 +59,7 @@ class PairRepulsion(PairEffect):
 
     name = "pair_repulsion"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("more_x", "more_y"),
             others={"more_x": ("m/s²", "push*n_x"), "more_y": ("m/s²", "push*n_y")},
             where={"push": "A_2*exp((2*r - d)/B_2)"},
@@ -86,7 +86,7 @@ class SlidingFriction(PairEffect):
 
     name = "sliding_friction"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("drag_x", "drag_y"),
             others={"drag_x": ("m/s²", "-slide*n_y"), "drag_y": ("m/s²", "slide*n_x")},
             where={"slide": "c*exp((2*r - d)/reach)*(dvx*n_y - dvy*n_x)"},
@@ -105,7 +105,7 @@ class Alignment(PairEffect):
 
     name = "alignment"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("c*pull_x/(near + few)", "c*pull_y/(near + few)"),
             others={
                 "near": ("1", "weight"),
@@ -131,7 +131,7 @@ class DensitySlowdown(PairEffect):
 
     name = "density_slowdown"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("-c*density*vx", "-c*density*vy"),
             others={"density": ("1/m²", f"exp(-d**2/(2*h**2))/({2 * math.pi!r}*h**2)")},
             constants={"h": (1.0, "m")},
@@ -149,17 +149,17 @@ class DensitySlowdown(PairEffect):
 # -- the law's force between people ------------------------------------------------------------
 
 
-def _force(x: str, y: str, where: Mapping[str, str] | None = None) -> dict[int, CrowdRule]:
+def _force(x: str, y: str, where: Mapping[str, str] | None = None) -> dict[int, Rule]:
     """What is added to the force of another person; a mean over people, as that of the force."""
     rate = ("more_x/(mass*people)", "more_y/(mass*people)")
     others = {"more_x": ("N", x), "more_y": ("N", y)}
-    return {2: CrowdRule(rate=rate, others=others, where=where or {})}
+    return {2: Rule(rate=rate, others=others, where=where or {})}
 
 
 class ForceEffect(PairEffect):
     """An effect that adds to the force between people of the base law what changes of it."""
 
-    acts_on = InteractionForce
+    acts_on = "force"
     confusable_group = "pair_force"
 
 
@@ -233,9 +233,9 @@ class WalkerHeterogeneity(CrowdEffect, IndividualEffect):
     """
 
     name = "walker_heterogeneity"
-    rules = {2: CrowdRule(rate=("eta*drive_x", "eta*drive_y"), inputs={"eta": "1"})}
+    rules = {2: Rule(rate=("eta*drive_x", "eta*drive_y"), inputs={"eta": "1"})}
     source = "Campanella, Hoogendoorn & Daamen 2009 (heterogeneous walkers)"
-    acts_on = Relaxation
+    acts_on = "drive"
     strengths = {"sigma": Strength(0.0, 0.05, Interval(0.0, 2.0), "1", min_effect_size=0.2)}
     in_equation = False
     distinguishing_data = "people who are recorded for longer and turn more often"
@@ -255,7 +255,7 @@ class GaitSway(CrowdEffect, IndividualEffect):
 
     name = "gait_sway"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("sway*e_y", "-sway*e_x"),
             where={"sway": f"a*sin({2 * math.pi!r}*f*clock + phase)*there"},
             inputs={"phase": "1", "there": "1"},
@@ -301,7 +301,7 @@ class SidePreference(PairEffect):
 
     name = "side_preference"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("c*(1 - exp(-met))*e_y", "-c*(1 - exp(-met))*e_x"),
             others={"met": ("1", "max(ahead, 0)*max(facing, 0)*logistic((reach - d)/edge)")},
             where={
@@ -326,7 +326,7 @@ class GroupCohesion(CrowdEffect):
     name = "group_cohesion"
     covariate = "group"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("-c*way_x/max(mates, 1)", "-c*way_y/max(mates, 1)"),
             others={
                 "mates": ("1", "mate"),
@@ -356,7 +356,7 @@ class PreferredSpeed(CrowdEffect):
     """People return to a preferred speed; the base law keeps whatever speed they have."""
 
     name = "preferred_speed"
-    rules = {2: CrowdRule(rate=("c*(v_pref - speed)*e_x", "c*(v_pref - speed)*e_y"))}
+    rules = {2: Rule(rate=("c*(v_pref - speed)*e_x", "c*(v_pref - speed)*e_y"))}
     source = "Helbing & Molnár 1995 (relaxation to the desired speed)"
     strengths = {"c": Strength(0.0, 0.02, Interval(-0.02, 5.0), "1/s", min_effect_size=0.2)}
     settings = {"v_pref": Setting(1.3, Interval(0.0, 3.0), "m/s")}
@@ -377,7 +377,7 @@ class Drift(CrowdEffect):
     """A constant acceleration of everyone."""
 
     name = "drift"
-    rules = {2: CrowdRule(rate=("a_x", "a_y"))}
+    rules = {2: Rule(rate=("a_x", "a_y"))}
     source = "a slope, a wind or a current; no specific source"
     strengths = dict.fromkeys(
         ("a_x", "a_y"), Strength(0.0, 0.02, Interval(-3.0, 3.0), "m/s²", min_effect_size=0.1)
@@ -397,7 +397,7 @@ class WallRepulsion(CrowdEffect):
 
     name = "wall_repulsion"
     rules = {
-        2: CrowdRule(
+        2: Rule(
             rate=("away_x", "away_y"),
             walls={"away_x": ("m/s²", "push*off_x"), "away_y": ("m/s²", "push*off_y")},
             where={
@@ -435,7 +435,7 @@ def places(batch: Batch) -> list[tuple[float, float]]:
         spacing *= 1.25
 
 
-_PLACE = CrowdRule(
+_PLACE = Rule(
     rate=("push*to_x", "push*to_y"),
     where={
         "to_x": "x - x_o",

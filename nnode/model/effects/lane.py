@@ -19,11 +19,11 @@ from nnode.model.effects.base import (
     Setting,
     Strength,
 )
-from nnode.model.lane_dynamics import Rule
+from nnode.model.laws import Law
 from nnode.model.scene import Scene
 from nnode.model.system import System, Traffic
 from nnode.model.term import Interval
-from nnode.model.traffic import FollowTheLeader, LighthillWhithamRichards
+from nnode.model.terms import Rule
 
 #: A zone begins and ends over this distance, m, and a period over this time, s: their edges
 #: can then be calibrated.
@@ -43,7 +43,8 @@ _PER = {"per": (1.0, "s")}
 
 def has_law(system: System) -> bool:
     """Whether a model has a law of the gap; without one, an effect on it cannot be looked for."""
-    return system.find(FollowTheLeader) is not None or system.order > 1
+    law = system.find(Law)
+    return law is not None and (law.of_gap or system.order > 1)
 
 
 def gaps(x: Tensor) -> Tensor:
@@ -340,11 +341,14 @@ class TimeGap(LaneEffect):
         "by the speed ahead, where Pipes 1953 and Treiber, Hennecke & Helbing 2000 have one's own"
     )
     built_into_laws = True
-    acts_on = LighthillWhithamRichards
     strengths = {"h": Strength(0.0, 0.02, Interval(-0.3, 2.0), "s", min_effect_size=0.2)}
     rank = 40
     confusable_group = _AHEAD
     distinguishing_data = "a wider range of speeds"
+
+    @classmethod
+    def applies(cls, batch: Batch, system: System) -> bool:
+        return system.find_law("lin", "log") is not None
 
 
 @CATALOGUE.add

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, build_model
+from nnode.model.arrays import computed
 from nnode.model.effects.lane import ReactionDelay
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.steps import METHODS
 from nnode.model.tangent import with_tangents
-from nnode.model.tensors import computed
 from nnode.simulate import Solver, TorchdiffeqSolver
 from nnode.simulate.kernels import lanes
 from tests.model.following import DT, driven, model, set_
@@ -165,10 +165,12 @@ def test_of_effects_and_of_what_they_remember(effect: dict[str, Any]) -> None:
     compared(system, platoons(), names)
 
 
-def test_of_starts_that_depend_on_the_law_and_on_measured_speeds() -> None:
-    """Of first order: the gap opens at the start as the law says; a leader's speed is measured."""
-    system = linear({"name": ReactionDelay.name, "T": 0.4})
-    compared(system, platoons(), owned(system))
+def test_a_start_that_is_no_formula_is_refused() -> None:
+    system, batch = linear({"name": ReactionDelay.name, "T": 0.4}), platoons()
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    with pytest.raises(ValueError, match="start of every added state that is a formula"):
+        lanes.tangents(system, lane, batch, 2, ["lin__v0"])
 
 
 def test_their_formulas_are_the_slopes_of_the_rate() -> None:
