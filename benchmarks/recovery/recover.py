@@ -148,7 +148,7 @@ def _system(law: Mapping[str, Any], typed: Mapping[str, float], dim: int) -> Sys
 
 def _metres(problem: ResidualProblem, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``(M,)`` differences of coordinates, m, and their ``(M, K)`` derivatives."""
-    away, _, slope = problem.linearised(row)
+    _, away, slope = problem.linearised(row)
     return away.numpy().ravel(), slope.flatten(1).T.numpy()
 
 

@@ -12,14 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import FOLLOWING, Convention, changed_gap, errors, net_gaps
+from nnode.calibrate.cost import (
+    FOLLOWING,
+    Convention,
+    changed_gap,
+    errors,
+    net_gaps,
+    sequence_costs,
+)
 from nnode.calibrate.least_squares import Minimum, Quadratic, least_squares
 from nnode.calibrate.options import StartSpeeds
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.system import Crowd, System, Traffic
-from nnode.simulate.base import simulated_batch, substeps
+from nnode.simulate.base import Trajectory, simulated_batch, substeps
 from nnode.simulate.fused import FusedSolver
 from nnode.simulate.kernels import lanes
 
@@ -127,16 +134,16 @@ class ResidualProblem:
         ``(B, P)``."""
         if self.fitted is not None:
             return np.asarray(self._settled(rows).cost)
-        return self._cost(*self._errors(*self._paths(rows)[:2]))
+        return self._cost(*self._paths(rows)[:2])
 
     def __call__(self, rows: np.ndarray) -> Quadratic:
         """Costs and their derivatives, of parameters as in :meth:`costs`."""
         if self.fitted is None:
             return self._quadratic(*self.linearised(rows))
         self._last = start = self._settled(rows).row
-        away, seen, slope = self.linearised(rows, start)
+        cost, away, slope = self.linearised(rows, start)
         both = torch.cat([slope, self._by_start(rows, start, away)])
-        return self._quadratic(away, seen, both).profiled(len(slope))
+        return self._quadratic(cost, away, both).profiled(len(slope))
 
     def start_speeds(self, rows: np.ndarray) -> dict[str, list[float]]:
         """First speeds (m/s) that are best for parameters, by sequence and vehicle; none where
@@ -194,16 +201,28 @@ class ResidualProblem:
         other parameters asked for may be far from the best, where no step helps.
         """
 
-        def quadratic(start: np.ndarray) -> Quadratic:
-            away, seen = self._errors(*self._paths(rows, start)[:2])
-            return self._quadratic(away, seen, self._by_start(rows, start, away))
+        assert self.fitted is not None
+        best = np.full(len(self.batch), math.inf)
+        away = torch.zeros(0)
 
         def costs(trials: np.ndarray) -> np.ndarray:
-            return np.stack([self._cost(*self._errors(*self._paths(rows, v)[:2])) for v in trials])
+            """They leave the errors of the best speeds, which the search goes on from."""
+            nonlocal away, best
+            (start,) = trials
+            x, v, *_ = self._paths(rows, start)
+            cost, new = self._cost(x, v), errors(x, v, self.batch, self.convention)[0]
+            better = torch.from_numpy(cost < best)[:, None]
+            away, best = (
+                torch.where(better, new, away) if len(away) else new,
+                np.minimum(cost, best),
+            )
+            return cost[None]
 
-        assert self.fitted is not None
-        begin = np.stack([self._given, self._last])
-        start = np.where(np.less(*costs(begin))[:, None], *begin)
+        def quadratic(start: np.ndarray) -> Quadratic:
+            return self._quadratic(best, away, self._by_start(rows, start, away))
+
+        given, last = costs(self._given[None])[0], costs(self._last[None])[0]
+        start = np.where((last < given)[:, None], self._last, self._given)
         low = np.where(self.fitted, 0.0, self._given)
         high = np.where(self.fitted, math.inf, self._given)
         return least_squares(quadratic, costs, start, low, high, steps=_TURNS, tolerance=_SETTLED)
@@ -215,7 +234,8 @@ class ResidualProblem:
         for i in np.flatnonzero(self.fitted.any(0)):
             other = start.copy()
             other[:, i] += _SPEED * self.fitted[:, i]
-            found[i] = (self._errors(*self._paths(rows, other)[:2])[0] - away) / _SPEED
+            x, v, *_ = self._paths(rows, other)
+            found[i] = (errors(x, v, self.batch, self.convention)[0] - away) / _SPEED
         return torch.nan_to_num(found)
 
     # -- simulations -----------------------------------------------------------------------------
@@ -282,23 +302,15 @@ class ResidualProblem:
 
     # -- from paths to costs ---------------------------------------------------------------------
 
-    def _errors(self, x: Tensor, v: Tensor | None) -> tuple[Tensor, Tensor]:
-        """``(K, B, N D)`` errors of coordinates, or ``(K, B, N - 1)`` of followers, and which
-        count."""
-        if self.convention in FOLLOWING:
-            return errors(x, v, self.batch, self.convention)
-        seen = self.batch.valid.repeat_interleave(self.system.dim, -1)
-        return torch.where(seen, x - self.batch.x.flatten(-2), 0.0), seen
-
     def linearised(
         self, rows: np.ndarray, start: np.ndarray | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Errors ``(K, B, N D)``, which count, and their derivatives ``(P, K, B, N D)``.
+    ) -> tuple[np.ndarray, Tensor, Tensor]:
+        """Costs ``(B,)``, errors ``(K, B, N D)`` and their derivatives ``(P, K, B, N D)``.
 
-        Of followers, ``(K, B, N - 1)`` each.
+        Of followers, ``(K, B, N - 1)`` and ``(P, K, B, N - 1)``.
         """
         x, v, slope, dv = self._paths(rows, start, slopes=True)
-        away, seen = self._errors(x, v)
+        away, seen = errors(x, v, self.batch, self.convention)
         if self.convention is Convention.speed:
             assert dv is not None
             slope = dv[..., :-1]
@@ -309,13 +321,15 @@ class ResidualProblem:
                 change = changed_gap(own, measured, self.convention)
                 (factor,) = torch.autograd.grad(change.sum(), own)
             slope = torch.diff(slope) * factor
-        return away.double(), seen, torch.where(seen, slope, 0.0).double()
+        return self._cost(x, v), away.double(), torch.where(seen, slope, 0.0).double()
 
-    def _quadratic(self, away: Tensor, seen: Tensor, slope: Tensor) -> Quadratic:
-        cost, number = self._cost(away, seen), seen.sum((0, -1)).clamp(min=1).numpy()
+    def _quadratic(self, cost: np.ndarray, away: Tensor, slope: Tensor) -> Quadratic:
+        number = self.batch.valid[1:, :, 1:].sum((0, -1)).clamp(min=1).numpy()
         match self.convention:
-            case Convention.integral | Convention.sum:
-                scale = np.full(len(cost), self._weight)
+            case Convention.integral:
+                scale = np.full(len(cost), self.batch.dt)
+            case Convention.sum:
+                scale = np.ones(len(cost))
             case Convention.spacing:
                 scale = 1 / (number * np.maximum(cost, 1e-12))
             case _:
@@ -329,26 +343,19 @@ class ResidualProblem:
             np.nan_to_num(hessian * scale[:, None, None]),
         )
 
-    @property
-    def _weight(self) -> float:
-        return self.batch.dt if self.convention is Convention.integral else 1.0
-
-    def _cost(self, away: Tensor, seen: Tensor) -> np.ndarray:
-        total = away.double().square().sum((0, -1))
-        if self.convention not in FOLLOWING:
-            total = 0.5 * self._weight * total
-        else:
-            total = total / seen.sum((0, -1)).clamp(min=1)
-            total = total.sqrt() if self.convention is Convention.spacing else total
-        return torch.where(torch.isfinite(total), total, math.inf).numpy()
+    def _cost(self, x: Tensor, v: Tensor | None) -> np.ndarray:
+        batch = self.batch
+        run = Trajectory(x.reshape(batch.x.shape), None if v is None else v[..., None])
+        cost = sequence_costs(run, batch, self.convention)
+        return torch.where(torch.isfinite(cost), cost, math.inf).numpy()
 
 
 def _lane(system: System, batch: Batch) -> Any:
     lane = lanes.supports(system, batch)
-    if lane is None or any(state not in lane.starts for state in list(lane.rates)[lane.order :]):
+    if lane is None:
         raise ConfigError(
-            "optimizer=gauss_newton needs a model of a lane whose law and effects are formulas, "
-            "starts of their memory as well; take another optimizer"
+            "optimizer=gauss_newton needs a model of a lane whose law and effects are formulas; "
+            "take another optimizer"
         )
     return lane
 
