@@ -23,9 +23,7 @@ from nnode.simulate.base import (
     simulated_batch,
     substeps,
 )
-from nnode.simulate.kernels import lanes
-from nnode.simulate.kernels.crowds import cells
-from nnode.simulate.kernels.crowds import runs as crowds
+from nnode.simulate.kernels import crowds, lanes
 from nnode.simulate.ode import TorchdiffeqSolver
 
 log = logging.getLogger(__name__)
@@ -59,7 +57,7 @@ class FusedSolver:
         cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
             left out, in units of A. The acceleration of one person is then off by less than
             ``cutoff_error`` A / m through people, and as much through walls; see
-            :func:`nnode.simulate.kernels.crowds.cells.cutoff_distance`. 0 lets everybody meet
+            :func:`nnode.simulate.kernels.crowds.cutoff_distance`. 0 lets everybody meet
             everybody.
         method: of lanes, one of :data:`nnode.model.steps.METHODS`; None takes the law's own,
             ``rk4`` for the smooth laws of the field, else ``ballistic`` for accelerations and
@@ -88,7 +86,7 @@ class FusedSolver:
                 f"solver.method={method} is unknown to solver=fused, expected one of "
                 f"{', '.join(METHODS)}, or null for the law's own"
             )
-        cells.check_cutoff(cutoff, cutoff_error)
+        crowds.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads
         self.cutoff, self.cutoff_error = cutoff, cutoff_error
         self.method, self.uncompiled = method, ""

@@ -19,9 +19,9 @@ from nnode.model.lane_dynamics import Rule
 from nnode.model.names import check_names, check_symbols
 from nnode.model.term import Term
 from nnode.model.traffic import Linear
-from nnode.simulate.kernels.crowds.alone import WalkSource
-from nnode.simulate.kernels.crowds.source import CrowdSource
-from nnode.simulate.kernels.lanes.source import LaneSource
+from nnode.simulate.kernels.alone import WalkSource
+from nnode.simulate.kernels.crowds import CrowdSource
+from nnode.simulate.kernels.lanes import LaneSource
 
 CODE = '__import__("os").abort()'
 #: An annotation, an index, a default, a second line, letters and digits that are not ASCII.

@@ -15,8 +15,8 @@ def source(model: System) -> str:
     Raises:
         ValueError: the model has a term that is no formula.
     """
-    from nnode.simulate.kernels.crowds.source import CrowdSource
-    from nnode.simulate.kernels.lanes.source import LaneSource
+    from nnode.simulate.kernels.crowds import CrowdSource
+    from nnode.simulate.kernels.lanes import LaneSource
 
     if isinstance(model, Traffic):
         lane = model.lane

@@ -34,8 +34,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
-from numba.extending import overload
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, overload
 
 from nnode.simulate.kernels.polynomials import (
     LOG2,
@@ -55,6 +56,8 @@ from nnode.simulate.kernels.polynomials import (
 FLAGS = {"contract", "nsz"}
 #: Options of every function that is to vanish into its caller's loop.
 INLINE: Any = {"forceinline": True, "fastmath": FLAGS, "error_model": "numpy"}
+#: Options of functions that hold a loop.
+LOOP: Any = {"fastmath": FLAGS, "error_model": "numpy"}
 
 
 @njit(**{**INLINE, "fastmath": {*FLAGS, "reassoc"}})
@@ -233,3 +236,22 @@ def _torch_softplus(x: Any) -> Callable[..., Any] | None:
         return (x if beyond else value), (1.0 if beyond else slope)
 
     return body
+
+
+_memmove: Any = cgutils.raw_memmove
+
+
+@intrinsic
+def copy(typing_context: Any, target: Any, source: Any, number: Any) -> Any:
+    """The first numbers of a row to another one, which may be the same array further on: a loop
+    that cannot know how far would take them one by one."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        rows = [
+            context.make_array(kind)(context, builder, value).data
+            for kind, value in zip(signature.args[:2], args[:2], strict=True)
+        ]
+        _memmove(builder, *rows, args[2], context.get_abi_sizeof(rows[0].type.pointee))
+        return context.get_dummy_value()
+
+    return types.none(target, source, types.intp), emit

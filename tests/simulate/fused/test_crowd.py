@@ -17,10 +17,9 @@ from nnode.model import Crowd, Linear, NetworkForce, Relaxation, SocialForce, Sy
 from nnode.model.effects import CATALOGUE
 from nnode.model.network import FeedForward
 from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
-from nnode.simulate.fused import engine
-from nnode.simulate.kernels.crowds import runs as compiled
-from nnode.simulate.kernels.crowds.rows import SIZE
-from nnode.simulate.kernels.crowds.source import CrowdSource
+from nnode.simulate import fused as engine
+from nnode.simulate.kernels import crowds as compiled
+from nnode.simulate.kernels.crowds import SIZE, CrowdSource
 from tests.simulate.fused.compare import difference, single
 from tests.simulate.fused.test_fallback import Sway
 
@@ -291,7 +290,7 @@ def test_loops_are_vector_code(name: str) -> None:
     module = compiled.compiled(source)
     for kind in (np.float64, np.float32):
         room, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
-        loops = ("law_others_pull", "law_points_pull", "slopes_others", "slopes_points")
+        loops = ("law_others_vjp", "law_points_vjp", "slopes_others", "slopes_points")
         divide = [getattr(module, one) for one in loops if hasattr(module, one)]
         assert len(divide) == 2
         for function in divide:

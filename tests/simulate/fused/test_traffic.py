@@ -11,7 +11,7 @@ from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.model import Linear, Logarithmic, NetworkSpeed, Traffic
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from nnode.simulate.fused import engine
+from nnode.simulate import fused as engine
 from nnode.simulate.kernels import lanes
 from tests.simulate.fused.compare import difference, gradient, single
 
