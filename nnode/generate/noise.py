@@ -25,8 +25,7 @@ from nnode.model.steps import STAGES
 from nnode.model.system import System
 from nnode.model.term import State, Term
 from nnode.simulate.base import Trajectory, check_finite, substeps
-from nnode.simulate.ode import whole_steps
-from nnode.simulate.rates import Rates
+from nnode.simulate.ode import Rates, whole_steps
 
 
 @dataclass(frozen=True)

@@ -562,7 +562,7 @@ def simulate(
     threads: int = 1,
     cutoff: float | None = None,
     cutoff_error: float = 1e-10,
-) -> tuple[Tensor, Tensor | None]:
+) -> Tensor:
     """Simulate a crowd model with the formula ``law`` (see :func:`supports`), by Euler's method.
 
     The gradient with respect to the parameters and the initial state is that of the discrete
@@ -581,7 +581,7 @@ def simulate(
             everybody meet everybody.
 
     Returns:
-        x and v at the samples, ``(K, B, N, 2)`` m and m/s; None for v of a law of first order.
+        ``(K, B, N, M)`` states at the samples, m and m/s; positions alone of a law of first order.
         Padding people stand still.
 
     Raises:
@@ -644,7 +644,7 @@ def simulate(
     fixed = [y0.new_tensor(value) for value in settings_of(terms, law).values()]
     q = torch.stack([*values_of(law, own_values(terms, law)), *fixed]).to(kind)
     y: Tensor = Simulate.apply(plan, y0.permute(2, 0, 1), q[None]).permute(1, 2, 3, 0).contiguous()
-    return y[..., :2], y[..., 2:] if law.order == 2 else None
+    return y[..., : 2 * law.order]
 
 
 def _table(place: Tensor, more: Tensor, exists: Tensor, kind: torch.dtype) -> np.ndarray:
