@@ -11,7 +11,7 @@ can the compiler tell that nothing that it writes is something that it still has
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, cast
@@ -47,10 +47,10 @@ from nnode.simulate.kernels.runs import (
     Plan,
     Simulate,
     compiled,
-    lines,
+    fill,
+    head,
     seeds,
     shared_out,
-    template,
 )
 
 #: From so many people on, social forces use cell lists. They are faster for 50 already; smaller
@@ -81,6 +81,8 @@ _PARTNERS = {
 }
 #: Where the numbers of receivers and sources stand: behind each other, or somewhere.
 _AT = {False: ("at + j", "to + j"), True: ("at[j]", "to[j]")}
+#: Sign, array, row and place of a number.
+_Part = tuple[str, str, int, str]
 #: What a difference is made of: the receiver's part and the source's, of which one may be missing.
 _PARTS = {
     OTHERS: {"dx": ("x", "x"), "dy": ("y", "y"), "dvx": ("vx", "vx"), "dvy": ("vy", "vy")},
@@ -89,14 +91,6 @@ _PARTS = {
         "normal_x": ("", "normal_x"), "normal_y": ("", "normal_y"),
     },
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Feature:
-    """A number of a receiver and one of a source, of which a summand sees the difference."""
-
-    own: Expr
-    other: Expr
 
 
 @dataclass(frozen=True)
@@ -118,12 +112,12 @@ class CrowdSource:
         return [*self.law.owned, *self.law.settings]
 
     @cached_property
-    def _split(self) -> tuple[CrowdDynamics, dict[str, dict[str, Feature]]]:
+    def _split(self) -> tuple[CrowdDynamics, dict[str, dict[str, tuple[Expr, Expr]]]]:
         # pair by pair there is little to save
         return (self.law, {}) if self.near else split(self.law, self.uniform)
 
     @property
-    def features(self) -> dict[str, dict[str, Feature]]:
+    def features(self) -> dict[str, dict[str, tuple[Expr, Expr]]]:
         """Numbers of receivers and sources whose differences sums are made of, if they are."""
         return self._split[1]
 
@@ -142,6 +136,12 @@ class CrowdSource:
     def over(self) -> dict[str, dict[str, Expr]]:
         """What sums run over, and these."""
         return {over: sums for over, sums in self._split[0].sums.items() if sums}
+
+    @cached_property
+    def formulas(self) -> dict[str, dict[str, Expr]]:
+        """The same, and under ``own`` both components of the acceleration."""
+        x, y = self._split[0].rate
+        return {**self.over, "own": {"O_x": x, "O_y": y}}
 
     @cached_property
     def sums(self) -> list[str]:
@@ -164,11 +164,8 @@ class CrowdSource:
     def kept(self) -> list[str]:
         """Sums on which the gradient depends by itself."""
         needed: list[Expr] = []
-        for formulas, slopes in (
-            (self._rate, self._slopes_own),
-            *((self.over[over], self._slopes(over)) for over in self.over if over == SMALLEST),
-        ):
-            stored, ends = self.loop.adjoints(seeds(formulas, _weight), slopes)
+        for over in {"own", SMALLEST} & {*self.formulas}:
+            stored, ends = self.loop.adjoints(self._seeds(over), self._slopes(over))
             needed += [*stored.values(), *ends.values()]
         inner = {*symbols(needed), *self.rows_of_sums[len(self.sums) :]}
         return [name for name in self.rows_of_sums if name in inner]
@@ -177,18 +174,13 @@ class CrowdSource:
     def loop(self) -> Loop:
         return Loop(self.uniform, options="LOOP", fixed=tuple(self.law.settings))
 
-    @cached_property
-    def _rate(self) -> dict[str, Expr]:
-        x, y = self._split[0].rate
-        return {"O_x": x, "O_y": y}
-
-    @cached_property
-    def _slopes_own(self) -> dict[str, str]:
-        return {f"D_{name}": name for name in (*_STATE, *self.sums)}
+    def _seeds(self, over: str) -> dict[Expr, Expr]:
+        return seeds(self.formulas[over], _weight)
 
     def _slopes(self, over: str) -> dict[str, str]:
-        names = [*_RELATIVE[over], *_STATE, *self.sums]
-        used = set(symbols(self.over[over].values()))
+        """Rows of adjoints to what they are of."""
+        names = [*_RELATIVE.get(over, ()), *_STATE, *self.sums]
+        used = set(symbols(self.formulas[over].values()))
         return {f"D_{name}": name for name in names if name in used}
 
     @cached_property
@@ -210,198 +202,176 @@ class CrowdSource:
         Raises:
             ConfigError: a name in the formulas that is no symbol.
         """
-        law, sections = self.law, template("crowd")
+        law = self.law
         check_symbols([*self.rows, *self.uniform, *law.symbols])
         state = "v" if law.order == 2 else ""
         formula = [f"d{state}{a}/dt = {plain(r)}" for a, r in zip("xy", law.rate, strict=True)]
         for over, sums in self.over.items():
             what = "smallest over others of" if over == SMALLEST else f"sum over {over} of"
             formula += [f"{plain(symbol(n))} = {what} {plain(s)}" for n, s in sums.items()]
-        constants = sections["constants"].substitute(
+        whom = "near" if self.near else "everybody"
+        text = head(
+            "crowd",
+            formula,
+            CHUNK,
+            [f"_{r} = np.uint64({i * SIZE})" for i, r in enumerate(self.rows)],
             size=SIZE,
             rows=len(self.rows),
             kept=[self.rows_of_sums.index(name) for name in self.kept],
-            places=lines(0, *(f"_{r} = np.uint64({i * SIZE})" for i, r in enumerate(self.rows))),
         )
-        text = template("shared")["head"].substitute(
-            formula="\n".join(formula), chunk=CHUNK, constants=constants
-        )
-        whom = "near" if self.near else "everybody"
-        text += sections["rows"].template + sections[whom].template
-        for over, sums in self.over.items():
+        text += fill("crowd", "rows") + fill("crowd", whom)
+        for over in self.formulas:
             if over in self.features:
                 text += self._neurons(over)
                 continue
-            text += self._functions(f"law_{over}", sums, self._slopes(over))
-            if over == SMALLEST:
-                text += self._smallest()
-                continue
-            text += self._pairs(over)
-            antisymmetric = self.antisymmetric and over == OTHERS
-            for end, rest in (("", "sums, reaction"), ("_vjp", "weight, to_own, to_other")):
-                text += sections[f"meet {whom}"].substitute(
-                    name=f"{over}{end}", rest=rest, antisymmetric=antisymmetric
-                )
-        text += self._functions("law_own", self._rate, self._slopes_own)
-        text += sections["rates"].substitute(self._rates_text())
-        return text + sections["simulate"].substitute(self._drivers(whom))
+            text += self.loop.function(f"law_{over}", self.formulas[over])
+            slopes = self._slopes(over)
+            text += self.loop.pulled(f"law_{over}_vjp", self._seeds(over), slopes, [])
+            match over:
+                case "own":
+                    text += self._rates()
+                case _ if over == SMALLEST:
+                    text += self._smallest()
+                case _:
+                    text += self._pairs(over, whom)
+        return text + fill("crowd", "simulate", **self._drivers(whom))
 
-    def _functions(self, name: str, formulas: dict[str, Expr], slopes: dict[str, str]) -> str:
-        """Formulas of rows, and their gradients."""
-        text = self.loop.function(name, formulas)
-        return text + self.loop.pulled(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
-
-    def _gather(self, over: str, near: bool) -> list[str]:
-        """Into the buffer: what a sum takes from receivers and sources."""
-        used, relative, seen = symbols(self.over[over].values()), _RELATIVE[over], [*SEEN[over]]
+    def _taken(self, over: str, near: bool) -> dict[str, list[_Part]]:
+        """Rows of the buffer to what they are the sum of."""
+        relative, seen = _RELATIVE.get(over, ()), [*SEEN.get(over, ())]
         at, to = _AT[near]
-        body = []
-        for n in used:
+        taken: dict[str, list[_Part]] = {}
+        for n in symbols(self.formulas[over].values()):
             if n in relative:
                 c = relative.index(n)
-                body.append(f"buffer[_{n} + j] = own[{c}, {at}] - other[{c}, {to}]")
+                taken[n] = [("", "own", c, at), ("-", "other", c, to)]
             elif n in seen:
-                body.append(f"buffer[_{n} + j] = other[{seen.index(n)}, {to}]")
+                taken[n] = [("", "other", seen.index(n), to)]
             elif n in self.own:
-                body.append(f"buffer[_{n} + j] = own[{self.own.index(n)}, {at}]")
-            elif n.endswith("_j") and n[:-2] in self.own:
-                body.append(f"buffer[_{n} + j] = other[{self.own.index(n[:-2])}, {to}]")
-            elif over == SMALLEST and n in self.sums:
-                body.append(f"buffer[_{n} + j] = sums[{self.sums.index(n)}, {at}]")
-        return body
+                taken[n] = [("", "own", self.own.index(n), at)]
+            elif n[:-2] in self.own and n.endswith("_j"):
+                taken[n] = [("", "other", self.own.index(n[:-2]), to)]
+            elif n in self.sums and over in (SMALLEST, "own"):
+                taken[n] = [("", "sums", self.sums.index(n), at)]
+        return taken
 
-    def _to_receivers(self, over: str, near: bool) -> list[str]:
-        """Out of the buffer: adjoints of what was taken from receivers."""
-        used, at = symbols(self.over[over].values()), _AT[near][0]
-        targets = {n: ("to_own", c) for c, n in enumerate(_RELATIVE[over]) if n in used}
-        targets |= {n: ("to_own", c) for c, n in enumerate(_STATE) if n in used}
-        if over == SMALLEST:
-            targets |= {n: ("weighted", i) for i, n in enumerate(self.sums) if n in used}
-        return [_increase(a, c, at, f"buffer[_D_{n} + j]") for n, (a, c) in targets.items()]
+    def _scattered(self, over: str, near: bool, *arrays: str) -> list[str]:
+        """Adjoints out of the buffer to those of what was taken from some arrays."""
+        taken = self._taken(over, near)
+        return _scatter({n: taken[n] for n in self._slopes(over).values()}, *arrays)
 
-    def _to_sources(self, over: str, near: bool) -> list[str]:
-        used, to = symbols(self.over[over].values()), _AT[near][1]
-        moved = [(c, n) for c, n in enumerate(_RELATIVE[over]) if n in used]
-        return [_increase("to_other", c, to, f"buffer[_D_{n} + j]", "-") for c, n in moved]
-
-    def _pairs(self, over: str) -> str:
-        """Some pairs: what they add to sums, and their adjoints."""
+    def _pairs(self, over: str, whom: str) -> str:
+        """Some pairs: what they add to sums, and their adjoints; and all of them."""
         at, to = _AT[self.near]
-        mirrored = self.antisymmetric and over == OTHERS
+        antisymmetric = self.antisymmetric and over == OTHERS
         mine, its = ("", "") if self.near else (f"other_mask[{to}] * ", f"own_mask[{at}] * ")
-        add, weights = [], []
+        add, weights = [], {}
         for n, summand in self.over[over].items():
             c = self.sums.index(n)
-            add.append(_increase("sums", c, at, f"{mine}buffer[_{n} + j]"))
+            add.append(_increase("sums", c, at, f"+ {mine}buffer[_{n} + j]"))
             weight = f"{mine}weight[{c}, {at}]"
-            if mirrored:
-                add.append(_increase("reaction", c, to, f"{its}buffer[_{n} + j]", "-"))
+            if antisymmetric:
+                add.append(_increase("reaction", c, to, f"- {its}buffer[_{n} + j]"))
                 weight += f" - {its}weight[{c}, {to}]"
             if not summand.is_number():
-                weights.append((n, weight))
-        back = self._to_receivers(over, self.near)
-        back += self._to_sources(over, self.near) if over == OTHERS else []
-        return template("crowd")["pairs"].substitute(
+                weights[n] = weight
+        moving = ["other"] if over == OTHERS else []  # walls do not move
+        text = fill(
+            "crowd",
+            "pairs",
             over=over,
-            gather=_each(1, self._gather(over, self.near)),
-            add=_each(1, add),
-            weights=_weight_rows(1, weights),
-            scatter=_each(1, back),
+            gather=_gather(self._taken(over, self.near)),
+            add=_each(add),
+            weights=_weighted(weights),
+            scatter=self._scattered(over, self.near, "own", *moving),
         )
+        for end, rest in (("", "sums, reaction"), ("_vjp", "weight, to_own, to_other")):
+            text += fill(
+                "crowd", f"meet {whom}", name=over + end, rest=rest, antisymmetric=antisymmetric
+            )
+        return text
 
     def _smallest(self) -> str:
         """Smallest values over the others, and their gradients."""
         names, first, who = [*self.over[SMALLEST]], self.sums.index, len(self.sums)
-        weights = [
-            (n, f"weighted[{first(n)}, at[j]] if which == {r} else real(0, dt)")
-            for r, n in enumerate(names)
-        ]
-        smaller = [
-            f"neighbour_min(sums[{first(n)}], sums[{who + r}], low, own_mask, start, length, "
-            f"buffer[_{n}:], n)"
-            for r, n in enumerate(names)
-        ]
-        back = [*self._to_receivers(SMALLEST, True), *self._to_sources(SMALLEST, True)]
-        return template("crowd")["smallest"].substitute(
+        return fill(
+            "crowd",
+            "smallest",
             number=len(names),
             first=first(names[0]),
             who=who,
             nobody=NOBODY,
-            gather=_each(3, self._gather(SMALLEST, False)),
-            smaller=lines(3, *smaller),
-            gather_pairs=_each(3, self._gather(SMALLEST, True)),
-            weights=_weight_rows(3, weights),
-            scatter=_each(3, back),
+            gather=_gather(self._taken(SMALLEST, False)),
+            smaller=[
+                f"neighbour_min(sums[{first(n)}], sums[{who + r}], low, own_mask, start, length, "
+                f"buffer[_{n}:], n)"
+                for r, n in enumerate(names)
+            ],
+            gather_pairs=_gather(self._taken(SMALLEST, True)),
+            weights=_weighted(
+                {
+                    n: f"to_sums[{first(n)}, at[j]] if which == {r} else real(0, dt)"
+                    for r, n in enumerate(names)
+                }
+            ),
+            scatter=self._scattered(SMALLEST, True, "own", "sums", "other"),
         )
 
     def _neurons(self, over: str) -> str:
         """Features of receivers and of sources, sums of functions of their differences, and the
         gradients."""
-        text, features, sections = "", self.features[over], template("crowd")
-        for whose in ("own", "other"):
-            formulas = {z: getattr(feature, whose) for z, feature in features.items()}
-            # walls do not move
-            moves = over == OTHERS or whose == "own"
+        text, features = "", self.features[over]
+        for side, whose in enumerate(("own", "other")):
+            formulas = {z: feature[side] for z, feature in features.items()}
+            moves = over == OTHERS or whose == "own"  # walls do not move
             columns = _STATE if moves else ("x", "y", "normal_x", "normal_y")
             used = set(symbols(formulas.values()))
-            takes = {n: c for c, n in enumerate(columns) if n in used}
-            name = f"{whose}_{over}"
-            slopes = {f"D_{n}": n for n in takes if moves}
-            text += self._functions(f"features_{name}", formulas, slopes)
-            gather = [
+            taken: dict[str, list[_Part]] = {
                 # from somebody's place on, for large numbers cost digits
-                f"buffer[_{n} + j] = own[{c}, at + j]" + (f" - y[{c}, 0]" if c < 2 else "")
-                for n, c in takes.items()
-            ]
-            back = [
-                _increase("to_own", takes[n], "at + j", f"buffer[{'_' + row} + j]")
-                for row, n in slopes.items()
-            ]
-            text += sections["features"].substitute(
-                name=name,
-                gather=_each(2, gather),
+                n: [("", "own", c, "at + j"), *([("-", "y", c, "0")] if c < 2 else [])]
+                for c, n in enumerate(columns)
+                if n in used
+            }
+            name = f"features_{whose}_{over}"
+            slopes = {f"D_{n}": n for n in taken if moves}
+            text += self.loop.function(name, formulas)
+            text += self.loop.pulled(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
+            text += fill(
+                "crowd",
+                "features",
+                name=f"{whose}_{over}",
+                gather=_gather(taken),
                 store=_each(
-                    2, [f"features[{i}, at + j] = buffer[_{z} + j]" for i, z in enumerate(features)]
+                    f"features[{i}, at + j] = buffer[_{z} + j]" for i, z in enumerate(features)
                 ),
-                weights=_weight_rows(
-                    2, [(z, f"weight[{i}, at + j]") for i, z in enumerate(features)]
-                ),
-                scatter=_each(2, back),
+                weights=_weighted({z: f"weight[{i}, at + j]" for i, z in enumerate(features)}),
+                scatter=_scatter(taken if moves else {}, "own"),
             )
         value = apply(self.over[over][f"{over}_s0"].op, symbol("z"))
-        return text + sections["neurons"].substitute(
+        return text + fill(
+            "crowd",
+            "neurons",
             over=over,
             first=self.sums.index(f"{over}_one"),
-            value=lines(2, *self.loop.of_numbers({"value": value})),
-            slope=lines(2, *self.loop.of_numbers({"slope": derivatives(value, ["z"])["z"]})),
+            value=self.loop.of_numbers({"value": value}),
+            slope=self.loop.of_numbers({"slope": derivatives(value, ["z"])["z"]}),
         )
 
-    def _rates_text(self) -> dict[str, str]:
-        """What accelerations take, and what their gradient gives back."""
-        used = set(symbols(self._rate.values()))
-        takes = [("own", i, n) for i, n in enumerate(self.own) if n in used]
-        takes += [("sums", i, n) for i, n in enumerate(self.sums) if n in used]
-        back = [
-            _increase("to_own", c, "at + j", f"buffer[_D_{n} + j]") for c, n in enumerate(_STATE)
-        ]
-        back += [f"to_sums[{i}, at + j] = buffer[_D_{n} + j]" for i, n in enumerate(self.sums)]
-        axes = [*enumerate("xy")]
-        return {
-            "gather": _each(2, [f"buffer[_{n} + j] = {a}[{i}, at + j]" for a, i, n in takes]),
-            "store": _each(2, [f"rate[{i}, at + j] = buffer[_O_{a} + j]" for i, a in axes]),
-            "weights": _weight_rows(2, [(f"O_{a}", f"weight[{i}, at + j]") for i, a in axes]),
-            "scatter": _each(2, back),
-        }
+    def _rates(self) -> str:
+        """Accelerations of sums, and their gradient."""
+        return fill(
+            "crowd",
+            "rates",
+            gather=_gather(self._taken("own", False)),
+            store=_each(f"rate[{i}, at + j] = buffer[_O_{a} + j]" for i, a in enumerate("xy")),
+            weights=_weighted({f"O_{a}": f"weight[{i}, at + j]" for i, a in enumerate("xy")}),
+            scatter=self._scattered("own", False, "own", "sums"),
+        )
 
-    def _drivers(self, whom: str) -> dict[str, object]:
+    def _drivers(self, whom: str) -> dict[str, Any]:
         """The pieces of the time loops."""
         near, number, second = self.near, len(self.rows_of_sums), self.law.order == 2
-        barriers: list[str] = []
-        meet: list[str] = []
-        back = [] if near else [f"repeat(weighted, {number}, length)"]
-        if SMALLEST in self.over:
-            call = "q, time, dt, total, sums"
-            back.insert(0, f"least_vjp(buffer, y, length, {call}, weighted, to_own, to_other)")
+        barriers, meet, back = [], [], []
         for over in self.over:
             if over == SMALLEST:
                 continue
@@ -416,92 +386,91 @@ class CrowdSource:
                 table = f"barrier(members, people, {_COUNT[over]}, table_{over})"
                 barriers.append(f"rows_{over}, mask_{over} = {table}")
             if over in self.features:
-                self._meet_neurons(over, barriers, meet, back)
+                others = over == OTHERS
+                pieces = {
+                    "over": over,
+                    "number": len(self.features[over]),
+                    "size": "2 * length" if others else f"rows_{over}.shape[1]",
+                    "rows": "y" if others else f"rows_{over}",
+                    "partners": "own_mask, width, first, shifts"
+                    if others
+                    else f"mask_{over}, width, 0, {_COUNT[over]}",
+                }
+                barriers += fill("crowd", "neurons begin", **pieces).splitlines()
+                meet += fill("crowd", "neurons meet", **pieces).splitlines()
+                back += fill("crowd", "neurons back", **pieces).splitlines()
+                end = "others" if others else "barriers"
+                back += fill("crowd", f"neurons back to {end}", **pieces).splitlines()
                 continue
             call = f"buffer, own, {_PARTNERS[near][over]}, q, time, dt, total"
             meet.append(f"meet_{over}({call}, sums, reaction)")
-            back.append(f"meet_{over}_vjp({call}, weighted, to_own, to_other)")
+            back.append(f"meet_{over}_vjp({call}, to_sums, to_own, to_other)")
         if not near:
             meet += ["accumulate(sums, reaction, length)"] if self.antisymmetric else []
+            back = [f"repeat(to_sums, {number}, length)", *back]
             back.append("accumulate(to_own, to_other, length)")
         if SMALLEST in self.over:
-            meet.append("least(buffer, y, length, own_mask, width, q, time, dt, total, sums)")
+            call = "buffer, y, length, own_mask, width, q, time, dt, total, sums"
+            meet.append(f"least({call})")
+            back.insert(0, f"least_vjp({call}, to_sums, to_own, to_other)")
         inner = {"width": len(self.own), "antisymmetric": self.antisymmetric}
-        sections = template("crowd")
         return {
-            "scene": sections[f"scene {whom}"].substitute(inner).rstrip("\n"),
-            "arrange": sections[f"arrange {whom}"].substitute(inner).rstrip("\n"),
-            "barriers": lines(2, *barriers),
+            "scene": fill("crowd", f"scene {whom}", **inner).splitlines(),
+            "arrange": fill("crowd", f"arrange {whom}", **inner).splitlines(),
+            "barriers": barriers,
             "rows_of": "scattered" if near else "zeros",
+            "twice": 1 if near else 2,
             "reaction": "sums" if near else f"zeros({number}, 2 * length, y0)",
-            "weighted": f"scattered({number}, length, grad_y0)"
-            if near
-            else f"zeros({number}, 2 * length, grad_y0)",
             "to_other": "to_own" if near else "zeros(4, 2 * length, grad_y0)",
             "sums": number,
             "kept_width": 4 + len(self.kept),
-            "meet": lines(3, *meet).rstrip("\n"),
-            "meet_vjp": lines(3, *back).rstrip("\n"),
+            "meet": meet,
+            "meet_vjp": back,
             "moved": "2 + c" if second else "c",
             "place": "y[c, t] += move[t] * y[2 + c, t]" if second else "pass",
             "place_vjp": "adjoint[2 + c, t] += move[t] * adjoint[c, t]" if second else "pass",
         }
-
-    def _meet_neurons(
-        self, over: str, barriers: list[str], meet: list[str], back: list[str]
-    ) -> None:
-        """Features of everybody, sums of functions of their differences, and the gradients."""
-        number, rest = len(self.features[over]), "q, time, dt, total"
-        if over == OTHERS:
-            size, rows, partners = "2 * length", "y", "own_mask, width, first, shifts"
-        else:
-            size, rows = f"rows_{over}.shape[1]", f"rows_{over}"
-            partners = f"mask_{over}, width, 0, {_COUNT[over]}"
-        barriers += [
-            f"own_{over} = zeros({number}, length, y)",
-            f"other_{over} = zeros({number}, {size} + CHUNK, y)",
-            f"to_own_{over}, to_other_{over} = 0 * own_{over}, 0 * other_{over}",
-        ]
-        features = [
-            f"all_own_{over}(buffer, y, y, length, {rest}, own_{over})",
-            f"all_other_{over}(buffer, {rows}, y, {size}, {rest}, other_{over})",
-        ]
-        call = f"buffer, own_{over}, length, other_{over}, {partners}, dt"
-        meet += [*features, f"meet_{over}({call}, sums)"]
-        back += [
-            *features,
-            f"clear(to_own_{over})",
-            f"clear(to_other_{over})",
-            f"meet_{over}_vjp({call}, weighted, to_own_{over}, to_other_{over})",
-            f"all_own_{over}_vjp(buffer, y, y, length, {rest}, to_own_{over}, to_own)",
-        ]
-        share = f"to_other_{over}"
-        if over == OTHERS:
-            share, size = f"to_own_{over}", "length"
-            back += [f"clear({share})", f"accumulate({share}, to_other_{over}, length)"]
-        back.append(f"all_other_{over}_vjp(buffer, {rows}, y, {size}, {rest}, {share}, to_own)")
 
 
 def _weight(row: str) -> str:
     return f"W_{row}"
 
 
-def _increase(array: str, row: int, at: str, value: str, sign: str = "+") -> str:
-    return f"{array}[{row}, {at}] = {array}[{row}, {at}] {sign} {value}"
+def _increase(array: str, row: int, at: str, value: str) -> str:
+    return f"{array}[{row}, {at}] = {array}[{row}, {at}] {value}"
 
 
-def _each(depth: int, body: Sequence[str], numbers: str = "np.uint64(n)") -> str:
+def _each(body: Iterable[str], numbers: str = "np.uint64(n)") -> list[str]:
     """A loop over pairs for every line: several rows in one loop are too many for the compiler to
     see that they do not overlap."""
-    loops = [f"for j in range({numbers}):\n    {line}" for line in body]
-    return lines(depth, *loops)
+    return [line for row in body for line in (f"for j in range({numbers}):", f"    {row}")]
 
 
-def _weight_rows(depth: int, weights: Sequence[tuple[str, str]]) -> str:
+def _gather(taken: Mapping[str, Sequence[_Part]]) -> list[str]:
+    """Into the buffer."""
+    sums = {
+        row: " ".join(f"{sign} {array}[{c}, {at}]" for sign, array, c, at in parts)
+        for row, parts in taken.items()
+    }
+    return _each(f"buffer[_{row} + j] = {parts.strip()}" for row, parts in sums.items())
+
+
+def _scatter(taken: Mapping[str, Sequence[_Part]], *arrays: str) -> list[str]:
+    """Adjoints out of the buffer to those of what was taken from some arrays."""
+    return _each(
+        _increase(f"to_{array}", c, at, f"{sign or '+'} buffer[_D_{row} + j]")
+        for array in arrays
+        for row, parts in taken.items()
+        for sign, source, c, at in parts
+        if source == array
+    )
+
+
+def _weighted(weights: Mapping[str, str]) -> list[str]:
     """Weights into the buffer, and zeros behind them: of what does not exist."""
-    body = [f"buffer[_W_{row} + j] = {weight}" for row, weight in weights]
-    ends = [f"buffer[_W_{row} + j] = 0" for row, _ in weights]
-    return _each(depth, body) + _each(depth, ends, "np.uint64(n), np.uint64(padded(n))")
+    body = [f"buffer[_W_{row} + j] = {weight}" for row, weight in weights.items()]
+    ends = [f"buffer[_W_{row} + j] = 0" for row in weights]
+    return _each(body) + _each(ends, "np.uint64(n), np.uint64(padded(n))")
 
 
 def _opposite(pair: list[Expr], swapped: list[Expr]) -> bool:
@@ -745,7 +714,7 @@ def cutoff_distance(reach: float, decay: float, cutoff_error: float) -> float:
 
 def split(
     law: CrowdDynamics, uniform: Sequence[str]
-) -> tuple[CrowdDynamics, dict[str, dict[str, Feature]]]:
+) -> tuple[CrowdDynamics, dict[str, dict[str, tuple[Expr, Expr]]]]:
     """A law whose sums are over functions of features, and these features by their symbols; those
     sums for which this is not possible stay what they are.
 
@@ -757,7 +726,7 @@ def split(
     def same(node: Expr) -> bool:
         return known.issuperset(symbols([node]))
 
-    features: dict[str, dict[str, Feature]] = {}
+    features: dict[str, dict[str, tuple[Expr, Expr]]] = {}
     if law.sums[SMALLEST]:
         return law, features  # they may name the sums
     for over, parts in _PARTS.items():
@@ -777,7 +746,7 @@ def split(
                 own = own + weight * symbol(mine) if mine else own
                 if its:
                     other = other + weight * symbol(its) if mine else other - weight * symbol(its)
-            features[over][f"{over}_z{k}"] = Feature(own, other)
+            features[over][f"{over}_z{k}"] = (own, other)
             sums[f"{over}_s{k}"] = apply(g.op, symbol(f"{over}_z{k}"))
         total = {}
         for name, (start, weights) in outer.items():

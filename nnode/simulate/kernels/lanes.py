@@ -41,10 +41,10 @@ from nnode.simulate.kernels.runs import (
     Plan,
     Simulate,
     compiled,
-    lines,
+    fill,
+    head,
     seeds,
     shared_out,
-    template,
 )
 
 #: Weights and times of the stages of a method.
@@ -92,6 +92,10 @@ class LaneSource:
     @cached_property
     def parameters(self) -> list[str]:
         return list(self.lane.owned)
+
+    @property
+    def _own(self) -> list[str]:
+        return self.parameters if self.own else []
 
     @cached_property
     def recursive(self) -> bool:
@@ -164,9 +168,7 @@ class LaneSource:
         every += self.fields
         if not self.forward_only:
             every += ["RBAR", *(f"D_{i}" for i in self.inputs if i not in self.states)]
-        if self.own:
-            every += [*self.parameters, *(f"G_{p}" for p in self.parameters)]
-        return every
+        return [*every, *self._own, *(f"G_{p}" for p in self._own)]
 
     def text(self) -> str:
         """The module's source.
@@ -176,49 +178,41 @@ class LaneSource:
         """
         check_symbols([*self.rows, *self.parameters, *self.lane.symbols])
         weights, times = TABLEAUS[self.stages]
-        sections = template("lane")
-        constants = sections["constants"].substitute(
+        formula = [f"d{s}/dt = {plain(rate)}" for s, rate in self.lane.rates.items()]
+        text = head(
+            "lane",
+            [*formula, f"leader: {plain(self.lane.leader)}"],
+            CHUNK,
+            [f"_{row} = np.uint64({i * self.stride})" for i, row in enumerate(self.rows)],
             stride=self.stride,
             states=len(self.states),
             rows=len(self.rows),
             weights=weights,
             times=times,
-            places=lines(
-                0, *(f"_{r} = np.uint64({i * self.stride})" for i, r in enumerate(self.rows))
-            ),
         )
-        formula = [f"d{s}/dt = {plain(rate)}" for s, rate in self.lane.rates.items()]
-        text = template("shared")["head"].substitute(
-            formula="\n".join([*formula, f"leader: {plain(self.lane.leader)}"]),
-            chunk=CHUNK,
-            constants=constants,
+        load, spread, collect = (
+            [line.format(row, i) for i, row in enumerate(rows)]
+            for line, rows in (
+                ("load(buffer[_{}:], fields[{}], low, width, w)", self.fields),
+                ("spread(buffer[_{}:], every_q[:, {}], low, width, w, agents)", self._own),
+                ("    collect(buffer[_G_{}:], grad_q[:, {}], low, width, w, agents)", self._own),
+            )
         )
-        text += sections["rows"].template + self._gather() + self._rates()
-        own = [*enumerate(self.parameters)] if self.own else []
-        text += sections["simulate"].substitute(
+        text += fill("lane", "rows") + self._gather() + self._rates()
+        text += fill(
+            "lane",
+            "simulate",
             measured=self.measured,
             speeds=self.lane.order > 1,
-            fields=lines(
-                1,
-                *(
-                    f"load(buffer[_{name}:], fields[{i}], low, width, w)"
-                    for i, name in enumerate(self.fields)
-                ),
-                *(f"spread(buffer[_{p}:], every_q[:, {i}], low, width, w, agents)" for i, p in own),
-            ),
+            fields=[*load, *spread],
         )
         if self.forward_only:
             return text
-        collected = [
-            f"    collect(buffer[_G_{p}:], grad_q[:, {i}], low, width, w, agents)" for i, p in own
-        ]
-        short = ["if step % per == 0:  # sums of single precision are kept short", *collected]
+        short = ["if step % per == 0:  # sums of single precision are kept short", *collect]
         return (
             text
             + self._vjp()
-            + sections["gradient"].substitute(
-                scatter=self._scatter(), collect=lines(3, *short) if own else ""
-            )
+            + fill("lane", "gradient", scatter=self._scatter(), collect=short if collect else [])
         )
 
     def _gather(self) -> str:
@@ -270,7 +264,7 @@ class LaneSource:
         # a state's own adjoint is read once, and can be replaced at once
         rows = {f"A_{s}": s for s in self.states}
         rows |= {f"D_{i}": i for i in self.inputs if i not in self.states}
-        grads = {f"G_{p}": p for p in self.parameters} if self.own else {}
+        grads = {f"G_{p}": p for p in self._own}
         kept = [f"A_{s}" for s in self.states] if self.stages != "rk4" else []
 
         def weight(row: str) -> str:
@@ -313,7 +307,7 @@ class LaneSource:
             ]
         return text + _function("vjp(buffer, q, t, dt, drives, w, agents, total)", *body)
 
-    def _scatter(self) -> str:
+    def _scatter(self) -> list[str]:
         """Adjoints of states ahead to those whose states they are."""
         body = []
         for s, j in reversed(self.lane.ahead):
@@ -330,11 +324,11 @@ class LaneSource:
                 f"for k in range(max(agents - {j}, 0) * w):",
                 "    target[k] = target[k] + share[k]",
             ]
-        return lines(1, *body)
+        return body
 
 
 def _function(signature: str, *body: str) -> str:
-    return f"\n\n@njit(**INLINE)\ndef {signature}:\n" + lines(1, *body)
+    return fill("lane", "function", signature=signature, body=list(body))
 
 
 def supports(system: System, batch: Batch) -> LaneDynamics | None:

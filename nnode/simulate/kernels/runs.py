@@ -52,18 +52,32 @@ def compiled(source: Source) -> ModuleType:
 
 
 @cache
-def template(name: str) -> Mapping[str, Template]:
+def _sections(name: str) -> Mapping[str, str]:
     """The sections of a template file, each after a line ``# == title``."""
-    text = (
-        files("nnode.simulate.kernels").joinpath("templates", f"{name}.py.txt").read_text("utf-8")
-    )
+    folder = files("nnode.simulate.kernels") / "templates"
+    text = (folder / f"{name}.py.txt").read_text("utf-8")
     parts = re.split(r"^# == (.*)\n", text, flags=re.MULTILINE)
-    return {title: Template(part) for title, part in zip(parts[1::2], parts[2::2], strict=True)}
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
-def lines(depth: int, *texts: str) -> str:
-    """Lines of source text at a depth of indentation."""
-    return "".join(f"{'    ' * depth}{line}\n" for text in texts for line in text.splitlines())
+def fill(name: str, section: str, /, **values: Any) -> str:
+    """A section of a template file with values in place of ``$names``; lists of lines have the
+    indentation of the place where they stand."""
+
+    def inserted(found: re.Match[str]) -> str:
+        rows = values[found[2]]
+        return "".join(f"{found[1]}{row}\n" for row in rows) if type(rows) is list else found[0]
+
+    text = re.sub(r"^( *)\$(\w+)\n", inserted, _sections(name)[section], flags=re.MULTILINE)
+    return Template(text).substitute(values)
+
+
+def head(
+    name: str, formula: Sequence[str], chunk: int, places: list[str], /, **constants: Any
+) -> str:
+    """The beginning of a module: its formula in words, imports and constants."""
+    own = fill(name, "constants", places=places, **constants)
+    return fill("shared", "head", formula="\n".join(formula), chunk=chunk, constants=own)
 
 
 def seeds(formulas: Mapping[str, Expr], weight: Callable[[str], str]) -> dict[Expr, Expr]:
