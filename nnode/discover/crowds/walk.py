@@ -14,9 +14,9 @@ from torch.func import functional_call, vmap
 
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
 from nnode.discover.residuals.engine import runge_kutta, trained
-from nnode.model.crowd import NetworkForce
-from nnode.model.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
-from nnode.model.formula import own_values, values_of
+from nnode.model.crowd_formula import settings_of, walls_of
+from nnode.model.formula import crowd_of, own_values, values_of
+from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
 from nnode.simulate.kernels.alone import WalkSource, compiled
@@ -109,9 +109,9 @@ class Walk:
     ) -> None:
         self.windows, self.scene, self.system = windows, scene, alone(system)
         terms = cast(list[Term], list(system.terms))
-        self.law = list(takewhile(lambda term: isinstance(term, CrowdBase), terms))
+        self.law = list(takewhile(lambda term: isinstance(term, Law), terms))
         law = crowd_of(self.law)
-        force = system.find(NetworkForce)
+        force = system.find(InteractionForce)
         oneself = force is not None and force.self_interaction
         self.formula = None if oneself else law
         self.beyond = Beyond(self.system, terms[len(self.law) :] if self.compiled else terms)

@@ -22,12 +22,10 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.model.crowd import InteractionForce, NetworkForce, SocialForce
 from nnode.model.crowd_dynamics import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
-from nnode.model.crowd_formula import crowd_of, people_of, settings_of, walls_of
+from nnode.model.crowd_formula import people_of, settings_of, walls_of
 from nnode.model.differentiate import derivatives
 from nnode.model.expression import (
-    UNARY,
     Expr,
     apply,
     const,
@@ -36,8 +34,10 @@ from nnode.model.expression import (
     symbols,
     topological,
 )
-from nnode.model.formula import own_values, values_of
+from nnode.model.formula import crowd_of, own_values, values_of
+from nnode.model.laws import InteractionForce
 from nnode.model.names import check_symbols
+from nnode.model.operations import FUNCTIONS
 from nnode.model.system import Crowd, System
 from nnode.model.tensors import computed
 from nnode.model.term import Term
@@ -509,7 +509,7 @@ def supports(system: System, batch: Batch | None = None) -> CrowdDynamics | None
     law = crowd_of(terms)
     if law is None or not (law.sums[OTHERS] or law.sums[SMALLEST]):
         return None  # nobody meets anybody: cheap in PyTorch
-    force = system.find(NetworkForce)
+    force = system.find(InteractionForce)
     # only the sums of the force are over oneself as well
     alone = len(law.sums[OTHERS]) == 2 or force is None or not force.self_interaction
     return law if alone else None
@@ -584,7 +584,7 @@ def simulate(
         stored += kept * most * len(members)
     jobs = shared_out(blocks, threads)
     force = system.find(InteractionForce)
-    alone = not (isinstance(force, NetworkForce) and force.self_interaction)
+    alone = force is None or not force.self_interaction
     inputs = people_of(terms, law, scene)
     inputs |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
     # the last one, which is not taken, gives their shape where there are none
@@ -635,7 +635,7 @@ def _distances(
     system: System, law: CrowdDynamics, cutoff: float | None, cutoff_error: float, people: int
 ) -> tuple[float, ...]:
     """Cutoffs of pairs and of wall points, m; none where everybody meets everybody."""
-    social = system.find(SocialForce)
+    social: Any = system.find_law("social_force")
     check_cutoff(cutoff, cutoff_error, 2 * social.r if social else 0.0)
     if cutoff is not None:
         if law.sums[SMALLEST]:
@@ -733,7 +733,7 @@ def split(
         found = law.sums[over]
         outer = {name: _weights(summand, same) for name, summand in found.items()}
         inner = list(dict.fromkeys(g for _, weights in outer.values() for g in weights))
-        if not inner or inner[0].op not in UNARY or len({g.op for g in inner}) > 1:
+        if not inner or FUNCTIONS.get(inner[0].op) != 1 or len({g.op for g in inner}) > 1:
             continue
         numbers = [_weights(g.args[0], same) for g in inner]
         if not all(s.op == "symbol" and s.value in parts for _, w in numbers for s in w):

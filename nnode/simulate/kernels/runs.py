@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nnode.model.expression import Expr, symbol
-from nnode.simulate.kernels import functions, polynomials
+from nnode.simulate.kernels import functions
 from nnode.simulate.kernels.cache import digest, keep
 
 #: Compiled into every module besides its own text.
-COMPILED_IN = (functions, polynomials)
+COMPILED_IN = (functions,)
 
 
 class Source(Protocol):

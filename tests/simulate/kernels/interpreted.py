@@ -58,7 +58,9 @@ _NAMES: dict[str, Any] = {
     "real": lambda value, like: float(value), "add": lambda total, value: total + value,
     "exp": _float(math.exp, math.inf), "log": _float(math.log, math.nan),
     "sqrt": _float(math.sqrt, math.nan), "sin": math.sin, "cos": math.cos,
-    "logistic": _logistic, "torch_softplus": _torch_softplus,
+    "logistic": _logistic, "torch_softplus": _torch_softplus, "tanh": math.tanh,
+    "recip": lambda x: 1.0 / x, "where": lambda condition, a, b: a if condition else b,
+    "softplus": lambda x: _torch_softplus(x)[0], "softplus_slope": lambda x: _torch_softplus(x)[1],
     # indices are Python's numbers, which are faster than NumPy's
     "np": SimpleNamespace(uint64=int, zeros=np.zeros, array=np.array),
 }  # fmt: skip
