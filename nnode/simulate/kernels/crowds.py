@@ -34,7 +34,7 @@ from nnode.model.expression import (
     symbols,
     topological,
 )
-from nnode.model.formula import crowd_of, own_values, values_of
+from nnode.model.formula import own_values, values_of
 from nnode.model.laws import InteractionForce
 from nnode.model.names import check_symbols
 from nnode.model.operations import FUNCTIONS
@@ -165,7 +165,9 @@ class CrowdSource:
         """Sums on which the gradient depends by itself."""
         needed: list[Expr] = []
         for over in {"own", SMALLEST} & {*self.formulas}:
-            stored, ends = self.loop.adjoints(self._seeds(over), self._slopes(over))
+            stored, ends = self.loop.adjoints(
+                seeds(self.formulas[over], _weight), self._slopes(over)
+            )
             needed += [*stored.values(), *ends.values()]
         inner = {*symbols(needed), *self.rows_of_sums[len(self.sums) :]}
         return [name for name in self.rows_of_sums if name in inner]
@@ -173,9 +175,6 @@ class CrowdSource:
     @cached_property
     def loop(self) -> Loop:
         return Loop(self.uniform, options="LOOP", fixed=tuple(self.law.settings))
-
-    def _seeds(self, over: str) -> dict[Expr, Expr]:
-        return seeds(self.formulas[over], _weight)
 
     def _slopes(self, over: str) -> dict[str, str]:
         """Rows of adjoints to what they are of."""
@@ -224,9 +223,7 @@ class CrowdSource:
             if over in self.features:
                 text += self._neurons(over)
                 continue
-            text += self.loop.function(f"law_{over}", self.formulas[over])
-            slopes = self._slopes(over)
-            text += self.loop.pulled(f"law_{over}_vjp", self._seeds(over), slopes, [])
+            text += self._functions(f"law_{over}", self.formulas[over], self._slopes(over))
             match over:
                 case "own":
                     text += self._rates()
@@ -235,6 +232,11 @@ class CrowdSource:
                 case _:
                     text += self._pairs(over, whom)
         return text + fill("crowd", "simulate", **self._drivers(whom))
+
+    def _functions(self, name: str, formulas: dict[str, Expr], slopes: dict[str, str]) -> str:
+        """Formulas of rows, and their gradients."""
+        vjp = self.loop.pulled(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
+        return self.loop.function(name, formulas) + vjp
 
     def _taken(self, over: str, near: bool) -> dict[str, list[_Part]]:
         """Rows of the buffer to what they are the sum of."""
@@ -334,8 +336,7 @@ class CrowdSource:
             }
             name = f"features_{whose}_{over}"
             slopes = {f"D_{n}": n for n in taken if moves}
-            text += self.loop.function(name, formulas)
-            text += self.loop.pulled(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
+            text += self._functions(name, formulas, slopes)
             text += fill(
                 "crowd",
                 "features",
@@ -503,12 +504,9 @@ def supports(system: System, batch: Batch | None = None) -> CrowdDynamics | None
         tensors.append(batch.x)
         if batch.destination.requires_grad or batch.walls.requires_grad:
             return None  # both are constants here
-    if any(tensor.device.type != "cpu" for tensor in tensors):
-        return None
-    terms = cast(list[Term], list(system.terms))
-    law = crowd_of(terms)
-    if law is None or not (law.sums[OTHERS] or law.sums[SMALLEST]):
-        return None  # nobody meets anybody: cheap in PyTorch
+    law = system.formula
+    if any(t.device.type != "cpu" for t in tensors) or law is None or without_partners(system):
+        return None  # where nobody meets anybody PyTorch is cheap
     force = system.find(InteractionForce)
     # only the sums of the force are over oneself as well
     alone = len(law.sums[OTHERS]) == 2 or force is None or not force.self_interaction
@@ -517,9 +515,7 @@ def supports(system: System, batch: Batch | None = None) -> CrowdDynamics | None
 
 def without_partners(system: System) -> bool:
     """Whether nobody meets anybody in this model, so that a cutoff changes nothing."""
-    if not isinstance(system, Crowd):
-        return False
-    law = crowd_of(cast(list[Term], list(system.terms)))
+    law = system.formula if isinstance(system, Crowd) else None
     return law is not None and not (law.sums[OTHERS] or law.sums[SMALLEST])
 
 
