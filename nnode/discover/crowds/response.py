@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import torch
 from torch import Tensor
 from torch.func import functional_call
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.walk import Walk
-from nnode.discover.residuals.engine import runge_kutta, trained
+from nnode.discover.residuals.engine import runge_kutta
 from nnode.model.effects.base import Effect
-from nnode.model.term import State
+from nnode.model.term import State, Term
 
 #: Differences of positions (m) and velocities (m/s) for derivatives.
 DIFFERENCE = 1e-4
@@ -95,7 +98,8 @@ class Frames:
 
     def _bare(self, x: Tensor, v: Tensor, rate: Tensor) -> State:
         zero = torch.zeros((), dtype=x.dtype)
-        return State(zero, x, v, self.scene, self.walk.system, rate=rate, seen=self.seen)
+        terms = cast(list[Term], list(self.walk.system.terms))
+        return State(zero, x, v, self.scene, terms, rate=rate, seen=self.seen)
 
     def _own(self) -> dict[str, Tensor]:
         return {name: part[0] for name, part in self.walk.parameters(self.row[None]).items()}
@@ -110,7 +114,7 @@ class Frames:
         """Differences of the parameters. An effect's force may be rough: what it does over a
         visible difference of its strength is what a fit has to know."""
         out = []
-        for name, p in trained(self.walk.system).items():
+        for name, p in ParameterVector(self.walk.system).parameters.items():
             _, place, key = name.split(".", 2)
             term = self.walk.system.terms[int(place)]
             known = term.strengths.get(key) if isinstance(term, Effect) else None

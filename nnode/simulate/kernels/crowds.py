@@ -235,7 +235,7 @@ class CrowdSource:
 
     def _functions(self, name: str, formulas: dict[str, Expr], slopes: dict[str, str]) -> str:
         """Formulas of rows, and their gradients."""
-        vjp = self.loop.pulled(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
+        vjp = self.loop.vjp(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
         return self.loop.function(name, formulas) + vjp
 
     def _taken(self, over: str, near: bool) -> dict[str, list[_Part]]:
@@ -354,8 +354,8 @@ class CrowdSource:
             "neurons",
             over=over,
             first=self.sums.index(f"{over}_one"),
-            value=self.loop.of_numbers({"value": value}),
-            slope=self.loop.of_numbers({"slope": derivatives(value, ["z"])["z"]}),
+            value=self.loop.of_numbers("value", value),
+            slope=self.loop.of_numbers("slope", derivatives(value, ["z"])["z"]),
         )
 
     def _rates(self) -> str:

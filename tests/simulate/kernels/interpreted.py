@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from nnode.model.operations import LIBRARIES
 from nnode.simulate.kernels.lanes import LaneSource
 
 #: Rows are computed in multiples of this, so that they reach into the rows of the next vehicle.
@@ -22,17 +23,6 @@ CHUNK = 8
 
 def _copy(target: Any, source: Any, number: int) -> None:
     target[:number] = source[:number].copy()
-
-
-def _logistic(x: float) -> float:
-    u = math.exp(-abs(x))
-    return (u if x < 0 else 1.0) / (1.0 + u)
-
-
-def _torch_softplus(x: float) -> tuple[float, float]:
-    if x > 20:
-        return x, 1.0
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x))), _logistic(x)
 
 
 def _undecorated(*_: Any, **__: Any) -> Any:
@@ -54,13 +44,11 @@ def _float(operation: Any, otherwise: float) -> Any:
 
 #: What the generated source imports, for numbers in float64.
 _NAMES: dict[str, Any] = {
+    **LIBRARIES["number"],
     "njit": _undecorated, "INLINE": {}, "LOOP": {}, "copy": _copy,
     "real": lambda value, like: float(value), "add": lambda total, value: total + value,
     "exp": _float(math.exp, math.inf), "log": _float(math.log, math.nan),
-    "sqrt": _float(math.sqrt, math.nan), "sin": math.sin, "cos": math.cos,
-    "logistic": _logistic, "torch_softplus": _torch_softplus, "tanh": math.tanh,
-    "recip": lambda x: 1.0 / x, "where": lambda condition, a, b: a if condition else b,
-    "softplus": lambda x: _torch_softplus(x)[0], "softplus_slope": lambda x: _torch_softplus(x)[1],
+    "sqrt": _float(math.sqrt, math.nan),
     # indices are Python's numbers, which are faster than NumPy's
     "np": SimpleNamespace(uint64=int, zeros=np.zeros, array=np.array),
 }  # fmt: skip
