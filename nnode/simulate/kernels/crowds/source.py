@@ -12,11 +12,11 @@ from functools import cached_property
 
 import torch
 
+from nnode.model.arrays import computed
 from nnode.model.crowd_dynamics import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
 from nnode.model.differentiate import derivatives
 from nnode.model.expression import Expr, apply, symbol, symbols, topological
 from nnode.model.names import check_symbols
-from nnode.model.tensors import computed
 from nnode.model.text import plain
 from nnode.simulate.kernels.crowds.least import LEAST
 from nnode.simulate.kernels.crowds.neurons import Feature, split
