@@ -133,13 +133,13 @@ OPERATIONS = {
         Operation(
             "max",
             "where(({1} > {0}) | ({1} != {1}), {1}, {0})",
-            "1 - choose(b - a, 1, 0), choose(b - a, 1, 0)",
+            "choose(b - a, 0, 1), choose(b - a, 1, 0)",
             alike=(0, 1),
         ),
         Operation(
             "min",
             "where(({1} < {0}) | ({1} != {1}), {1}, {0})",
-            "1 - choose(a - b, 1, 0), choose(a - b, 1, 0)",
+            "choose(a - b, 0, 1), choose(a - b, 1, 0)",
             alike=(0, 1),
         ),
         Operation(
