@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
-from nnode.discover.residuals.engine import runge_kutta, trained
+from nnode.discover.residuals.engine import runge_kutta
 from nnode.model.crowd_formula import settings_of, walls_of
 from nnode.model.formula import crowd_of, own_values, values_of
 from nnode.model.laws import InteractionForce, Law
@@ -115,9 +116,9 @@ class Walk:
         oneself = force is not None and force.self_interaction
         self.formula = None if oneself else law
         self.beyond = Beyond(self.system, terms[len(self.law) :] if self.compiled else terms)
-        self.names = list(trained(system))
+        self.names = list(ParameterVector(system).parameters)
         self._people = tuple(torch.as_tensor(index) for index in windows.person.T)
-        self.sizes = [p.numel() for p in trained(system).values()]
+        self.sizes = [p.numel() for p in ParameterVector(system).parameters.values()]
         if self.formula is not None:
             source = WalkSource(self.formula)
             self.kernel = compiled(source)
@@ -150,7 +151,7 @@ class Walk:
 
     def parameters(self, rows: Tensor) -> dict[str, Tensor]:
         """Rows ``(R, K)`` as parameters of :class:`Beyond`."""
-        own = trained(self.system).values()
+        own = ParameterVector(self.system).parameters.values()
         parts = rows.split(self.sizes, 1)
         return {
             f"system.{name}": part.reshape(-1, *p.shape)
