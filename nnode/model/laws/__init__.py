@@ -161,7 +161,6 @@ class Law(Term):
         self.formulas = _rule(found)
         self.domain = "crowd" if self.formulas.of_crowd else "traffic"
         self.order, self.step = self.formulas.order, found.get("step")
-        self.memory = self.formulas.memory  # type: ignore[misc]
         if self.step is not None and self.step not in METHODS:
             raise ConfigError(
                 f"model.law.step={self.step} is unknown, expected {', '.join(METHODS)}"
@@ -285,10 +284,13 @@ class Law(Term):
         sizes = [getattr(self, module).sizes for module in self.networks]
         return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
 
+    def rule_for(self, order: int) -> Rule | None:
+        return self.rule
+
     @property
     def of_gap(self) -> bool:
         """Whether it is a speed that depends on the gap alone."""
-        if self.domain != "traffic" or self.order != 1 or self.memory:
+        if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
         return _names_gap_alone(self.dynamics(called=True))
 
