@@ -201,7 +201,8 @@ LIBRARIES: dict[str, dict[str, Any]] = {
     "tensor": {"where": torch.where},
 }
 for _library, _names in LIBRARIES.items():
-    _names |= {name: getattr(row, _library) for name, row in OPERATIONS.items()} | {"zero": 0}
+    _names |= {row.name: getattr(row, _library) for row in OPERATIONS.values() if row.number}
+    _names["zero"] = 0
 
 
 def compiled(code: str, arguments: str, names: dict[str, Any]) -> Callable[..., Any]:

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.model.formula import rule_of
 from nnode.model.steps import METHODS
 from nnode.model.system import System
 from nnode.model.term import Term
@@ -182,7 +181,7 @@ class FusedSolver:
 def _reason(system: System) -> str:
     """Why compiled code is not used, in words: terms that it does not cover, by their names."""
     terms = cast(list[Term], list(system.terms))
-    names = ", ".join(t.name for t in terms if rule_of(t) is None or (t.memory and t.rule is None))
+    names = ", ".join(t.name for t in terms if t.rule_for(system.order) is None)
     if names:
         return f"it does not cover {names}"
     alone = "models that begin with a law of the gap, without people who meet themselves and others"

@@ -37,8 +37,9 @@ class Beyond(nn.Module):
     def forward(self, state: State) -> Tensor:
         assert state.rate is not None
         first = total = state.rate
+        terms = cast(list[Term], list(self.system.terms))
         for term in self.added:
-            total = total + term(replace(state, system=self.system, rate=total))
+            total = total + term(replace(state, terms=terms, rate=total))
         return total - first
 
 

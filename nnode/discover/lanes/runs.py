@@ -45,7 +45,7 @@ def side_by_side(system: System, rows: Tensor, scene: Scene) -> Runs:
 @torch.no_grad()
 def _starts(system: System, rows: Tensor, batch: Batch) -> Tensor:
     """``(R, B, N, W)`` states at the start; what terms remember depends on the parameters."""
-    if not any(getattr(term, "memory", 0) for term in system.terms):
+    if not system.memory:
         y = system.initial(batch)
         return y.expand(len(rows), *y.shape)
     every = ParameterVector(system).runs(rows)

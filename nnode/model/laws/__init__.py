@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from importlib.resources import files
+from operator import itemgetter
 from typing import Any
 
 import torch
@@ -164,13 +165,7 @@ class Law(Term):
         self.network: FeedForward | None = None
         self.formulas = _rule(found)
         self.domain = "crowd" if self.formulas.of_crowd else "traffic"
-        if self.domain == "traffic":
-            self.order, self.step = 1 if "x" in found["rate"] else 2, found.get("step")
-        else:
-            self.order = self.formulas.order
-        self.memory = (  # type: ignore[misc]
-            len(self.formulas.states) + len(self.formulas.delayed) * self.formulas.remembered
-        )
+        self.order, self.step = self.formulas.order, found.get("step")
         if self.step is not None and self.step not in METHODS:
             raise ConfigError(
                 f"model.law.step={self.step} is unknown, expected {', '.join(METHODS)}"
@@ -283,10 +278,13 @@ class Law(Term):
         sizes = [getattr(self, module).sizes for module in self.networks]
         return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
 
+    def rule_for(self, order: int) -> Rule | None:
+        return self.rule
+
     @property
     def of_gap(self) -> bool:
         """Whether it is a speed that depends on the gap alone."""
-        if self.domain != "traffic" or self.order != 1 or self.memory:
+        if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
         return _names_gap_alone(self.dynamics(called=True))
 
@@ -296,8 +294,8 @@ class Law(Term):
 
     def code(self) -> dict[str, Code]:
         """What calls in its formulas stand for, by name."""
-        found: dict[str, Code] = {"speed": self.speed, "0": _first, "1": _second}
-        return {**found, **{m: partial(_joined, getattr(self, m)) for m in self.networks}}
+        networks = {module: partial(_joined, getattr(self, module)) for module in self.networks}
+        return {"speed": self.speed, **{str(k): itemgetter((..., k)) for k in (0, 1)}, **networks}
 
     def written(
         self, model: Any, owner: str, place: int, rule: Rule | None = None, called: bool = False
@@ -444,14 +442,6 @@ def velocity(state: State) -> Tensor:
     return state.v
 
 
-def _first(out: Tensor) -> Tensor:
-    return out[..., 0]
-
-
-def _second(out: Tensor) -> Tensor:
-    return out[..., 1]
-
-
 def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
     """A network, layer by layer."""
     out: Tensor = network(torch.stack(torch.broadcast_tensors(*inputs), -1))
@@ -547,24 +537,26 @@ class InteractionForce(Law):
 
         return {**super().code(), "pair_force": pair}
 
-    def _force(self, over: str, **seen: Tensor) -> Tensor:
-        """``(..., 2)`` N: the entry's summands over the others or over wall points."""
+    def _force(self, over: str, seen: Mapping[str, Tensor]) -> Tensor:
+        """``(..., 2)`` N: the entry's summands over the others or over wall points.
+
+        Args:
+            seen: vectors ``(..., 2)``; their names have {} for the axis.
+        """
         sums = self.dynamics(called=True).sums[over]
         if not sums:
             raise NotImplementedError(f"{type(self).__name__} has no force from {over}")
-        parts = {
-            key: value[..., c] for name, value in seen.items() for c, key in enumerate(_AXES[name])
-        }
+        parts = {name.format(c): seen[name][..., k] for name in seen for k, c in enumerate("xy")}
         return torch.stack(self.computed([*sums.values()], parts), -1)
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
         """Force on i from j, ``(..., 2)`` N, of x_i - x_j (m) and v_i - v_j (m/s)."""
-        return self._force(OTHERS, dx=dx, dv=dv)
+        return self._force(OTHERS, {"d{}": dx, "dv{}": dv})
 
     def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
         """Force on i from a wall point, ``(..., 2)`` N, of x_i - x_w (m), v_i (m/s) and the
         wall's unit normal."""
-        return self._force(POINTS, dx=dx, v=v, normal=normal)
+        return self._force(POINTS, {"d{}": dx, "v{}": v, "normal_{}": normal})
 
     def pairs(self, state: State) -> Tensor:
         """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third),
@@ -595,10 +587,6 @@ class InteractionForce(Law):
         return sum(self.components(state).values(), torch.zeros_like(state.x))
 
 
-#: Components of what a force sees.
-_AXES = {
-    "dx": ("dx", "dy"), "dv": ("dvx", "dvy"), "v": ("vx", "vy"), "normal": ("normal_x", "normal_y")
-}  # fmt: skip
 #: A force between people that is code.
 _FORCE: dict[str, Any] = {
     "parameters": {},
@@ -681,42 +669,36 @@ def _rule(entry: Mapping[str, Any]) -> Rule:
         ConfigError: a rate that is neither of a lane nor of a crowd, or an entry of another form.
     """
     rate = entry["rate"]
-    states = set(rate) if isinstance(rate, Mapping) else set()
-    parts: dict[str, Any] = {
-        "where": {str(k): str(v) for k, v in (entry.get("where") or {}).items()},
-        "constants": {str(k): in_si(str(v)) for k, v in (entry.get("constants") or {}).items()},
-        "settings": {k: in_si(str(v))[1] for k, v in entry.get("settings", {}).items()},
-    }
-    if states in ({"x"}, {"v"}):
-        leader = "v0" if "v0" in entry["parameters"] else "measured"
-        return Rule(
-            rate=str(next(iter(rate.values()))),
-            leader="v" if states == {"v"} else leader,
-            states=_threes("states", "[unit, rate, start]", entry),
-            delayed=_threes("delayed", "[formula, unit, delay]", entry),
-            remembered=int(entry.get("remembered", 0)),
-            **parts,
-        )
-    if states not in ({"vx", "vy"}, {"x", "y"}):
-        if states & {"vx", "vy", "y"}:
+    states = sorted(map(str, rate)) if isinstance(rate, Mapping) else []
+    if states not in (["v"], ["vx", "vy"], ["x"], ["x", "y"]):
+        if {"vx", "vy", "y"}.isdisjoint(states):
             raise ConfigError(
-                f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
-                "components of a person's acceleration; or x and y: of his velocity"
+                f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
+                "or v: a formula of an acceleration (second order); or vx and vy, of a crowd, or "
+                "x and y, of a crowd of first order"
             )
         raise ConfigError(
-            f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
-            "or v: a formula of an acceleration (second order); or vx and vy, of a crowd, or "
-            "x and y, of a crowd of first order"
+            f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
+            "components of a person's acceleration; or x and y: of his velocity"
         )
-    for over in REDUCED:
-        parts[over] = {str(k): ("", str(v)) for k, v in (entry.get(over) or {}).items()}
-    first, second = ("x", "y") if states == {"x", "y"} else ("vx", "vy")
+    texts = [str(rate[state]) for state in states]
+    leader = {"v": "v", "x": "v0" if "v0" in entry["parameters"] else "measured"}
+    reduced: dict[str, Any] = {
+        over: {str(k): ("", str(v)) for k, v in (entry.get(over) or {}).items()} for over in REDUCED
+    }
     return Rule(
-        rate=(str(rate[first]), str(rate[second])),
-        order=1 if first == "x" else 2,
+        rate=texts[0] if len(texts) == 1 else (texts[0], texts[1]),
+        order=1 if "x" in states else 2,
+        leader=leader.get("".join(states), ""),
+        states=_threes("states", "[unit, rate, start]", entry),
+        delayed=_threes("delayed", "[formula, unit, delay]", entry),
+        remembered=int(entry.get("remembered", 0)),
+        where={str(k): str(v) for k, v in (entry.get("where") or {}).items()},
+        constants={str(k): in_si(str(v)) for k, v in (entry.get("constants") or {}).items()},
+        settings={k: in_si(str(v))[1] for k, v in entry.get("settings", {}).items()},
         force=tuple(entry["force"]) if "force" in entry else None,
         drive=entry.get("drive", False),
-        **parts,
+        **reduced,
     )
 
 

@@ -239,7 +239,7 @@ def with_effects() -> list[Any]:
     found = []
     for law, order in (("lin", 1), ("idm", 2)):
         for effect in CATALOGUE.of("traffic", every=True):
-            if (effect.rule if order == 1 else effect.second) is None:
+            if order not in effect.rules:
                 continue
             for method in METHODS:
                 if method == "rk4" and _is_map(law, effect.name):

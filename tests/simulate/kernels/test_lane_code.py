@@ -17,7 +17,7 @@ import torch
 
 from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
-from nnode.model.effects.following import RelativeSpeed
+from nnode.model.effects.lane import RelativeSpeed
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from nnode.simulate.kernels import functions, source
 from nnode.simulate.kernels.cache import digest

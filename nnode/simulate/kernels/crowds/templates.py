@@ -21,8 +21,7 @@ from nnode.simulate.kernels.crowds.rows import (
     space, store, subtract, weigh, weigh_less,
 )
 from nnode.simulate.kernels.functions import (
-    INLINE, add, exp, log, logistic, real, recip, softplus, softplus_slope, tanh, torch_softplus,
-    where,
+    INLINE, add, exp, log, logistic, real, recip, softplus, softplus_slope, tanh, where,
 )
 
 ROWS = {rows}

@@ -14,8 +14,7 @@ from nnode.simulate.kernels.lanes.rows import (
     collect, copy, lead_places, masks, padded, place, spread, take,
 )
 from nnode.simulate.kernels.functions import (
-    INLINE, add, exp, log, logistic, real, recip, softplus, softplus_slope, tanh, torch_softplus,
-    where,
+    INLINE, add, exp, log, logistic, real, recip, softplus, softplus_slope, tanh, where,
 )
 
 SCALAR = dict(error_model="numpy", fastmath={{"contract", "nsz"}})
