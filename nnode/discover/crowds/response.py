@@ -8,9 +8,10 @@ from torch import Tensor
 from torch.func import functional_call
 
 from nnode.discover.crowds.walk import Walk
-from nnode.discover.residuals.engine import runge_kutta, trained
+from nnode.discover.residuals.engine import trained
 from nnode.model.effects.base import Effect
 from nnode.model.term import State
+from nnode.simulate.numpy import runge_kutta
 
 #: Differences of positions (m) and velocities (m/s) for derivatives.
 DIFFERENCE = 1e-4

@@ -13,13 +13,14 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
-from nnode.discover.residuals.engine import runge_kutta, trained
+from nnode.discover.residuals.engine import trained
 from nnode.model.crowd import NetworkForce
 from nnode.model.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
 from nnode.model.formula import own_values, values_of
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
 from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
+from nnode.simulate.numpy import runge_kutta
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000

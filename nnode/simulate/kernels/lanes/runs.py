@@ -209,7 +209,7 @@ def tangents(
     known = {}
     if every.starts:
         scene = replace(system.scene(batch), step=batch.dt / substeps)
-        values = dict(zip(lane.owned, q.T[..., None], strict=True))
+        values = dict(zip(lane.owned, q.T, strict=True))
         known = starts_of(terms, every, x[0], batch.v[0], scene, values)
     zero = torch.zeros_like(x[0, ..., 0])
     known = {"x": x[0, ..., 0], "v": batch.v[0, ..., 0], **known}

@@ -16,8 +16,8 @@ from functools import cached_property
 
 from nnode.model.expression import Expr, apply, const, symbol, symbols
 from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.lane_rates import SAFE
 from nnode.model.names import check_symbols
-from nnode.model.tensors import SAFE
 from nnode.model.text import plain
 from nnode.simulate.kernels.lanes.templates import HEAD, SIMULATE
 from nnode.simulate.kernels.loops import Loop
