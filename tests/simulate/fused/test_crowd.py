@@ -16,8 +16,7 @@ from nnode.errors import ConfigError, SimulationError
 from nnode.model import Crowd, Linear, NetworkForce, Relaxation, SocialForce, System, Traffic
 from nnode.model.effects import CATALOGUE
 from nnode.model.network import FeedForward
-from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
-from nnode.simulate.fused import engine
+from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, fused
 from nnode.simulate.kernels.crowds import runs as compiled
 from nnode.simulate.kernels.crowds.rows import SIZE
 from nnode.simulate.kernels.crowds.source import CrowdSource
@@ -56,7 +55,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     def refuse(*args: object) -> None:
         raise AssertionError("the fallback was called")
 
-    monkeypatch.setattr(engine, "TorchdiffeqSolver", refuse)
+    monkeypatch.setattr(fused, "TorchdiffeqSolver", refuse)
 
 
 @pytest.fixture

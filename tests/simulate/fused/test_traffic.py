@@ -10,8 +10,7 @@ import torch
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.model import Linear, Logarithmic, NetworkSpeed, Traffic
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from nnode.simulate.fused import engine
+from nnode.simulate import FusedSolver, TorchdiffeqSolver, fused
 from nnode.simulate.kernels import lanes
 from tests.simulate.fused.compare import difference, gradient, single
 
@@ -36,7 +35,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     def refuse(*args: object) -> None:
         raise AssertionError("the fallback was called")
 
-    monkeypatch.setattr(engine, "TorchdiffeqSolver", refuse)
+    monkeypatch.setattr(fused, "TorchdiffeqSolver", refuse)
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
