@@ -17,10 +17,9 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from nnode.data.sequence import Batch
-from nnode.model.arrays import NumpyFunction, numpy_function
 from nnode.model.differentiate import derivatives
-from nnode.model.expression import Expr
 from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.lane_rates import Formulas
 from nnode.model.scene import Scene
 from nnode.model.system import System, initial_with
 from nnode.model.term import State
@@ -171,7 +170,7 @@ def whole(blocks: Blocks, shape: tuple[int, ...]) -> np.ndarray:
 @cache
 def _derivatives(
     lane: LaneDynamics,
-) -> tuple[list[tuple[int, str]], NumpyFunction, dict[str, Expr]]:
+) -> tuple[list[tuple[int, str]], Formulas, list[str], Formulas]:
     """Which derivatives of rates there are, a function of all, and those of a leader's speed."""
     states = list(lane.rates)
     names = [f"{s}{ahead}" for ahead in ("", "_1", "_2") for s in states] + ["dx_1", *lane.owned]
@@ -181,7 +180,7 @@ def _derivatives(
         for name, node in derivatives(rate, names).items()
     }
     lead = derivatives(lane.leader, list(lane.owned))
-    return list(found), numpy_function(tuple(found.values())), lead
+    return list(found), Formulas(list(found.values())), list(lead), Formulas(list(lead.values()))
 
 
 class LinearResponse:
@@ -223,14 +222,14 @@ class LinearResponse:
         symbols = rhs.symbols(self._t, self._y)[1]
         rates = rhs.by_formula(self._y, symbols)
         self._speed = rates[0]
-        which, function, lead = _derivatives(lane)
+        which, function, lead, of_lead = _derivatives(lane)
         places = {
             f"{state}{ahead}": (len(ahead) and int(ahead[1]), q)
             for ahead in ("", "_1", "_2")
             for q, state in enumerate(lane.rates)
         }
         places["dx_1"] = 1, len(lane.rates)
-        every = function({**symbols, "dx_1": rates[0, 1:]}, ())
+        every = function({**symbols, "dx_1": rates[0, 1:]})
         for (p, name), value in zip(which, every, strict=True):
             wide = np.where(rhs.rates.follows, value, np.zeros_like(rates[0, 1:]))
             if name in lane.owned:
@@ -243,23 +242,24 @@ class LinearResponse:
                 wide = wide - near
             blocks[p, ahead, q] = blocks.get((p, ahead, q), 0.0) + wide
         if not rhs.measured:
-            values = rhs.rates.of_leaders(tuple(lead.values()), self._y, symbols)
+            values = rhs.rates.of_leaders(of_lead, self._y, symbols)
             self._of_lead.update(zip(lead, values, strict=True))
 
     def _with_code(self, matrix: np.ndarray) -> np.ndarray:
         """Derivatives of all rates by all states ``(M, N, M, N, K, B)``, from those of the
         formula."""
-        rhs, (m, n) = self.rhs, self._y.shape[:2]
+        rhs = self.rhs
         y, speed = known = [
             torch.from_numpy(one).clone().requires_grad_() for one in (self._y, self._speed)
         ]
         with torch.enable_grad():
-            sums = [rates.unbind() for rates in rhs.by_code(self._t, y, speed).sum((2, 3))]
-        by_formula = matrix[0].copy()
-        for p, i in np.ndindex(m, n):
-            if sums[p][i].requires_grad and (rhs.added is None or p == rhs.top):
+            rates = rhs.by_code(self._t, y, speed)
+            sums = [[rate.sum() for rate in every] for every in rates]
+        by_formula, coded = matrix[0].copy(), matrix[rhs.coded]
+        for p, i in np.ndindex(*coded.shape[:2]):
+            if sums[p][i].requires_grad:
                 found = torch.autograd.grad(sums[p][i], known, retain_graph=True, allow_unused=True)
-                for total, part in zip((matrix[p, i], self._by_speed[i]), found, strict=True):
+                for total, part in zip((coded[p, i], self._by_speed[i]), found, strict=True):
                     total += 0.0 if part is None else part.numpy()
         matrix[rhs.top] += np.einsum("ijkb,jqmkb->iqmkb", self._by_speed, by_formula)
         return matrix
@@ -307,7 +307,7 @@ class LinearResponse:
         for own, (name, place) in zip(found, entries, strict=True):
             if code and name.startswith(rhs.own):
                 rates = self._along(name, place, partial(rhs.by_code, self._t, y, speed))
-                own += rates.numpy()
+                own[rhs.coded] += rates.numpy()
         return torch.from_numpy(found).permute(0, 3, 4, 2, 1)
 
     def _starts(self, entries: Sequence[tuple[str, int]]) -> Tensor | None:

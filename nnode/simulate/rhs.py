@@ -6,6 +6,8 @@ rows, each of which is whole; then L runs of a model, or L times of one run; the
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, cast
@@ -48,7 +50,8 @@ class RightHandSide:
     Attributes:
         lane: the formula; None: there is none.
         rates: the formula's rates.
-        added: the term that is added to them.
+        added: the term that is added to them, with one parameter a simulation.
+        coded: states whose rates depend on code.
         measured: whether leaders drive as they were measured.
         own: what stands before the names of the parameters that :meth:`by_code` depends on.
     """
@@ -57,12 +60,20 @@ class RightHandSide:
         self, system: System, scene: Scene, parameters: Mapping[str, Tensor] | None = None
     ) -> None:
         self.system, self.scene, self.parameters = system, scene, parameters
-        self.lane, self.added, self.own = formula_of(system), None, ""
+        self.lane, self.own, self.coded = formula_of(system), "", slice(None)
+        self.added: Term | None = None
         terms = cast(list[Term], list(system.terms))
         if self.lane is None and terms and terms[-1].side_by_side:
             self.lane = formula_of(system, -1)
             if self.lane is not None:
-                self.added, self.own = terms[-1], f"terms.{len(terms) - 1}."
+                self.own, self.coded = f"terms.{len(terms) - 1}.", slice(self.top, self.top + 1)
+                self.added = copy.copy(terms[-1])
+                self.added._parameters = dict(self.added._parameters)
+                for name, value in (parameters or {}).items():
+                    if name.startswith(self.own):  # one for each simulation
+                        several = value.repeat_interleave(len(scene.agent))[:, None, None]
+                        del self.added._parameters[name.removeprefix(self.own)]
+                        setattr(self.added, name.removeprefix(self.own), several)
         self._every: dict[int, Scene] = {}
         self.measured = getattr(system, "leader", "constant") == "measured"
         self.leads = _rows(scene.leader.T)
@@ -114,7 +125,7 @@ class RightHandSide:
         if self.added is not None:
             with torch.no_grad():
                 added = self.by_code(t, torch.from_numpy(y), torch.from_numpy(found[0]))
-            found[self.top] += added[self.top].numpy()
+            found[self.coded] += added.numpy()
         if self.measured:
             # a leader's state is never read: its place is known at every time
             np.copyto(found, 0.0, where=self.leads)
@@ -142,10 +153,12 @@ class RightHandSide:
     def leader_at(self, t: Any) -> list[np.ndarray]:
         """``(B,)`` or ``(L, B)`` measured places (m) and speeds (m/s) of leaders, linear between
         samples."""
-        position = np.asarray(t) / self.scene.dt
+        if np.ndim(t):  # at the samples
+            return [one[: len(t)] for one in self._path]
+        position = t / self.scene.dt
         # as in the scene: a hair of tolerance keeps whole sample numbers whole
-        k = np.floor(position + 1e-4).clip(0, len(self._path[0]) - 2).astype(int)
-        share, k = (position - k).clip(0.0, 1.0), k[..., 0] if k.ndim else k
+        k = max(0, min(math.floor(position + 1e-4), len(self._path[0]) - 2))
+        share = min(max(position - k, 0.0), 1.0)
         return [one[k] + share * (one[k + 1] - one[k]) for one in self._path]
 
     def by_code(
@@ -155,27 +168,24 @@ class RightHandSide:
         speed: Tensor | None = None,
         parameters: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """``(M, N, L, B)`` rates by the whole model; of one with a formula those that the added
-        term changes.
+        """``(..., N, L, B)`` rates of the states ``coded``: by the whole model, or what the added
+        term changes of those by the formula.
 
         Args:
             speed: ``(N, L, B)`` rates of places by the formula, m/s.
             parameters: of one run, by name; None: those that were given.
         """
-        runs = parameters is None and self.parameters is not None
-        own = dict((self.parameters or {}) if parameters is None else parameters)
         if self.added is not None:
             assert speed is not None
-            b = y.shape[-1]
-            mine = {
-                name.removeprefix(self.own): p.repeat_interleave(b)[:, None, None] if runs else p
-                for name, p in own.items()
-                if name.startswith(self.own)
-            }
-            change = functional_call(self.added, mine, (self._state(t, y, speed),))
-            change = change[..., 0].T.reshape(y.shape[1:])
-            none = torch.zeros_like(change)
-            return torch.stack([change if p == self.top else none for p in range(len(y))])
+            state = self._state(t, y, speed)
+            if parameters is None:
+                change = self.added(state)
+            else:
+                own = {name.removeprefix(self.own): p for name, p in parameters.items()}
+                change = functional_call(self.added, own, (state,))
+            return change[..., 0].T.reshape(1, *y.shape[1:])
+        runs = parameters is None and self.parameters is not None
+        given = dict((self.parameters or {}) if parameters is None else parameters)
 
         def one(own: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
             found: Tensor = functional_call(self.system, own, (t, y, self.scene))
@@ -183,7 +193,7 @@ class RightHandSide:
 
         time = torch.as_tensor(t, dtype=torch.float64).flatten()
         dims = 0 if runs else None, 0 if len(time) > 1 else None, 0
-        found = vmap(one, dims)(own, time if len(time) > 1 else time[0], y.permute(2, 3, 1, 0))
+        found = vmap(one, dims)(given, time if len(time) > 1 else time[0], y.permute(2, 3, 1, 0))
         return found.permute(3, 2, 0, 1)
 
     def state(self, t: Any, y: np.ndarray) -> State:
