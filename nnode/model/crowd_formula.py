@@ -1,109 +1,26 @@
-"""The formula of a model of a crowd, made from what its terms say of themselves, and its
-accelerations by PyTorch."""
+"""The accelerations of a crowd by PyTorch, from the formula of its model."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nnode.model.crowd_dynamics import (
+from nnode.model.arrays import Code, computed
+from nnode.model.scene import Scene
+from nnode.model.term import State, Term
+from nnode.model.terms import (
     NOBODY,
     OTHERS,
     POINTS,
     SMALLEST,
     WALLS,
     CrowdDynamics,
-    CrowdRule,
-    with_rule,
-)  # fmt: skip
-from nnode.model.expression import const
-from nnode.model.formula import own_values, owners, parameters_of, rule_of, values_of
-from nnode.model.scene import Scene
-from nnode.model.tensors import Code, computed
-from nnode.model.term import State, Term
-
-
-class CrowdBase(Term):
-    """A term that others may look at: what drives a person, or a force between people."""
-
-    def written(self, law: CrowdDynamics, owner: str, place: int) -> CrowdDynamics:
-        """A law with this term, as a formula."""
-        return ruled(law, self, owner, place)
-
-    def told(self, law: CrowdDynamics, owner: str, place: int) -> CrowdDynamics:
-        """A law with what others may name of this term; its acceleration does not matter."""
-        return self.written(law, owner, place)
-
-    def code(self) -> dict[str, Code]:
-        """What calls in its formula stand for, by name."""
-        return {}
-
-    def forward(self, state: State) -> Tensor:
-        """By its rule; a term without one defines its own."""
-        return contribution(self, state)
-
-
-def ruled(
-    law: CrowdDynamics, term: Term, owner: str, place: int, own: CrowdRule | None = None
-) -> CrowdDynamics:
-    """A law with a term that has a rule, or ``own`` in its place."""
-    rule = own or term.rule
-    if not isinstance(rule, CrowdRule):
-        raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
-    parameters, owned, units = parameters_of(term, owner, place)
-    return with_rule(law, owner, rule, parameters, owned, units, whose=place)
-
-
-def formula_of(base: CrowdBase) -> CrowdDynamics:
-    """The formula of one term."""
-    if (base.shape,) not in _KNOWN:
-        _KNOWN[base.shape,] = base.written(CrowdDynamics(), base.name, 0).flat()
-    return _KNOWN[base.shape,]
-
-
-#: Terms' shapes to the formula of all of them, and of the first one beside what it looks at.
-_KNOWN: dict[tuple[Any, ...], CrowdDynamics] = {}
-_ALONE: dict[tuple[Any, ...], CrowdDynamics] = {}
-
-
-def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
-    """The formula of a model with these terms; None where one is code without a formula."""
-    if any(rule_of(term) is None or term.memory for term in terms):
-        return None
-    key = tuple(term.shape for term in terms)
-    if key not in _KNOWN:
-        law, names = CrowdDynamics(), owners(terms)
-        # a law is known to effects wherever it stands
-        for i, term in sorted(enumerate(terms), key=lambda it: not isinstance(it[1], CrowdBase)):
-            add = term.written if isinstance(term, CrowdBase) else _ruled(term)
-            law = add(law, names[i], i)
-        _KNOWN[key] = law.flat()
-    return _KNOWN[key]
-
-
-def _ruled(term: Term) -> Callable[[CrowdDynamics, str, int], CrowdDynamics]:
-    return lambda law, owner, place: ruled(law, term, owner, place)
-
-
-def contribution(term: Term, state: State) -> Tensor:
-    """``(B, N, 2)`` m/s²: what one term adds to the accelerations, by its rule."""
-    around = [] if state.system is None else list(state.system.terms)
-    effect = not isinstance(term, CrowdBase)
-    bases = [t for t in around if effect and isinstance(t, CrowdBase)]
-    terms = [term, *bases]
-    key = tuple(t.shape for t in terms)
-    if key not in _ALONE:
-        law, names = CrowdDynamics(), owners(terms)
-        for i, base in enumerate(bases, start=1):
-            law = base.told(law, names[i], i)
-        law = replace(law, rate=(const(0), const(0)))
-        _ALONE[key] = ruled(law, term, names[0], 0).flat()
-    code = {name: call for base in bases for name, call in base.code().items()}
-    return rates_of(terms, _ALONE[key], state, code)
+    own_values,
+    values_of,
+)
 
 
 def settings_of(terms: Sequence[Any], law: CrowdDynamics) -> dict[str, float]:

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.model.arrays import NumpyFunction, numpy_function
+from nnode.model.arrays import Code, NumpyFunction, computed, numpy_function
 from nnode.model.expression import Expr, topological
-from nnode.model.lane_dynamics import LaneDynamics
-from nnode.model.tensors import Code, computed
+from nnode.model.terms import LaneDynamics
 
 Array = Any
 #: Values of a formula's symbols.

@@ -18,11 +18,11 @@ from torch.autograd import forward_ad
 
 from nnode.data.sequence import Batch
 from nnode.model.differentiate import derivatives
-from nnode.model.lane_dynamics import LaneDynamics
 from nnode.model.lane_rates import Formulas
 from nnode.model.scene import Scene
 from nnode.model.system import System, initial_with
 from nnode.model.term import State
+from nnode.model.terms import LaneDynamics
 from nnode.simulate.rhs import RightHandSide, arranged, rates_along, samples
 
 #: Derivatives of rates ``(N - 1, K, B)`` by number of the rate's state, number of vehicles ahead,

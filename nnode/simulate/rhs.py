@@ -18,13 +18,13 @@ from torch import Tensor
 from torch.func import functional_call, vmap
 
 from nnode.data.sequence import Batch
-from nnode.model.formula import lane_of, own_values, symbols_of, values_of
-from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.formula import lane_of, symbols_of
 from nnode.model.lane_rates import LaneRates, Values
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
 from nnode.model.system import System, Traffic, initial_with
 from nnode.model.term import State, Term
+from nnode.model.terms import LaneDynamics, own_values, values_of
 
 
 def formula_of(system: System, terms: int | None = None) -> LaneDynamics | None:

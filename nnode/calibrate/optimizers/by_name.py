@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
-from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.errors import ConfigError
 from nnode.model.system import System
 

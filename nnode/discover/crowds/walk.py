@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
-from nnode.discover.residuals.engine import trained
-from nnode.model.crowd import NetworkForce
-from nnode.model.crowd_formula import CrowdBase, crowd_of, settings_of, walls_of
-from nnode.model.formula import own_values, values_of
+from nnode.model.crowd_formula import settings_of, walls_of
+from nnode.model.formula import crowd_of, own_values, values_of
+from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
 from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
@@ -110,15 +110,15 @@ class Walk:
     ) -> None:
         self.windows, self.scene, self.system = windows, scene, alone(system)
         terms = cast(list[Term], list(system.terms))
-        self.law = list(takewhile(lambda term: isinstance(term, CrowdBase), terms))
+        self.law = list(takewhile(lambda term: isinstance(term, Law), terms))
         law = crowd_of(self.law)
-        force = system.find(NetworkForce)
+        force = system.find(InteractionForce)
         oneself = force is not None and force.self_interaction
         self.formula = None if oneself else law
         self.beyond = Beyond(self.system, terms[len(self.law) :] if self.compiled else terms)
-        self.names = list(trained(system))
+        self.names = list(ParameterVector(system).parameters)
         self._people = tuple(torch.as_tensor(index) for index in windows.person.T)
-        self.sizes = [p.numel() for p in trained(system).values()]
+        self.sizes = [p.numel() for p in ParameterVector(system).parameters.values()]
         if self.formula is not None:
             source = WalkSource(self.formula)
             self.kernel = compiled(source)
@@ -151,7 +151,7 @@ class Walk:
 
     def parameters(self, rows: Tensor) -> dict[str, Tensor]:
         """Rows ``(R, K)`` as parameters of :class:`Beyond`."""
-        own = trained(self.system).values()
+        own = ParameterVector(self.system).parameters.values()
         parts = rows.split(self.sizes, 1)
         return {
             f"system.{name}": part.reshape(-1, *p.shape)

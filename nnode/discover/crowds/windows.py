@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,6 @@ from torch import Tensor
 from nnode.data.sequence import PADDING_GAP, Batch, Sequence, collate
 from nnode.discover.crowds.paths import Smoother
 from nnode.errors import DataError
-from nnode.model.crowd import SocialForce
 from nnode.model.scene import Scene
 from nnode.model.system import Crowd, System
 
@@ -157,7 +157,7 @@ class Windows:
         plain = system.scene(self.batch)
         scene = WindowScene(**{f.name: getattr(plain, f.name) for f in fields(plain)})
         scene.speed = self.batch.v
-        force = system.find(SocialForce)
+        force: Any = system.find_law("social_force")
         if force is not None and scene.wall.shape[1]:
             reach = force.r + CUT * force.B + STRAY
             scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)

@@ -14,21 +14,13 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor, nn
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
-from nnode.discover.residuals.engine import (
-    Squares,
-    fill,
-    names_of,
-    of_residuals,
-    row_of,
-    runs_of,
-    trained,
-)
-from nnode.discover.residuals.fit import limits
+from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.expression import symbols
@@ -122,7 +114,7 @@ class TrafficEngine:
         """``(R, K, B, N, W)`` states; their first component are positions, m."""
         batch, longest = self.smoothed, self._longest(system, rows)
         scene = replace(system.scene(batch), step=self._step(longest))
-        rhs = RightHandSide(system, scene, runs_of(system, rows))
+        rhs = RightHandSide(system, scene, ParameterVector(system).runs(rows))
         found = simulated(rhs, rhs.start(batch), batch.dt, batch.n_samples, longest)
         return torch.from_numpy(found).permute(3, 0, 4, 2, 1).contiguous()
 
@@ -155,9 +147,7 @@ class TrafficEngine:
         """``(K, n)`` derivatives of the residuals, by linear response."""
         response = self.linear(system, row)
         with torch.no_grad():
-            own = trained(system)
-            entries = [(name, place) for name, p in own.items() for place in range(p.numel())]
-            return self._columns(response, response.parameters(entries))
+            return self._columns(response, response.parameters(ParameterVector(system).places))
 
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
@@ -186,7 +176,7 @@ class TrafficEngine:
             values[name], amount = effect.strengths[name].neutral + step, step
         changed, _ = extended(response.system, effect(**values))
         with torch.no_grad():
-            x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
+            x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
         moved = torch.where(self.follows, x - response.states[..., 0], 0.0)
         seen = self.batch.x[..., 0][self.batch.valid]
         if not float(moved.abs().max()) <= float(seen.max() - seen.min()):
@@ -222,7 +212,7 @@ class TrafficEngine:
         if last is None or last[0] is not system or not torch.equal(last[1], row):
             self.deviations(system, row[None])
         assert self._last is not None
-        fixed = fill(copy.deepcopy(system), row)
+        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         step = self._step(self._longest(system, row[None]))
         scene = replace(fixed.scene(self.smoothed), step=step)
         with torch.no_grad():
@@ -245,7 +235,8 @@ class TrafficEngine:
         found, batch = copy.deepcopy(system), self.smoothed
         if any(getattr(term, "memory", 0) for term in found.terms):
             return found  # speeds alone do not tell of states that nobody measures
-        low, high = limits(found)
+        vector = ParameterVector(found)
+        low, high = vector.bounds
         states, wanted = batch.x, batch.v[..., 0]
         if system.order > 1 and batch.n_samples > 1:
             states = torch.cat([batch.x, batch.v], -1)
@@ -253,14 +244,14 @@ class TrafficEngine:
         scene = found.scene(batch)
 
         def missed(row: np.ndarray) -> np.ndarray:
-            rates = rates_along(fill(found, torch.from_numpy(row)), scene, states)
+            rates = rates_along(vector.fill_(row), scene, states)
             rate = rates[..., system.order - 1]
             away: np.ndarray = (wanted - rate)[self.follows].numpy()
             return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
 
-        start = np.clip(row_of(found).numpy(), low, high)
+        start = np.clip(vector.row.numpy(), low, high)
         best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
-        return fill(found, torch.from_numpy(best.x))
+        return vector.fill_(best.x)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
@@ -334,7 +325,7 @@ def fastest(system: System, rows: Tensor) -> float:
     }
     found = [
         factors[name] * float(rows[:, j].min())
-        for j, name in enumerate(names_of(system))
+        for j, name in enumerate(ParameterVector(system).names)
         if name in factors
     ]
     return min(found, default=math.inf)

@@ -10,52 +10,44 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.walk import Walk
 from nnode.discover.crowds.windows import Windows
 from nnode.discover.locate.curves import columns_of
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
-from nnode.model import Crowd, Relaxation, SocialForce
-from nnode.model.crowd_formula import CrowdBase
+from nnode.model import Crowd, make_law
 from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.effects.crowd_motion import Drift
 from nnode.model.effects.crowd_pairs import Alignment, PairRepulsion
 from nnode.model.extend import extended
-from nnode.model.field_crowd import PEDESTRIAN_LAWS, without_walls
-from nnode.model.formula_law import FormulaForce
+from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law, without_walls
 from nnode.model.term import State
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
 
 
-class Same(SocialForce):
+class Same(InteractionForce):
     """A force that is the same, but code of its own."""
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
         return super().pair_force(dx, dv)
 
 
-class Coded(CrowdBase):
+class Coded(Law):
     """A formula that is evaluated as code."""
 
-    name = "coded"
-
-    def __init__(self, name: str, **law: Any) -> None:
-        super().__init__()
-        self.own = FormulaForce(name, **law)
-
     def forward(self, state: State) -> Tensor:
-        found: Tensor = self.own(state)
-        return found
+        return super().forward(state)
 
 
-def model(force: type[SocialForce] = SocialForce, **options: float | bool) -> Crowd:
-    law = force(walkers.A, 0.0, 0.0, B=walkers.B, **options)
-    return Crowd([Relaxation(walkers.TAU), law])
+def model(force: type[InteractionForce] = InteractionForce, **options: float | bool) -> Crowd:
+    values: Any = {"A": walkers.A, "k": 0.0, "kappa": 0.0, "B": walkers.B, **options}
+    law = force(entry="social_force", **values)
+    return Crowd([make_law("relaxation", tau=walkers.TAU), law])
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +73,10 @@ def test_compiled_paths_are_those_of_the_model(
     windows = Windows(plain)
     rows = torch.tensor([[15.0, 0.0, 0.0], [25.0, 200.0, 30.0]], dtype=torch.float64)
     found = []
-    for force in (SocialForce, Same):
+    for force in (InteractionForce, Same):
         system = model(force, opposing_wall_friction=opposing, walls=walls, r=0.45)
         walk = Walk(windows, windows.scene(system), system)
-        assert walk.compiled is (force is SocialForce)
+        assert walk.compiled is (force is InteractionForce)
         found.append(walk.paths(rows))
     torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=2e-6)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=2e-5)
@@ -95,11 +87,11 @@ def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
     windows = Windows(plain)
     found = []
     for law in (PEDESTRIAN_LAWS["esf"], without_walls(PEDESTRIAN_LAWS["esf"])):
-        for kind in (FormulaForce, Coded):
-            system = Crowd([kind("esf", **law)], desired="direction").double()
+        for kind in (Law, Coded):
+            system = Crowd([kind(law, "esf")], desired="direction").double()
             walk = Walk(windows, windows.scene(system), system)
-            assert walk.compiled is (kind is FormulaForce)
-            found.append(walk.paths(torch.stack([row_of(system)]))[0])
+            assert walk.compiled is (kind is Law)
+            found.append(walk.paths(torch.stack([ParameterVector(system).row]))[0])
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-5)
     assert float((found[0] - found[2]).abs().max()) > 0.01
 
@@ -108,10 +100,10 @@ def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
 def test_effects_are_followed_to_second_order(plain: list[Sequence], effect: Effect) -> None:
     windows = Windows(plain)
     paths = []
-    for force in (SocialForce, Same):
+    for force in (InteractionForce, Same):
         system, _ = extended(model(force), effect)
         walk = Walk(windows, windows.scene(system), system)
-        paths.append(walk.paths(torch.stack([row_of(system)]))[0])
+        paths.append(walk.paths(torch.stack([ParameterVector(system).row]))[0])
     bare = Walk(windows, windows.scene(model()), model()).paths(ROW[None])[0]
     moved = float((paths[1] - bare).square().mean().sqrt())
     assert moved > 0.02
@@ -120,7 +112,7 @@ def test_effects_are_followed_to_second_order(plain: list[Sequence], effect: Eff
 
 def test_rows_are_independent_of_each_other(engine: CrowdEngine) -> None:
     system, _ = extended(model(), Alignment(c=0.2))
-    rows = row_of(system) + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
+    rows = ParameterVector(system).row + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
     together = engine.residuals(system, rows)
     for k in range(2):
         alone = engine.residuals(system, rows[k : k + 1])[0]
@@ -182,7 +174,7 @@ def alike(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
 
 def test_tangents_are_those_of_simulations(plain: list[Sequence]) -> None:
     system, _ = extended(model(), PairRepulsion(A_2=0.2, B_2=0.8))
-    row = row_of(system)
+    row = ParameterVector(system).row
     row[1] = 50.0
     engine = CrowdEngine(plain)
     engine.settle(system, row)
@@ -208,7 +200,7 @@ def test_traces_are_those_of_simulations(engine: CrowdEngine, name: str) -> None
     for column, (strength, step) in zip(found, probe.steps.items(), strict=True):
         options = {**probe.options, strength: effect.strengths[strength].neutral + step}
         system, _ = extended(model(), effect(**options))
-        changed = engine.residuals(system, row_of(system)[None])[0]
+        changed = engine.residuals(system, ParameterVector(system).row[None])[0]
         cosine, ratio = alike(column, (changed - plain) / step)
         assert cosine > 0.98
         assert ratio == pytest.approx(1.0, abs=0.05)
@@ -237,7 +229,7 @@ def test_sine_and_cosine_of_the_gait(engine: CrowdEngine) -> None:
     phase = effect.person(np.array([0.3, 0.4]), {})  # type: ignore[attr-defined]
     people = {name: [phase] * 6 for name in engine.names}
     system, _ = extended(model(), effect(people=people, a=0.05, f=0.9))
-    row = row_of(system)
+    row = ParameterVector(system).row
     change = engine.residuals(system, row[None])[0] - engine.residuals(model(), ROW[None])[0]
     agreement, ratio = alike(change, 0.05 * (0.6 * sine + 0.8 * cosine))
     assert agreement > 0.97
@@ -290,7 +282,7 @@ def test_a_hidden_effect_scores_best_and_is_measured(
     start = model()
     engine.settle(start, ROW)
     fit = refine(engine, start)
-    engine.settle(fit.system, row_of(fit.system))
+    engine.settle(fit.system, ParameterVector(fit.system).row)
     fit = refine(engine, fit.system)
     screen = Screen(fit, engine.cluster)
     effects = [

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from nnode.model.operations import LIBRARIES
 from nnode.simulate.kernels.lanes import rows
 from nnode.simulate.kernels.lanes.source import LaneSource
 
@@ -27,17 +28,6 @@ def _copy(target: Any, source: Any, number: int) -> None:
 
 def _padded(number: int) -> int:
     return (number + CHUNK - 1) // CHUNK * CHUNK
-
-
-def _logistic(x: float) -> float:
-    u = math.exp(-abs(x))
-    return (u if x < 0 else 1.0) / (1.0 + u)
-
-
-def _torch_softplus(x: float) -> tuple[float, float]:
-    if x > 20:
-        return x, 1.0
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x))), _logistic(x)
 
 
 def _undecorated(*_: Any, **__: Any) -> Any:
@@ -65,11 +55,11 @@ def _real(value: float, like: Any) -> float:
 _lead_places = FunctionType(rows.lead_places.py_func.__code__, {**vars(rows), "real": _real})
 #: What the generated source imports, for numbers in float64.
 _NAMES: dict[str, Any] = {
+    **LIBRARIES["number"],
     "njit": _undecorated, "INLINE": {}, "copy": _copy, "padded": _padded,
     "real": _real, "lead_places": _lead_places, "add": lambda total, value: total + value,
     "exp": _float(math.exp, math.inf), "log": _float(math.log, math.nan),
-    "sqrt": _float(math.sqrt, math.nan), "sin": math.sin, "cos": math.cos,
-    "logistic": _logistic, "torch_softplus": _torch_softplus,
+    "sqrt": _float(math.sqrt, math.nan),
     **{name: getattr(rows, name).py_func
        for name in ("collect", "masks", "place", "spread", "take")},
     # indices are Python's numbers, which are faster than NumPy's

@@ -12,11 +12,11 @@ from functools import cached_property
 
 import torch
 
+from nnode.model.arrays import computed
 from nnode.model.crowd_dynamics import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
 from nnode.model.differentiate import derivatives
 from nnode.model.expression import Expr, apply, symbol, symbols, topological
 from nnode.model.names import check_symbols
-from nnode.model.tensors import computed
 from nnode.model.text import plain
 from nnode.simulate.kernels.crowds.least import LEAST
 from nnode.simulate.kernels.crowds.neurons import Feature, split
@@ -181,7 +181,7 @@ class CrowdSource:
                 continue
             text += self._tables(over)
             text += self.loop.function(f"law_{over}", found)
-            text += self.loop.pulled(f"law_{over}_pull", _seeds(found), self._slopes(over), [])
+            text += self.loop.vjp(f"law_{over}_pull", _seeds(found), self._slopes(over), [])
             if over == SMALLEST:
                 text += LEAST.format(over=over, nobody=NOBODY)
                 continue
@@ -190,7 +190,7 @@ class CrowdSource:
             for name, rest in (("", "sums, reaction"), ("_pull", "weight, to_own, to_other")):
                 text += MEET[self.near].format(name=f"{over}{name}", rest=rest, mutual=mutual)
         text += self._own_tables() + self.loop.function("law_own", self._rate)
-        text += self.loop.pulled("law_own_pull", _seeds(self._rate), self._slopes_own, [])
+        text += self.loop.vjp("law_own_pull", _seeds(self._rate), self._slopes_own, [])
         return text + OWN + DRIVE.format(**self._pieces())
 
     def _known(self, over: str) -> str:
@@ -209,13 +209,13 @@ class CrowdSource:
             text += self._table(f"PLACE_{name}", {n: i for n, i in takes.items() if i < 2})
             text += self.loop.function(f"know_{name}", formulas)
             slopes = {row: row[2:] for row in gives}
-            text += self.loop.pulled(f"know_{name}_pull", _seeds(formulas), slopes, [])
+            text += self.loop.vjp(f"know_{name}_pull", _seeds(formulas), slopes, [])
             text += KNOW.format(name=name, over=over)
         first, z = self.sums.index(f"{over}_one"), symbol("z")
         value = apply(self.over[over][f"{over}_s0"].op, z)
         lines = {
-            "value": self.loop.of_numbers({"value": value}),
-            "slope": self.loop.of_numbers({"slope": derivatives(value, ["z"])["z"]}),
+            "value": self.loop.of_numbers("value", value),
+            "slope": self.loop.of_numbers("slope", derivatives(value, ["z"])["z"]),
         }
         text += NEURONS.format(
             over=over, first=first, **{k: _lines(2, v).rstrip("\n") for k, v in lines.items()}

@@ -235,10 +235,10 @@ class LaneSource:
         grads = {f"G_{p}": p for p in self.parameters} if self.own else {}
         kept = [f"A_{s}" for s in self.states] if self.stages != "rk4" else []
         onto = [*kept, *grads]
-        text = self.loop.pulled("follow_pull", self._seeds(self.follower), {**rows, **grads}, onto)
+        text = self.loop.vjp("follow_pull", self._seeds(self.follower), {**rows, **grads}, onto)
         # of the first row only a leader's own speed can matter
         mine = [f"A_{s}" for s in self.states if not kept or s in symbols(self.first.values())]
-        text += self.loop.pulled(
+        text += self.loop.vjp(
             "first_pull",
             self._seeds(self.first),
             {**{row: row[2:] for row in mine}, **grads},
