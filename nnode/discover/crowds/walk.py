@@ -20,7 +20,7 @@ from nnode.model.formula import crowd_of, own_values, values_of
 from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
-from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
+from nnode.simulate.kernels.alone import WalkSource, compiled
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -46,7 +46,7 @@ class Beyond(nn.Module):
 @dataclass
 class Tables:
     """What the compiled code knows of the surroundings, see
-    :mod:`nnode.simulate.kernels.crowds.alone`."""
+    :mod:`nnode.simulate.kernels.alone`."""
 
     others: np.ndarray
     window: np.ndarray

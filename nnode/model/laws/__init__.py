@@ -17,13 +17,13 @@ import yaml
 from torch import Tensor
 
 from nnode.errors import ConfigError
+from nnode.model.arrays import Code, computed
 from nnode.model.crowd_formula import rates_of, settings_of
 from nnode.model.expression import Expr, call, const, substitute, symbol, symbols
 from nnode.model.names import check_names
 from nnode.model.network import FeedForward
 from nnode.model.parse import parse
 from nnode.model.steps import METHODS
-from nnode.model.tensors import Code, computed
 from nnode.model.term import Interval, State, Term
 from nnode.model.terms import (
     LARGEST,
