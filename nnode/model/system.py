@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -321,21 +321,28 @@ class Crowd(System):
         return torch.cat([*moving[1:], self._rates(state)], -1)
 
 
-class _Initial(nn.Module):
-    """The start of a model as a module, so that its parameters can be replaced."""
+class _Given(nn.Module):
+    """A model in a module that calls a function of it, so that its parameters can be replaced."""
 
     def __init__(self, system: System) -> None:
         super().__init__()
         self.system = system
 
-    def forward(self, batch: Batch, step: float | None) -> Tensor:
-        return self.system.initial(batch, step)
+    def forward(self, function: Callable[[System], Any]) -> Any:
+        return function(self.system)
+
+
+def with_parameters(
+    system: System, parameters: Mapping[str, Tensor], function: Callable[[System], Any]
+) -> Any:
+    """A function of a model, with other parameters in place of the model's."""
+    own = {f"system.{name}": value for name, value in parameters.items()}
+    return functional_call(_Given(system), own, (function,))
 
 
 def initial_with(
     system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
 ) -> Tensor:
     """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
-    own = {f"system.{name}": value for name, value in parameters.items()}
-    found: Tensor = functional_call(_Initial(system), own, (batch, step))
+    found: Tensor = with_parameters(system, parameters, lambda own: own.initial(batch, step))
     return found

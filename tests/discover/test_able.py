@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.able import check_effect, check_model
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import evaluated
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.score import traces
@@ -127,14 +127,14 @@ def crowd(*more: Term) -> Crowd:
 @pytest.fixture(scope="module")
 def platoon_engine() -> TrafficEngine:
     engine = TrafficEngine(platoons(number=4, driver=0.2))
-    engine.settle(lane(), row_of(lane()))
+    engine.settle(lane(), ParameterVector(lane()).row)
     return engine
 
 
 @pytest.fixture(scope="module")
 def crowd_engine() -> CrowdEngine:
     engine = CrowdEngine(walkers.crowd(sequences=3))
-    engine.settle(crowd(), row_of(crowd()))
+    engine.settle(crowd(), ParameterVector(crowd()).row)
     return engine
 
 
@@ -158,7 +158,7 @@ def test_a_lane_asks_an_individual_effect_what_it_does(
         return found
 
     system = model(np.array(start)) if own else lane()
-    row = row_of(lane())
+    row = ParameterVector(lane()).row
     found = engine.individual(system, row, kind, {})
     before = engine.residuals(model(np.array(start)), row[None])[0]
     for place in range(4):  # the leader's place is the last
@@ -170,7 +170,7 @@ def test_a_lane_asks_an_individual_effect_what_it_does(
 
 
 def test_two_individual_effects_have_different_columns(platoon_engine: TrafficEngine) -> None:
-    row = row_of(lane())
+    row = ParameterVector(lane()).row
     ours, theirs = (
         platoon_engine.individual(lane(), row, kind, {}) for kind in (Haste, DriverHeterogeneity)
     )
@@ -178,11 +178,11 @@ def test_two_individual_effects_have_different_columns(platoon_engine: TrafficEn
 
 
 def test_a_crowd_asks_an_individual_effect_for_its_amounts(crowd_engine: CrowdEngine) -> None:
-    engine, row = crowd_engine, row_of(crowd())
+    engine, row = crowd_engine, ParameterVector(crowd()).row
     sine, cosine = engine.individual(crowd(), row, Stride, {})
     people = dict.fromkeys(engine.names, [0.9] * 6)
     system = crowd(Stride(people=people, a=0.05))
-    change = engine.residuals(system, row_of(system)[None])[0]
+    change = engine.residuals(system, ParameterVector(system).row[None])[0]
     change = change - engine.residuals(crowd(), row[None])[0]
     expected = 0.05 * (math.cos(0.9) * sine + math.sin(0.9) * cosine)
     assert apart(change, expected) < 0.1
@@ -190,11 +190,11 @@ def test_a_crowd_asks_an_individual_effect_for_its_amounts(crowd_engine: CrowdEn
 
 
 def test_a_crowd_looks_for_an_effect_without_strengths(crowd_engine: CrowdEngine) -> None:
-    engine, row = crowd_engine, row_of(crowd())
+    engine, row = crowd_engine, ParameterVector(crowd()).row
     assert Limit.probes(engine.batch, crowd()) == [Probe({}, {})]
     (trace,) = traces(engine, evaluated(engine, crowd()), Limit)
     system = crowd(Faint())
-    change = engine.residuals(system, row_of(system)[None])[0]
+    change = engine.residuals(system, ParameterVector(system).row[None])[0]
     change = change - engine.residuals(crowd(), row[None])[0]
     assert trace.columns.shape == (len(change), 1)
     assert apart(torch.from_numpy(trace.columns[:, 0]), change / 0.01) < 0.02
@@ -218,7 +218,7 @@ def test_a_law_of_another_kind_is_diagnosed_in_a_lane() -> None:
 def test_an_effect_on_a_law_that_is_missing_says_so(platoon_engine: TrafficEngine) -> None:
     system = Traffic([Optimal(), Inertia()], leader="measured")
     with pytest.raises(ConfigError, match=r"needs a model with one; derive .*FollowTheLeader"):
-        platoon_engine.residuals(system, row_of(system)[None])
+        platoon_engine.residuals(system, ParameterVector(system).row[None])
 
 
 class Moody(IndividualEffect):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.able import check_model
 from nnode.discover.crowds.response import Frames, propagate
@@ -20,7 +21,7 @@ from nnode.discover.crowds.walk import Tables, Walk
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows, WindowScene
 from nnode.discover.found import Simulation
-from nnode.discover.residuals.engine import Squares, fill, of_residuals
+from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
@@ -193,7 +194,7 @@ class CrowdEngine:
         if now is not None and now.system is system and torch.equal(now.row, row):
             return now
         walk = self._walk(copy.deepcopy(system))
-        fill(walk.system, row)
+        ParameterVector(walk.system).fill_(row)
         x, v = walk.paths(row[None])
         self._now = Linearised(system, row.clone(), Frames(walk, row, x[:, 0], v[:, 0]))
         return self._now

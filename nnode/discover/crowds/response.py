@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.walk import Walk
-from nnode.discover.residuals.engine import runge_kutta, trained
+from nnode.discover.residuals.engine import runge_kutta
 from nnode.model.effects.base import Effect
 from nnode.model.term import State, Term
 
@@ -113,7 +114,7 @@ class Frames:
         """Differences of the parameters. An effect's force may be rough: what it does over a
         visible difference of its strength is what a fit has to know."""
         out = []
-        for name, p in trained(self.walk.system).items():
+        for name, p in ParameterVector(self.walk.system).parameters.items():
             _, place, key = name.split(".", 2)
             term = self.walk.system.terms[int(place)]
             known = term.strengths.get(key) if isinstance(term, Effect) else None

@@ -12,14 +12,15 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
-from nnode.discover.residuals.engine import runge_kutta, trained
+from nnode.discover.residuals.engine import runge_kutta
 from nnode.model.crowd_formula import settings_of, walls_of
 from nnode.model.formula import crowd_of, own_values, values_of
 from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
-from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
+from nnode.simulate.kernels.alone import WalkSource, compiled
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -45,7 +46,7 @@ class Beyond(nn.Module):
 @dataclass
 class Tables:
     """What the compiled code knows of the surroundings, see
-    :mod:`nnode.simulate.kernels.crowds.alone`."""
+    :mod:`nnode.simulate.kernels.alone`."""
 
     others: np.ndarray
     window: np.ndarray
@@ -116,9 +117,9 @@ class Walk:
         oneself = force is not None and force.self_interaction
         self.formula = None if oneself else law
         self.beyond = Beyond(self.system, terms[len(self.law) :] if self.compiled else terms)
-        self.names = list(trained(system))
+        self.names = list(ParameterVector(system).parameters)
         self._people = tuple(torch.as_tensor(index) for index in windows.person.T)
-        self.sizes = [p.numel() for p in trained(system).values()]
+        self.sizes = [p.numel() for p in ParameterVector(system).parameters.values()]
         if self.formula is not None:
             source = WalkSource(self.formula)
             self.kernel = compiled(source)
@@ -151,7 +152,7 @@ class Walk:
 
     def parameters(self, rows: Tensor) -> dict[str, Tensor]:
         """Rows ``(R, K)`` as parameters of :class:`Beyond`."""
-        own = trained(self.system).values()
+        own = ParameterVector(self.system).parameters.values()
         parts = rows.split(self.sizes, 1)
         return {
             f"system.{name}": part.reshape(-1, *p.shape)

@@ -14,6 +14,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor, nn
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.along import Along
@@ -23,15 +24,7 @@ from nnode.discover.lanes.response import Response
 from nnode.discover.lanes.runs import side_by_side
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
-from nnode.discover.residuals.engine import (
-    Squares,
-    fill,
-    names_of,
-    of_residuals,
-    row_of,
-    runge_kutta,
-)
-from nnode.discover.residuals.fit import limits
+from nnode.discover.residuals.engine import Squares, of_residuals, runge_kutta
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.expression import symbols
@@ -192,7 +185,7 @@ class TrafficEngine:
             values[name], amount = effect.strengths[name].neutral + step, step
         changed, _ = extended(response.system, effect(**values))
         with torch.no_grad():
-            x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
+            x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
         moved = torch.where(self.follows, x - response.states[..., 0], 0.0)
         seen = self.batch.x[..., 0][self.batch.valid]
         if not float(moved.abs().max()) <= float(seen.max() - seen.min()):
@@ -230,7 +223,7 @@ class TrafficEngine:
         if last is None or last[0] is not system or not torch.equal(last[1], row):
             self.deviations(system, row[None])
         assert self._last is not None
-        fixed = fill(copy.deepcopy(system), row)
+        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         stride, steps = self._steps(system, row[None])
         scene = replace(fixed.scene(self.smoothed), step=self.batch.dt * stride / steps)
         with torch.no_grad():
@@ -253,7 +246,8 @@ class TrafficEngine:
         found, batch = copy.deepcopy(system), self.smoothed
         if found.memory:
             return found  # speeds alone do not tell of states that nobody measures
-        low, high = limits(found)
+        vector = ParameterVector(found)
+        low, high = vector.bounds
         states, wanted = batch.x, batch.v[..., 0]
         if system.order > 1 and batch.n_samples > 1:
             states = torch.cat([batch.x, batch.v], -1)
@@ -261,13 +255,13 @@ class TrafficEngine:
         along = Along(found.scene(batch), states)
 
         def missed(row: np.ndarray) -> np.ndarray:
-            rate = along.rates(fill(found, torch.from_numpy(row)))[..., system.order - 1]
+            rate = along.rates(vector.fill_(row))[..., system.order - 1]
             away: np.ndarray = (wanted - rate)[self.follows].numpy()
             return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
 
-        start = np.clip(row_of(found).numpy(), low, high)
+        start = np.clip(vector.row.numpy(), low, high)
         best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
-        return fill(found, torch.from_numpy(best.x))
+        return vector.fill_(best.x)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
@@ -341,7 +335,7 @@ def fastest(system: System, rows: Tensor) -> float:
     }
     found = [
         factors[name] * float(rows[:, j].min())
-        for j, name in enumerate(names_of(system))
+        for j, name in enumerate(ParameterVector(system).names)
         if name in factors
     ]
     return min(found, default=math.inf)

@@ -10,20 +10,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.walk import Walk
 from nnode.discover.crowds.windows import Windows
 from nnode.discover.locate.curves import columns_of
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.model import Crowd, make_law
 from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
-from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law, without_walls
+from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import State
+from nnode.study.walking.laws import without_walls
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
@@ -90,7 +91,7 @@ def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
             system = Crowd([kind(law, "esf")], desired="direction").double()
             walk = Walk(windows, windows.scene(system), system)
             assert walk.compiled is (kind is Law)
-            found.append(walk.paths(torch.stack([row_of(system)]))[0])
+            found.append(walk.paths(torch.stack([ParameterVector(system).row]))[0])
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-5)
     assert float((found[0] - found[2]).abs().max()) > 0.01
 
@@ -102,7 +103,7 @@ def test_effects_are_followed_to_second_order(plain: list[Sequence], effect: Eff
     for force in (InteractionForce, Same):
         system, _ = extended(model(force), effect)
         walk = Walk(windows, windows.scene(system), system)
-        paths.append(walk.paths(torch.stack([row_of(system)]))[0])
+        paths.append(walk.paths(torch.stack([ParameterVector(system).row]))[0])
     bare = Walk(windows, windows.scene(model()), model()).paths(ROW[None])[0]
     moved = float((paths[1] - bare).square().mean().sqrt())
     assert moved > 0.02
@@ -111,7 +112,7 @@ def test_effects_are_followed_to_second_order(plain: list[Sequence], effect: Eff
 
 def test_rows_are_independent_of_each_other(engine: CrowdEngine) -> None:
     system, _ = extended(model(), Alignment(c=0.2))
-    rows = row_of(system) + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
+    rows = ParameterVector(system).row + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
     together = engine.residuals(system, rows)
     for k in range(2):
         alone = engine.residuals(system, rows[k : k + 1])[0]
@@ -173,7 +174,7 @@ def alike(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
 
 def test_tangents_are_those_of_simulations(plain: list[Sequence]) -> None:
     system, _ = extended(model(), PairRepulsion(A_2=0.2, B_2=0.8))
-    row = row_of(system)
+    row = ParameterVector(system).row
     row[1] = 50.0
     engine = CrowdEngine(plain)
     engine.settle(system, row)
@@ -199,7 +200,7 @@ def test_traces_are_those_of_simulations(engine: CrowdEngine, name: str) -> None
     for column, (strength, step) in zip(found, probe.steps.items(), strict=True):
         options = {**probe.options, strength: effect.strengths[strength].neutral + step}
         system, _ = extended(model(), effect(**options))
-        changed = engine.residuals(system, row_of(system)[None])[0]
+        changed = engine.residuals(system, ParameterVector(system).row[None])[0]
         cosine, ratio = alike(column, (changed - plain) / step)
         assert cosine > 0.98
         assert ratio == pytest.approx(1.0, abs=0.05)
@@ -228,7 +229,7 @@ def test_sine_and_cosine_of_the_gait(engine: CrowdEngine) -> None:
     phase = effect.person(np.array([0.3, 0.4]), {})  # type: ignore[attr-defined]
     people = {name: [phase] * 6 for name in engine.names}
     system, _ = extended(model(), effect(people=people, a=0.05, f=0.9))
-    row = row_of(system)
+    row = ParameterVector(system).row
     change = engine.residuals(system, row[None])[0] - engine.residuals(model(), ROW[None])[0]
     agreement, ratio = alike(change, 0.05 * (0.6 * sine + 0.8 * cosine))
     assert agreement > 0.97
@@ -281,7 +282,7 @@ def test_a_hidden_effect_scores_best_and_is_measured(
     start = model()
     engine.settle(start, ROW)
     fit = refine(engine, start)
-    engine.settle(fit.system, row_of(fit.system))
+    engine.settle(fit.system, ParameterVector(fit.system).row)
     fit = refine(engine, fit.system)
     screen = Screen(fit, engine.cluster)
     effects = [

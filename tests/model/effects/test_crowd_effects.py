@@ -333,9 +333,7 @@ def test_effects_that_cannot_act_have_no_probes() -> None:
 def test_an_effect_on_a_force_that_is_not_there() -> None:
     model = Crowd([make_law("relaxation", tau=0.5)])
     add_effects(model, [{"name": "field_of_view", "lambda_": 0.5}])
-    with pytest.raises(
-        ValueError, match="social_force or network_force"
-    ):
+    with pytest.raises(ValueError, match="social_force or network_force"):
         model(torch.tensor(0.0), torch.cat([BATCH.x[0], BATCH.v[0]], -1), Scene.of(BATCH))
 
 
