@@ -236,7 +236,8 @@ def checkpoint(name: str) -> dict[str, Any]:
 
 
 def study(name: str) -> dict[str, Any]:
-    """Sums over the columns of a quick study's tables."""
+    """Sums over the columns of a quick study's tables, without those of networks' weights, which
+    data do not determine, and of held-out means, which contain runaways."""
     with tempfile.TemporaryDirectory() as folder:
         words = [f"study={name}", "study.quick=true", "study.workers=1", f"hydra.run.dir={folder}"]
         subprocess.run(
@@ -246,6 +247,7 @@ def study(name: str) -> dict[str, Any]:
         return {
             path.name: pd.read_csv(path).select_dtypes("number").abs().sum().to_dict()
             for path in tables
+            if path.stem not in ("parameters", "laws", "heldout")
         }
 
 

@@ -54,8 +54,9 @@ def check_model(system: System) -> None:
     Raises:
         ConfigError: names the term and what to do.
     """
-    law = crowd_of([t for t in system.terms if isinstance(t, Law)])
-    if system.domain == "crowd" and law is not None and (law.order == 1 or law.sums[SMALLEST]):
+    crowd = system.domain == "crowd"
+    law = crowd_of([t for t in system.terms if isinstance(t, Law)]) if crowd else None
+    if law is not None and (law.order == 1 or law.sums[SMALLEST]):
         what = "of first order" if law.order == 1 else "with smallest values over others"
         raise ConfigError(
             f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "

@@ -23,7 +23,6 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 from nnode.model.steps import METHODS
 from nnode.simulate import FusedSolver, TorchdiffeqSolver, Trajectory
 from nnode.simulate.kernels import lanes
-from nnode.simulate.kernels.lanes import runs
 from tests.model.effects.test_crowd_effects import VALUES
 from tests.model.following import model
 from tests.simulate.fused.compare import RungeKutta
@@ -322,7 +321,7 @@ def with_effects() -> list[Any]:
 
 @pytest.fixture
 def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs, "compiled", interpreted)
+    monkeypatch.setattr(lanes, "compiled", interpreted)
 
 
 @pytest.mark.usefixtures("without_compiler")
@@ -337,10 +336,7 @@ def test_every_law_and_method(law: str, method: str, leader: str) -> None:
 @pytest.mark.parametrize(("law", "effect", "method"), with_effects())
 def test_every_effect(law: str, effect: str, method: str, leader: str) -> None:
     system = lane_of(law, leader, *effect.split("+"))
-    lane = system.lane
-    assert lane is not None
-    exact_start = set(list(lane.rates)[lane.order :]) <= set(lane.starts)
-    check(system, platoons(), method, compiled, *([by_tangents] if exact_start else []))
+    check(system, platoons(), method, compiled, by_tangents)
 
 
 @pytest.mark.parametrize(
