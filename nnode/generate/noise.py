@@ -27,8 +27,7 @@ from nnode.model.system import System
 from nnode.model.term import State, Term
 from nnode.model.terms import Rule
 from nnode.simulate.base import Trajectory, check_finite, substeps
-from nnode.simulate.ode import whole_steps
-from nnode.simulate.rates import Rates
+from nnode.simulate.ode import Rates, whole_steps
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nnode.model.arrays import Code, computed
 from nnode.model.scene import Scene
-from nnode.model.tensors import Code, computed
 from nnode.model.term import State, Term
 from nnode.model.terms import (
     NOBODY,

@@ -77,6 +77,8 @@ class Term(nn.Module):
         rule: of a law or a force, its formulas; None: ``forward`` is code, which runs in PyTorch.
         rules: of an effect, the order of a model to what the effect does to it, as formulas.
         fast: parameters that time constants of its states are proportional to, with the factor.
+        side_by_side: whether ``forward`` takes many simulations at once, with times ``(B,)`` and
+            scalar parameters ``(B, 1, 1)``.
     """
 
     name: ClassVar[str]
@@ -85,6 +87,7 @@ class Term(nn.Module):
     rule: Rule | None = None
     rules: ClassVar[Mapping[int, Rule]] = {}
     fast: ClassVar[dict[str, float]] = {}
+    side_by_side: ClassVar[bool] = False
 
     def __init__(self) -> None:
         super().__init__()

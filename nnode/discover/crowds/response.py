@@ -11,9 +11,9 @@ from torch.func import functional_call
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.walk import Walk
-from nnode.discover.residuals.engine import runge_kutta
 from nnode.model.effects.base import Effect
 from nnode.model.term import State, Term
+from nnode.simulate.numpy import runge_kutta
 
 #: Differences of positions (m) and velocities (m/s) for derivatives.
 DIFFERENCE = 1e-4

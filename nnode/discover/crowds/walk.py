@@ -14,13 +14,13 @@ from torch.func import functional_call, vmap
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.windows import Windows, WindowScene, alone
-from nnode.discover.residuals.engine import runge_kutta
 from nnode.model.crowd_formula import settings_of, walls_of
 from nnode.model.formula import crowd_of, own_values, values_of
 from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
-from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
+from nnode.simulate.kernels.alone import WalkSource, compiled
+from nnode.simulate.numpy import runge_kutta
 
 #: Numbers in the largest intermediate result.
 CHUNK = 2_000_000
@@ -46,7 +46,7 @@ class Beyond(nn.Module):
 @dataclass
 class Tables:
     """What the compiled code knows of the surroundings, see
-    :mod:`nnode.simulate.kernels.crowds.alone`."""
+    :mod:`nnode.simulate.kernels.alone`."""
 
     others: np.ndarray
     window: np.ndarray
