@@ -71,20 +71,45 @@ def minimise(
     Source:
         Nocedal & Wright, Numerical Optimization, 2nd ed., sections 6.1 and 16.7.
     """
-    runs = _Runs(evaluate, start, low, high, inverse)
-    earlier = runs.cost
-    done = 0
+    x = start.clamp(low, high)
+    cost, gradient = evaluate(x)
+    usable = torch.isfinite(cost) & torch.isfinite(gradient).all(1)
+    cost = torch.where(usable, cost, math.inf)
+    gradient = torch.where(usable[:, None], gradient, 0.0)
+    unit = torch.eye(x.shape[1], dtype=x.dtype)
+    inverses = (unit if inverse is None else inverse).repeat(len(x), 1, 1)
+    # without curvature yet: the first step is cut, the first curvature scales the rest
+    fresh = torch.full((len(x),), inverse is None)
+    length, refused = torch.ones(len(x), dtype=x.dtype), torch.zeros(len(x), dtype=torch.long)
+    along = _direction(x, gradient, inverses, fresh, low, high)
+    earlier, done = cost, 0
     for done in range(1, iterations + 1):
-        runs.advance()
+        trial = (x + length[:, None] * along).clamp(low, high)
+        value, slope = evaluate(trial)
+        step = trial - x
+        enough = cost + DECREASE * (step * gradient).sum(1)
+        taken = (value <= enough) & (value < cost) & torch.isfinite(slope).all(1)
+        change = torch.where(taken[:, None], slope - gradient, 0.0)
+        inverses, fresh = _updated(inverses, fresh, taken, step, change)
+        x, gradient = (
+            torch.where(taken[:, None], *both) for both in ((trial, x), (slope, gradient))
+        )
+        cost = torch.where(taken, value, cost)
+        refused = torch.where(taken, 0, refused + 1)
+        lost = refused >= PATIENCE
+        inverses = torch.where(lost[:, None, None], unit, inverses)
+        fresh |= lost
+        refused[lost] = 0
+        new = taken | lost
+        length = torch.where(new, 1.0, length * SHORTEN)
+        turned = _direction(x, gradient, inverses, fresh, low, high)
+        along = torch.where(new[:, None], turned, along)
         if done % 20 == 0:
-            if bool(
-                (earlier - runs.cost <= tolerance * runs.cost.abs())
-                .logical_or(~torch.isfinite(runs.cost))
-                .all()
-            ):
+            still = (earlier - cost <= tolerance * cost.abs()) | ~torch.isfinite(cost)
+            if bool(still.all()):
                 break
-            earlier = runs.cost
-    return Minima(runs.x, runs.cost, runs.gradient, runs.inverse, done + 1)
+            earlier = cost
+    return Minima(x, cost, gradient, inverses, done + 1)
 
 
 def optimality_residual(
@@ -104,72 +129,27 @@ def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
-class _Runs:
-    """State of all runs: points, costs, gradients, inverse Hessians, steps."""
+def _updated(
+    inverses: Tensor, fresh: Tensor, taken: Tensor, step: Tensor, change: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Inverse Hessians after the steps that were taken and met curvature, and which runs have met
+    none yet."""
+    product = (step * change).sum(1)
+    good = taken & (product > 1e-12 * step.norm(dim=1) * change.norm(dim=1))
+    rate = torch.where(good, 1.0 / product, 0.0)[:, None, None]
+    first = good & fresh
+    scale = torch.where(first, product / (change * _times(inverses, change)).sum(1), 1.0)
+    left = torch.eye(step.shape[1], dtype=step.dtype) - rate * step[:, :, None] * change[:, None]
+    scaled = inverses * scale[:, None, None]
+    update = left @ scaled @ left.mT + rate * step[:, :, None] * step[:, None]
+    return torch.where(good[:, None, None], update, scaled), fresh & ~first
 
-    def __init__(
-        self,
-        evaluate: Evaluate,
-        start: Tensor,
-        low: Tensor,
-        high: Tensor,
-        inverse: Tensor | None = None,
-    ) -> None:
-        self.evaluate, self.low, self.high = evaluate, low, high
-        self.x = start.clamp(low, high)
-        cost, gradient = evaluate(self.x)
-        usable = torch.isfinite(cost) & torch.isfinite(gradient).all(1)
-        self.cost = torch.where(usable, cost, math.inf)
-        self.gradient = torch.where(usable[:, None], gradient, 0.0)
-        runs, size = start.shape
-        self.unit = torch.eye(size, dtype=start.dtype)
-        self.inverse = (self.unit if inverse is None else inverse).repeat(runs, 1, 1)
-        # without curvature yet: the first step is cut, the first curvature scales the rest
-        self.fresh = torch.full((runs,), inverse is None)
-        self.length = torch.ones(runs, dtype=start.dtype)
-        self.refused = torch.zeros(runs, dtype=torch.long)
-        self.direction = self._direction()
 
-    def advance(self) -> None:
-        """One evaluation: every run tries its step, and learns from it."""
-        trial = (self.x + self.length[:, None] * self.direction).clamp(self.low, self.high)
-        cost, gradient = self.evaluate(trial)
-        step = trial - self.x
-        enough = self.cost + DECREASE * (step * self.gradient).sum(1)
-        taken = (cost <= enough) & (cost < self.cost) & torch.isfinite(gradient).all(1)
-        self._learn(taken, step, torch.where(taken[:, None], gradient - self.gradient, 0.0))
-        self.x = torch.where(taken[:, None], trial, self.x)
-        self.gradient = torch.where(taken[:, None], gradient, self.gradient)
-        self.cost = torch.where(taken, cost, self.cost)
-        self.refused = torch.where(taken, 0, self.refused + 1)
-        lost = self.refused >= PATIENCE
-        self.inverse = torch.where(lost[:, None, None], self.unit, self.inverse)
-        self.fresh |= lost
-        self.refused[lost] = 0
-        new = taken | lost
-        self.length = torch.where(new, 1.0, self.length * SHORTEN)
-        self.direction = torch.where(new[:, None], self._direction(), self.direction)
-
-    def _learn(self, taken: Tensor, step: Tensor, change: Tensor) -> None:
-        """Update the inverse Hessians of the runs whose step was taken and met curvature."""
-        product = (step * change).sum(1)
-        good = taken & (product > 1e-12 * step.norm(dim=1) * change.norm(dim=1))
-        rate = torch.where(good, 1.0 / product, 0.0)
-        first = good & self.fresh
-        quadratic = (change * _times(self.inverse, change)).sum(1)
-        scale = torch.where(first, product / quadratic, 1.0)
-        inverse = self.inverse * scale[:, None, None]
-        self.fresh &= ~first
-        left = self.unit - rate[:, None, None] * step[:, :, None] * change[:, None, :]
-        update = left @ inverse @ left.mT + rate[:, None, None] * step[:, :, None] * step[:, None]
-        self.inverse = torch.where(good[:, None, None], update, self.inverse)
-
-    def _direction(self) -> Tensor:
-        pressed = ((self.x <= self.low) & (self.gradient > 0)) | (
-            (self.x >= self.high) & (self.gradient < 0)
-        )
-        free = (~pressed).to(self.x.dtype)
-        found = -_times(self.inverse, self.gradient * free) * free
-        size = found.norm(dim=1, keepdim=True)
-        most = torch.where(self.fresh, FIRST, LONGEST).to(size)[:, None]
-        return torch.where(size > most, found * most / size, found)
+def _direction(
+    x: Tensor, gradient: Tensor, inverses: Tensor, fresh: Tensor, low: Tensor, high: Tensor
+) -> Tensor:
+    free = ~(((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0)))
+    found = -_times(inverses, gradient * free) * free
+    size = found.norm(dim=1, keepdim=True)
+    most = torch.where(fresh, FIRST, LONGEST).to(size)[:, None]
+    return torch.where(size > most, found * most / size, found)

@@ -99,10 +99,10 @@ class ResidualProblem:
         own = [(name, at) for name, at in every if at[0] in vector.parameters]
         self.names = [name for name, _ in own]
         self.physical = np.array([axes is None for _, (_, _, axes) in own], dtype=bool)
-        if self.lane is None and self.physical.all():
-            system, batch = copy.deepcopy(system).double(), batch.to(None, torch.float64)
-        elif self.lane is None:
+        if self.lane is None:
             system = copy.deepcopy(system)
+            if self.physical.all():
+                system, batch = system.double(), batch.to(None, torch.float64)
         self.system, self.batch = system, batch
         self.vector = ParameterVector(system, [at[:2] for _, at in own])
         self.low, self.high = self.vector.bounds
@@ -200,7 +200,6 @@ class ResidualProblem:
         The search begins at the better of the last ones and of those that were given: speeds that
         other parameters asked for may be far from the best, where no step helps.
         """
-
         assert self.fitted is not None
         best = np.full(len(self.batch), math.inf)
         away = torch.zeros(0)
@@ -212,10 +211,8 @@ class ResidualProblem:
             x, v, *_ = self._paths(rows, start)
             cost, new = self._cost(x, v), errors(x, v, self.batch, self.convention)[0]
             better = torch.from_numpy(cost < best)[:, None]
-            away, best = (
-                torch.where(better, new, away) if len(away) else new,
-                np.minimum(cost, best),
-            )
+            away = torch.where(better, new, away) if len(away) else new
+            best = np.minimum(cost, best)
             return cost[None]
 
         def quadratic(start: np.ndarray) -> Quadratic:
@@ -352,10 +349,10 @@ class ResidualProblem:
 
 def _lane(system: System, batch: Batch) -> Any:
     lane = lanes.supports(system, batch)
-    if lane is None or any(state not in lane.starts for state in list(lane.rates)[lane.order :]):
+    if lane is None:
         raise ConfigError(
-            "optimizer=gauss_newton needs a model of a lane whose law and effects are formulas, "
-            "starts of their memory as well; take another optimizer"
+            "optimizer=gauss_newton needs a model of a lane whose law and effects are formulas; "
+            "take another optimizer"
         )
     return lane
 

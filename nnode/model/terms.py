@@ -164,8 +164,8 @@ class Rule:
             that it adds, of the velocity where ``order`` is 1.
         leader: what becomes of the speed of a leader that drives by itself, ``W`` before;
             empty: it stays.
-        states: name to (unit, rate) of states that the term adds, or (unit, rate, start); without
-            a start the term's ``remember`` gives it.
+        states: name to (unit, rate, start) of states that the term adds. A start may name v, v_1
+            and v_2 in laws of first order as well: measured speeds at the first sample.
         delayed: name to (formula, unit, delay), the formula's value some time ago; the delay
             in s, from none to as many steps as the term remembers. Before the first sample
             it was what it is there.
@@ -184,7 +184,7 @@ class Rule:
 
     rate: str | tuple[str, str] = ""
     leader: str = ""
-    states: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    states: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     delayed: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     remembered: int = 0
     others: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -213,7 +213,7 @@ class Rule:
 
     @property
     def memory(self) -> int:
-        """Number of states that it adds."""
+        """Number of states that the term adds to each agent."""
         return len(self.states) + len(self.delayed) * self.remembered
 
     @property
@@ -307,7 +307,7 @@ class LaneDynamics(Dynamics):
 
     @property
     def outputs(self) -> list[Expr]:
-        return [*self.rates.values(), self.leader, *self.leads.values(), *self.starts.values()]
+        return [*self.rates.values(), self.leader, *self.leads.values()]
 
     @property
     def names(self) -> Mapping[str, Expr]:
@@ -353,8 +353,9 @@ class LaneDynamics(Dynamics):
             made["dx_1"] = symbol("v_1")
         rates = {state: substitute(rate, made) for state, rate in self.rates.items()}
         starts: dict[str, Expr] = {}
+        at_start = {**made, "dx_1": symbol("v_1")}
         for state, start in self.starts.items():  # one may name those before it
-            starts[state] = substitute(substitute(start, made), starts)
+            starts[state] = substitute(substitute(start, at_start), starts)
         lead = substitute(self.leader, made)
         chained = {"x": "dx_1"} if "dx_1" in symbols([*rates.values(), lead]) else {}
         return replace(self, rates=rates, leader=lead, starts=starts, chained=chained)
@@ -542,11 +543,14 @@ def _in_lane(
         _remember(reader, part, entry, rates, starts)
     reader.parts(())
     given = {"W": leader, "measured": symbol("measured")}
-    for part, (unit, formula, *start) in rule.states.items():
+    moving = reader.names
+    at_start = {**{speed: symbol(speed) for speed in ("v", "v_1", "v_2", "dv")}, **moving}
+    for part, (unit, rate, start) in rule.states.items():
         own = f"{name}__{part}"
-        rates[own] = reader.formula(f"d{part}/dt of {name}", formula, f"{unit}/s")
-        for text in start:
-            starts[own] = reader.formula(f"{part} of {name} at the start", text, unit)
+        rates[own] = reader.formula(f"d{part}/dt of {name}", rate, f"{unit}/s")
+        reader.names = at_start
+        starts[own] = reader.formula(f"{part} of {name} at the start", start, unit)
+        reader.names = moving
     if isinstance(rule.rate, str) and rule.rate:
         unit = "m/s" if model.order == 1 else "m/s^2"
         rates[model.top] = reader.formula(name, rule.rate, unit)

@@ -106,7 +106,7 @@ class RightHandSide:
         assert self.parameters is not None
         runs = len(next(iter(self.parameters.values()))) if self.parameters else 1
         every = [self.system.initial(batch)] * runs
-        if any(getattr(term, "memory", 0) for term in self.system.terms):
+        if self.system.memory:
             rows = [{name: p[r] for name, p in self.parameters.items()} for r in range(runs)]
             every = [initial_with(self.system, own, batch) for own in rows]
         return arranged(torch.stack(every).detach())
@@ -212,7 +212,7 @@ class RightHandSide:
         if time.ndim:
             time = time.expand(-1, y.shape[-1]).flatten()
         x, rate = (one.flatten(1).T[..., None] for one in (y[0], speed))
-        return State(time, x, rate if self.top else None, self._every[key], self.system, rate)
+        return State(time, x, rate if self.top else None, self._every[key], rate=rate)
 
 
 def rates_along(system: System, scene: Scene, states: Tensor) -> Tensor:

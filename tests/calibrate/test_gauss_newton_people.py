@@ -21,7 +21,7 @@ from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.model.build import build_model
 from nnode.simulate import FusedSolver
-from nnode.simulate.rates import Rates
+from nnode.simulate.ode import Rates
 
 TRUTH = (0.5, 40.0, 12.0)
 

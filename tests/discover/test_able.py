@@ -24,16 +24,19 @@ from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import build_model
 from nnode.model.crowd import norm, velocity
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
-from nnode.model.effects.crowd_individual import GaitSway
-from nnode.model.effects.crowd_pairs import heading
-from nnode.model.effects.following import Inertia
-from nnode.model.effects.traffic import DriverHeterogeneity, SpeedZone, for_followers, gaps
+from nnode.model.effects.crowd import GaitSway, heading
+from nnode.model.effects.lane import DriverHeterogeneity, Inertia, SpeedZone, gaps
 from nnode.model.extend import extended
+from nnode.model.lane_dynamics import Rule
 from nnode.model.term import Interval, State, Term
 from tests.discover import walkers
 from tests.discover.platoons import LENGTH, V0, platoons
 
 ANY = Strength(0.0, 0.1, Interval(0.0, 5.0), "1")
+
+
+def followers(state: State, change: Tensor) -> Tensor:
+    return torch.where(state.scene.follower, change, 0.0)[..., None]
 
 
 class Haste(IndividualEffect):
@@ -46,7 +49,7 @@ class Haste(IndividualEffect):
     strengths: ClassVar = {"sigma": ANY}
 
     def forward(self, state: State) -> Tensor:
-        return for_followers(state, self.known(state.scene, state.x)[0])
+        return followers(state, self.known(state.scene, state.x)[0])
 
 
 class Stride(IndividualEffect):
@@ -93,17 +96,6 @@ class Faint(Limit):
         return 0.01 * super().forward(state)
 
 
-class Tired(Effect):
-    """What a person remembers."""
-
-    name = "tired"
-    domain = "crowd"
-    formula = "-c m"
-    source = "this test"
-    strengths: ClassVar = {"c": ANY}
-    memory = 1
-
-
 class Optimal(Term):
     """A law of the user's own, which is no law of the gap alone."""
 
@@ -119,7 +111,7 @@ class Optimal(Term):
         self.declare("d", 25.0, unit="m", bounds=Interval(5.0, 80.0))
 
     def forward(self, state: State) -> Tensor:
-        return for_followers(state, self.v0 * torch.tanh(gaps(state.x) / self.d))
+        return followers(state, self.v0 * torch.tanh(gaps(state.x) / self.d))
 
 
 def lane() -> System:
@@ -229,11 +221,15 @@ def test_an_effect_on_a_law_that_is_missing_says_so(platoon_engine: TrafficEngin
         platoon_engine.residuals(system, ParameterVector(system).row[None])
 
 
-class Moody(Haste):
-    """As Haste, with a memory."""
+class Moody(IndividualEffect):
+    """Every driver reacts late, and by a number of his own."""
 
     name = "moody"
-    memory = 1
+    domain = "traffic"
+    source = "this test"
+    rules: ClassVar = {1: Rule(rate="m", states={"m": ("m/s", "eta*(W - m)/unit", "W")},
+                               inputs={"eta": "1"}, constants={"unit": (1.0, "s")})}  # fmt: skip
+    strengths: ClassVar = {"sigma": ANY}
 
 
 class Fickle(Haste):
@@ -249,11 +245,10 @@ class Fickle(Haste):
 @pytest.mark.parametrize(
     ("effect", "words"),
     [
-        (Tired, "crowds cannot look for tired: it has a memory"),
         (Moody, "lanes cannot look for moody: it has a memory"),
         (Fickle, "lanes cannot look for fickle: it has 2 amounts for every driver"),
     ],
-    ids=["memory in a crowd", "memory and numbers", "two numbers"],
+    ids=["memory and numbers", "two numbers"],
 )
 def test_what_no_engine_can_look_for_is_refused_before_any_work(
     effect: type[Effect], words: str, monkeypatch: pytest.MonkeyPatch
@@ -272,12 +267,6 @@ def test_every_effect_of_the_catalogue_can_be_looked_for() -> None:
 
 
 def test_models_that_no_engine_can_simulate_are_refused() -> None:
-    with pytest.raises(ConfigError, match="model's term tired: it has a memory"):
-        check_model(crowd(Tired()))
-    with pytest.raises(ConfigError, match="model's term tired: it has a memory"):
-        CrowdEngine(walkers.crowd(sequences=1)).settle(
-            crowd(Tired()), ParameterVector(crowd(Tired())).row
-        )
     with pytest.raises(ConfigError, match="effect speed_zone twice"):
         check_model(Traffic([Optimal(), SpeedZone(), SpeedZone(a=200.0, b=300.0)]))
     with pytest.raises(ConfigError, match="no parameter that is calibrated"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from torch.func import functional_call
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.walk import Walk
 from nnode.model.effects.base import Effect
-from nnode.model.term import State
+from nnode.model.term import State, Term
 from nnode.simulate.numpy import runge_kutta
 
 #: Differences of positions (m) and velocities (m/s) for derivatives.
@@ -96,7 +98,8 @@ class Frames:
 
     def _bare(self, x: Tensor, v: Tensor, rate: Tensor) -> State:
         zero = torch.zeros((), dtype=x.dtype)
-        return State(zero, x, v, self.scene, self.walk.system, rate=rate, seen=self.seen)
+        terms = cast(list[Term], list(self.walk.system.terms))
+        return State(zero, x, v, self.scene, terms, rate=rate, seen=self.seen)
 
     def _own(self) -> dict[str, Tensor]:
         return {name: part[0] for name, part in self.walk.parameters(self.row[None]).items()}

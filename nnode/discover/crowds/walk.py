@@ -19,7 +19,7 @@ from nnode.model.formula import crowd_of, own_values, values_of
 from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System
 from nnode.model.term import State, Term
-from nnode.simulate.kernels.crowds.alone import WalkSource, compiled
+from nnode.simulate.kernels.alone import WalkSource, compiled
 from nnode.simulate.numpy import runge_kutta
 
 #: Numbers in the largest intermediate result.
@@ -37,15 +37,16 @@ class Beyond(nn.Module):
     def forward(self, state: State) -> Tensor:
         assert state.rate is not None
         first = total = state.rate
+        terms = cast(list[Term], list(self.system.terms))
         for term in self.added:
-            total = total + term(replace(state, system=self.system, rate=total))
+            total = total + term(replace(state, terms=terms, rate=total))
         return total - first
 
 
 @dataclass
 class Tables:
     """What the compiled code knows of the surroundings, see
-    :mod:`nnode.simulate.kernels.crowds.alone`."""
+    :mod:`nnode.simulate.kernels.alone`."""
 
     others: np.ndarray
     window: np.ndarray

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -155,7 +155,7 @@ class TrafficEngine:
         """``(S, n)`` derivatives of the residuals with respect to a probe's strengths, by linear
         response; the change by the effect as a whole where it has no strength."""
         response = self.linear(system, row)
-        if effect.memory:
+        if effect.remembers():
             return self._whole(response, effect, probe)
         base = response.rates(response.system)
         sources = []
@@ -233,7 +233,7 @@ class TrafficEngine:
         """A copy whose law is fitted to the smoothed rates: simulations started from there do
         not end in a far minimum. The regression itself is biased by noise, as a start it may."""
         found, batch = copy.deepcopy(system), self.smoothed
-        if any(getattr(term, "memory", 0) for term in found.terms):
+        if found.memory:
             return found  # speeds alone do not tell of states that nobody measures
         vector = ParameterVector(found)
         low, high = vector.bounds
@@ -321,7 +321,7 @@ def fastest(system: System, rows: Tensor) -> float:
     factors = {
         f"terms.{i}.{name}": factor
         for i, term in enumerate(system.terms)
-        for name, factor in _fast(term).items()
+        for name, factor in cast(Term, term).fast.items()
     }
     found = [
         factors[name] * float(rows[:, j].min())
@@ -329,11 +329,6 @@ def fastest(system: System, rows: Tensor) -> float:
         if name in factors
     ]
     return min(found, default=math.inf)
-
-
-def _fast(term: nn.Module) -> dict[str, float]:
-    assert isinstance(term, Term)
-    return term.fast
 
 
 def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache, partial
 from importlib.resources import files
 from operator import itemgetter
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import yaml
@@ -94,14 +94,6 @@ PEDESTRIAN_LAWS = _described(_CROWD_KEYS, {"vx", "y"})
 NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
 
 
-def without_walls(description: Mapping[str, Any]) -> dict[str, Any]:
-    """A law of people whose walls nobody feels."""
-    unit = "0" if "x" in description["rate"] else "0 m/s²"
-    zero = dict.fromkeys(description.get("walls", {}), unit)
-    kept = {key: value for key, value in description.items() if key != "walls"}
-    return {**kept, "constants": {**description.get("constants", {}), **zero}}
-
-
 class Law(Term):
     """A term that effects change: a law of vehicles or people, described by an entry.
 
@@ -140,6 +132,9 @@ class Law(Term):
     order = 2
     step: str | None = None
     formulas: Rule
+    #: Methods that replace formulas where a subclass defines them: what they replace, their inputs.
+    methods: ClassVar[dict[str, tuple[str, str]]] = {"speed": ("rate", "gap")}
+    _calls: dict[str, Callable[..., Expr]]
 
     def __init__(
         self,
@@ -166,7 +161,6 @@ class Law(Term):
         self.formulas = _rule(found)
         self.domain = "crowd" if self.formulas.of_crowd else "traffic"
         self.order, self.step = self.formulas.order, found.get("step")
-        self.memory = self.formulas.memory  # type: ignore[misc]
         if self.step is not None and self.step not in METHODS:
             raise ConfigError(
                 f"model.law.step={self.step} is unknown, expected {', '.join(METHODS)}"
@@ -266,23 +260,37 @@ class Law(Term):
 
     def _coded(self) -> None:
         """Say by ``rule`` what the class says: formulas, or calls of its own code."""
-        self.rule = self.formulas
-        self._methods: dict[str, Callable[..., Expr]] = {}
-        if type(self).speed is not Law.speed and self.domain == "traffic" and self.order == 1:
-            self._methods["speed"] = partial(call, "speed")
-            self.rule = replace(self.formulas, rate="speed(gap)")
-        if type(self).forward not in (Law.forward, InteractionForce.forward):
-            self.rule = None
+        rule, self._calls = self.formulas, {}
+        for method, (entry, inputs) in self.methods.items():
+            own = getattr(type(self), method) is not getattr(InteractionForce, method)
+            replaced = getattr(rule, entry)
+            if not own or not replaced or (entry == "rate" and self.order == 2):
+                continue
+            if isinstance(replaced, str):
+                self._calls[method] = partial(call, method)
+                rule = replace(rule, rate=f"{method}({inputs})")
+                continue
+            names = [f"{method}_{axis}" for axis in "xy"]
+            self._calls |= {name: partial(_output, method, k) for k, name in enumerate(names)}
+            sums: Any = {
+                part: ("N", f"{f}({inputs})") for part, f in zip(replaced, names, strict=True)
+            }
+            rule = replace(rule, **{entry: sums})
+        coded = type(self).forward not in (Law.forward, InteractionForce.forward)
+        self.rule = None if coded else rule
 
     @property
     def shape(self) -> tuple[Any, ...]:
         sizes = [getattr(self, module).sizes for module in self.networks]
         return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
 
+    def rule_for(self, order: int) -> Rule | None:
+        return self.rule
+
     @property
     def of_gap(self) -> bool:
         """Whether it is a speed that depends on the gap alone."""
-        if self.domain != "traffic" or self.order != 1 or self.memory:
+        if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
         return _names_gap_alone(self.dynamics(called=True))
 
@@ -310,7 +318,7 @@ class Law(Term):
         """
         rule = rule or self.rule or self.formulas
         parameters, owned, units = parameters_of(self, owner, place)
-        functions = dict(self._methods)
+        functions = dict(self._calls)
         for module, names in self.networks.items():
             if called:
                 functions |= {name: partial(_output, module, k) for k, name in enumerate(names)}
@@ -422,13 +430,6 @@ def _names_gap_alone(lane: LaneDynamics) -> bool:
     return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
 
-#: Methods of a force that formulas can call, with the functions that are their outputs.
-_CODED = {
-    "pair_force": ["pair_force_x", "pair_force_y"],
-    "wall_force": ["wall_force_x", "wall_force_y"],
-}
-
-
 def velocity(state: State) -> Tensor:
     """``(B, N, 2)`` m/s.
 
@@ -495,6 +496,10 @@ class InteractionForce(Law):
     """
 
     mass: float
+    methods: ClassVar[dict[str, tuple[str, str]]] = {
+        "pair_force": (OTHERS, "dx, dy, dvx, dvy"),
+        "wall_force": (POINTS, "dx, dy, vx, vy, normal_x, normal_y"),
+    }
 
     def __init__(
         self,
@@ -511,23 +516,9 @@ class InteractionForce(Law):
 
     def _coded(self) -> None:
         if not self.walls:
-            bare = dict.fromkeys(self.formulas.points, ("N", "0"))
-            self.formulas = replace(self.formulas, points=bare)
+            nothing = {**self.formulas.where, **dict.fromkeys(self.formulas.points, "0")}
+            self.formulas = replace(self.formulas, points={}, where=nothing)
         super()._coded()
-        if self.rule is None:
-            return
-        for over, method, inputs in (
-            (OTHERS, "pair_force", "dx, dy, dvx, dvy"),
-            (POINTS, "wall_force", "dx, dy, vx, vy, normal_x, normal_y"),
-        ):
-            own = getattr(type(self), method) is not getattr(InteractionForce, method)
-            if own and (over == OTHERS or self.walls):
-                names = zip(getattr(self.rule, over), _CODED[method], strict=True)
-                sums: Any = {name: ("N", f"{f}({inputs})") for name, f in names}
-                self.rule = replace(self.rule, **{over: sums})
-                self._methods |= {
-                    name: partial(_output, method, k) for k, name in enumerate(_CODED[method])
-                }
 
     def code(self) -> dict[str, Code]:
         def pair(dx: Tensor, dy: Tensor, dvx: Tensor, dvy: Tensor) -> Tensor:

@@ -38,12 +38,15 @@ from typing import Any
 
 import numpy as np
 from numba import njit, types
-from numba.extending import overload
+from numba.core import cgutils
+from numba.extending import intrinsic, overload
 
 #: Flags of every compiled function: fused multiply-add, and zeros without sign.
 FLAGS = {"contract", "nsz"}
 #: Options of every function that is to vanish into its caller's loop.
 INLINE: Any = {"forceinline": True, "fastmath": FLAGS, "error_model": "numpy"}
+#: Options of functions that hold a loop.
+LOOP: Any = {"fastmath": FLAGS, "error_model": "numpy"}
 
 # Chebyshev interpolants of the named functions, computed with 50 digits; lowest power first.
 # e^r for |r| <= log(2)/2, errors 2e-9 and 3e-18
@@ -366,3 +369,22 @@ def softplus(x: Any) -> Any:
 @njit(**INLINE)
 def softplus_slope(x: Any) -> Any:
     return torch_softplus(x)[1]
+
+
+_memmove: Any = cgutils.raw_memmove
+
+
+@intrinsic
+def copy(typing_context: Any, target: Any, source: Any, number: Any) -> Any:
+    """The first numbers of a row to another one, which may be the same array further on: a loop
+    that cannot know how far would take them one by one."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        rows = [
+            context.make_array(kind)(context, builder, value).data
+            for kind, value in zip(signature.args[:2], args[:2], strict=True)
+        ]
+        _memmove(builder, *rows, args[2], context.get_abi_sizeof(rows[0].type.pointee))
+        return context.get_dummy_value()
+
+    return types.none(target, source, types.intp), emit

@@ -20,11 +20,11 @@ from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.model import Crowd, make_law
 from nnode.model.effects import CATALOGUE, Effect
-from nnode.model.effects.crowd_motion import Drift
-from nnode.model.effects.crowd_pairs import Alignment, PairRepulsion
+from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
-from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law, without_walls
+from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import State
+from nnode.study.walking.laws import without_walls
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)

@@ -16,7 +16,7 @@ from nnode.discover.crowds.indirect_inference import unbiased
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.errors import SimulationError
 from nnode.model import Crowd, make_law
-from nnode.model.effects.crowd_motion import PreferredSpeed
+from nnode.model.effects.crowd import PreferredSpeed
 from tests.discover import walkers
 
 C, SPEED = 0.8, 1.3

@@ -20,7 +20,7 @@ from nnode.model import System
 from nnode.model.arrays import computed, numpy_function
 from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.effects.traffic import DriverHeterogeneity
+from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.parse import parse
 from nnode.simulate import rhs
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed

@@ -19,8 +19,7 @@ from nnode.discover.residuals.variables import Curve
 from nnode.model import System, build_model
 from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE
-from nnode.model.effects.following import Memory, RelativeSpeed
-from nnode.model.effects.traffic import DriverHeterogeneity, SpeedZone
+from nnode.model.effects.lane import DriverHeterogeneity, Memory, RelativeSpeed, SpeedZone
 from nnode.model.extend import extended
 from nnode.simulate import TorchdiffeqSolver
 from tests.discover.platoons import platoons

@@ -16,7 +16,7 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.random_effects import Individuals, individuals, numbers
-from nnode.model.effects.traffic import DriverHeterogeneity
+from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.extend import extended
 from tests.discover.lanes.test_engine import model
 from tests.discover.platoons import DT, platoons, relative_speed, streams
