@@ -420,7 +420,7 @@ def tangents(
     start = {"x": x[0, ..., 0], "v": batch.v[0, ..., 0]}
     if every.starts:
         scene = replace(system.scene(batch), step=batch.dt / substeps)
-        values = dict(zip(lane.owned, q.T[..., None], strict=True))
+        values = dict(zip(lane.owned, q.T, strict=True))
         start |= starts_of(terms, every, x[0], batch.v[0], scene, values)
     zero = torch.zeros_like(start["x"])
     y0 = torch.stack([start.get(state, zero) for state in every.rates])
