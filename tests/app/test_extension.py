@@ -165,7 +165,7 @@ def test_it_is_found_and_shown(written: Path, tmp_path: Path) -> None:
     assert coefficient.low < W < coefficient.high
     page = (tmp_path / "report.html").read_text()
     assert "hills" in page
-    assert "sin(x / 60 m)" in re.sub(r"<[^>]*>|&nbsp;", "", page)
+    assert "w*sin(x/long); long = 60 m" in re.sub(r"<[^>]*>|&nbsp;", "", page)
 
 
 @pytest.mark.usefixtures("written")
