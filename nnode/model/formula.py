@@ -210,14 +210,14 @@ def starts_of(
     """
     if not lane.starts:
         return {}
-    zero = x.new_tensor(0.0)
     y = torch.cat([x, v, x.new_zeros(*x.shape[:2], len(lane.starts))], -1)
+    zero = y.new_tensor(0.0)
     found = rates_of(terms, _starts(lane), y, zero, scene, False, parameters=parameters)
     return {name: found[..., i] for i, name in enumerate(lane.starts, start=2)}
 
 
 @cache
 def _starts(lane: LaneDynamics) -> LaneDynamics:
-    """Starts in the place of rates; positions and speeds are measured."""
+    """Starts in the place of rates, also those of leaders; positions and speeds are measured."""
     rates = {"x": const(0), "v": const(0), **lane.starts}
     return replace(lane, rates=rates, leader=const(0), leads={}, chained={})

@@ -57,7 +57,7 @@ class Candidate:
     def strength_excludes_neutral(self, cluster: np.ndarray, *, minimal: bool = False) -> bool:
         """Whether the interval of any of its strengths excludes the neutral value; or, if asked,
         all amounts that are taken for none."""
-        intervals, effect = self.fit.intervals(cluster), self.score.effect
+        intervals, effect = self.fit.jackknife_intervals(cluster), self.score.effect
         place = place_of(self.fit.system, self.name)
         none = minimal_of(effect, len(effect.strengths)) * minimal
         known = [

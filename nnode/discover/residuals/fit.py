@@ -67,29 +67,35 @@ class Fit:
         scores = sums(columns * self.residual[:, None], cluster)
         return ClusterInfluence(grams(columns, cluster), scores)
 
-    def errors(self, cluster: np.ndarray) -> np.ndarray:
-        """``(K,)`` standard errors that allow for any dependence within a cluster.
+    def errors(self, cluster: np.ndarray, power: float = 1.0) -> np.ndarray:
+        """``(K,)`` standard errors that allow for any dependence within a cluster, by the
+        jackknife.
 
         NaN for parameters at a bound, for those of which one cluster alone tells, and where there
         are fewer than three clusters.
-        """
-        return self._uncertain(cluster)[0]
 
-    def intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
-        """``(K, 2)`` confidence intervals: :meth:`errors` with Student's quantiles."""
-        error, degrees = self._uncertain(cluster)
-        half = stats.t.ppf(0.5 + level / 2, degrees) * error
+        Args:
+            power: see :meth:`~nnode.calibrate.intervals.ClusterInfluence.covariance`.
+        """
+        found = np.full(len(self.row), np.nan)
+        if len(np.unique(cluster)) >= 3 and self.free.any():
+            variance = np.diag(self.influence(cluster).covariance(power))
+            found[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
+        return found if self.simulated is None else np.hypot(found, self.simulated)
+
+    def jackknife_intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
+        """``(K, 2)`` cautious intervals that decide whether an effect is kept: :meth:`errors`
+        with Student's quantiles by the number of clusters."""
+        number = len(np.unique(cluster))
+        half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(cluster)
         return np.stack([self.row - half, self.row + half], 1)
 
-    def _uncertain(self, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Standard errors and their degrees of freedom ``(K,)``."""
-        error, degrees = np.full((2, len(self.row)), np.nan)
-        if len(np.unique(cluster)) >= 3 and self.free.any():
-            found = self.influence(cluster)
-            variance = np.diag(found.covariance())
-            error[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
-            degrees[self.free] = found.degrees()
-        return error if self.simulated is None else np.hypot(error, self.simulated), degrees
+    def intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
+        """``(K, 2)`` confidence intervals, by CR2 with Satterthwaite's degrees of freedom; NaN
+        as of :meth:`errors`."""
+        half = self.errors(cluster, 0.5)
+        half[self.free] *= stats.t.ppf(0.5 + level / 2, self.influence(cluster).degrees())
+        return np.stack([self.row - half, self.row + half], 1)
 
 
 def sums(values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:

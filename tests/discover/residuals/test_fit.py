@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from nnode.discover.residuals.fit import Fit
 from nnode.model import System
@@ -25,6 +26,16 @@ def test_intervals_are_those_of_clusters() -> None:
     np.testing.assert_allclose((high + low)[free] / 2, fit.row[free])
     assert np.isnan([low[1], high[1]]).all()
     assert np.isnan(fit.intervals(np.repeat([0, 1], 120))).all()  # too few clusters
+    without = np.stack(
+        [
+            np.linalg.lstsq(jacobian[cluster != k], -residual[cluster != k], rcond=None)[0]
+            for k in range(6)
+        ]
+    )
+    spread = np.sqrt(5 / 6 * (without**2).sum(0))
+    np.testing.assert_allclose(fit.errors(cluster)[free], spread, rtol=1e-9)
+    low, high = fit.jackknife_intervals(cluster)[free].T
+    np.testing.assert_allclose((high - low) / 2, stats.t.ppf(0.975, 5) * spread, rtol=1e-9)
     simulated = replace(fit, simulated=np.array([0.3, 0.0, 0.4]))
     wanted = np.hypot(fit.errors(cluster), simulated.simulated)
     np.testing.assert_allclose(simulated.errors(cluster), wanted)
