@@ -110,12 +110,14 @@ class LaneRates:
         leader: Array,
         code: Mapping[str, Code] | None = None,
     ) -> None:
-        self.lane, self.values, self.inputs, self._code = lane, values, inputs, code
+        self.lane, self.inputs, self._code = lane, inputs, code
         self.follows, self.leader = follower[:-1], leader
         self._formulas, self._lead = _formulas(lane)
         self.second = self.follows & follower[1:]
-        self._second = 1.0 * self.second
-        self._all_follow = not isinstance(follower, Tensor) and bool(self.follows.all())
+        rows = {name: every[:-1] for name, every in inputs.items()}
+        self._fixed = {**values, **rows, "second": 1.0 * self.second}
+        self._library: Any = torch if isinstance(follower, Tensor) else np
+        self._all_follow = self._library is np and bool(self.follows.all())
 
     def symbols(self, t: Array, y: Array, measured: Array) -> Values:
         """Values ``(N - 1, ..., B)`` of what formulas of followers name, but for ``dx_1``.
@@ -124,10 +126,10 @@ class LaneRates:
             t: s. y: ``(M, N, ..., B)`` states.
             measured: speeds of leaders, m/s.
         """
-        library: Any = torch if isinstance(y, Tensor) else np
-        states = dict(zip(self.lane.rates, y, strict=True))
-        found = {name: every[:-1] for name, every in {**self.inputs, **states}.items()}
-        found = {**self.values, **found, "t": t, "measured": measured, "second": self._second}
+        library, states = self._library, dict(zip(self.lane.rates, y, strict=True))
+        found = {**self._fixed, "t": t, "measured": measured}
+        for name, every in states.items():
+            found[name] = every[:-1]
         for name, ahead in self.lane.ahead:
             value, safe = states[name][1:], SAFE if name == "x" else 0.0
             if ahead == 2:
@@ -153,7 +155,7 @@ class LaneRates:
             y: their values. symbols: see :meth:`symbols`.
             lead: speeds of leaders; None: the formula tells them.
         """
-        library: Any = torch if isinstance(y, Tensor) else np
+        library = self._library
         if lead is None:
             (lead,) = self.of_leaders(self._lead, y, symbols)
         if library is np:
@@ -175,7 +177,10 @@ class LaneRates:
             rates = [library.stack(row) for row in zip(*rows[::-1], strict=True)]
         if library is np:
             for own, rate in zip(found[:, :-1], rates, strict=True):
-                np.copyto(own, rate, where=True if self._all_follow else self.follows)
+                if self._all_follow:
+                    own[...] = rate
+                else:
+                    np.copyto(own, rate, where=self.follows)
             return found
         whole = []
         for rate, other in zip(rates, [lead, *[0.0 * lead] * (len(y) - 1)], strict=True):
