@@ -6,13 +6,13 @@ import copy
 
 from nnode.errors import ConfigError
 from nnode.model.build import add_effects
-from nnode.model.crowd_dynamics import SMALLEST
 from nnode.model.effects import Effect, IndividualEffect
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of
 from nnode.model.formula import crowd_of
 from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
+from nnode.model.terms import SMALLEST
 
 
 def check_effect(effect: type[Effect]) -> None:

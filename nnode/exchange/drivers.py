@@ -16,10 +16,10 @@ from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.lane import VehicleClass
 from nnode.model.expression import symbol, symbols, topological
 from nnode.model.formula import own_values, values_of
-from nnode.model.lane_dynamics import LaneDynamics
 from nnode.model.lane_rates import Rates
 from nnode.model.steps import stepped
 from nnode.model.term import Term
+from nnode.model.terms import LaneDynamics
 
 #: Gaps, m, that stand for an empty road: a law that drives there says the same at both.
 EMPTY = (1e6, 1e9)

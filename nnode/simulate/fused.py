@@ -37,7 +37,7 @@ class FusedSolver:
     differs by O(dt). ``rk4`` is the classic method, and torchdiffeq's the 3/8 rule, which differs
     from it by O(dt^4).
 
-    Models whose law and effects are formulas (see :mod:`nnode.model.lane_dynamics`) run compiled.
+    Models whose law and effects are formulas (see :mod:`nnode.model.terms`) run compiled.
     Any other model, with a term that is code of its own, goes through torchdiffeq: the same
     gradient, at the speed and with the memory of PyTorch. The solver warns of it once.
 

@@ -106,7 +106,7 @@ class RightHandSide:
         assert self.parameters is not None
         runs = len(next(iter(self.parameters.values()))) if self.parameters else 1
         every = [self.system.initial(batch)] * runs
-        if any(getattr(term, "memory", 0) for term in self.system.terms):
+        if self.system.memory:
             rows = [{name: p[r] for name, p in self.parameters.items()} for r in range(runs)]
             every = [initial_with(self.system, own, batch) for own in rows]
         return arranged(torch.stack(every).detach())

@@ -53,16 +53,14 @@ from nnode.model.terms import Rule
 @CATALOGUE.add
 class Hills(Effect):
     name, domain, source, rank = "hills", "traffic", "none", 20
-    formula = "+ w sin(x / 60 m)"
-    rule = Rule(rate="W + w*sin(x/long)", constants={"long": (60.0, "m")})
+    rules = {1: Rule(rate="W + w*sin(x/long)", constants={"long": (60.0, "m")})}
     strengths = {"w": Strength(0.0, 0.2, Interval(-6.0, 6.0), "m/s", min_effect_size=1.0)}
 
 
 @CATALOGUE.add
 class Current(Effect):
     name, domain, source, rank = "current", "crowd", "none", 20
-    formula = "+ c (ẏ, -ẋ)"
-    rule = Rule(rate=("c*vy", "-c*vx"))
+    rules = {2: Rule(rate=("c*vy", "-c*vx"))}
     strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "1/s", min_effect_size=0.2)}
 """
 NAMES = ("hills", "current")

@@ -27,8 +27,8 @@ from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Sett
 from nnode.model.effects.crowd import GaitSway, heading
 from nnode.model.effects.lane import DriverHeterogeneity, Inertia, SpeedZone, gaps
 from nnode.model.extend import extended
-from nnode.model.lane_dynamics import Rule
 from nnode.model.term import Interval, State, Term
+from nnode.model.terms import Rule
 from tests.discover import walkers
 from tests.discover.platoons import LENGTH, V0, platoons
 

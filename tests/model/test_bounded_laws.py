@@ -100,7 +100,7 @@ def test_remembered_steps_have_a_limit(number: int) -> None:
 def test_as_many_as_that_are_built() -> None:
     with soon():
         law = law_from("mine", {**CAR_FOLLOWING_LAWS["newell"], "remembered": REMEMBERED})
-    assert law.memory == REMEMBERED + 1
+    assert law.formulas.memory == REMEMBERED + 1
 
 
 @pytest.mark.parametrize("number", [NEURONS + 1, 10**9])

@@ -11,7 +11,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import Crowd, build_model, make_law
 from nnode.model.effects import CATALOGUE
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulate import FusedSolver
 from tests.model.test_forces import people
 
 LAW: dict[str, Any] = {
@@ -54,17 +54,6 @@ def test_it_computes_what_it_says() -> None:
         model.terms[0].A.fill_(-1.0)  # type: ignore[union-attr, operator]
     model.project_()
     assert float(model.physical()["mine.A"][0]) == 0.0
-
-
-def test_it_is_compiled() -> None:
-    batch, model, solver = collate([people(5, 1), people(3, 2)]), own(), FusedSolver(0.02)
-    exact = TorchdiffeqSolver("euler", "discrete", 0.02)(model, batch)
-    wanted = torch.autograd.grad(exact.x[batch.valid].square().sum(), list(model.parameters()))
-    found = solver(model, batch)
-    assert not solver.uncompiled
-    torch.testing.assert_close(found.x[batch.valid], exact.x[batch.valid], rtol=1e-12, atol=1e-12)
-    share = torch.autograd.grad(found.x[batch.valid].square().sum(), list(model.parameters()))
-    torch.testing.assert_close(share, wanted, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -217,9 +217,15 @@ def compiled(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The same by the generated code."""
     scene, x, v = moving(batch)
-    solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
-    found = _states(solver(system, scene))
-    assert not solver.uncompiled
+    if isinstance(system, Traffic):  # the solver refuses gradients by a leader's measured path
+        lane = lanes.supports(system, batch)
+        assert lane is not None
+        y = lanes.simulate(system, lane, scene, SUBSTEPS, method=method)[:, 0]
+        found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
+    else:
+        solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
+        found = _states(solver(system, scene))
+        assert not solver.uncompiled
     return found, _slopes(system, batch, found, x, v)
 
 

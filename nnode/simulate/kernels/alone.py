@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from types import ModuleType
 
-from nnode.model.crowd_dynamics import OTHERS, POINTS, SEEN, WALLS, CrowdDynamics
 from nnode.model.expression import Expr, symbols
 from nnode.model.names import check_symbols
+from nnode.model.terms import OTHERS, POINTS, SEEN, WALLS, CrowdDynamics
 from nnode.model.text import plain
 from nnode.simulate.kernels import functions
 from nnode.simulate.kernels.cache import digest, keep

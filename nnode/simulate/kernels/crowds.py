@@ -23,7 +23,6 @@ from torch import Tensor
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.model.arrays import computed
-from nnode.model.crowd_dynamics import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
 from nnode.model.crowd_formula import people_of, settings_of, walls_of
 from nnode.model.differentiate import derivatives
 from nnode.model.expression import (
@@ -41,6 +40,7 @@ from nnode.model.names import check_symbols
 from nnode.model.operations import FUNCTIONS
 from nnode.model.system import Crowd, System
 from nnode.model.term import Term
+from nnode.model.terms import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
 from nnode.model.text import plain
 from nnode.simulate.kernels.loops import Loop
 from nnode.simulate.kernels.runs import (

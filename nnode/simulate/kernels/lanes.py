@@ -28,13 +28,13 @@ from torch import Tensor
 from nnode.data.sequence import Batch
 from nnode.model.expression import Expr, apply, const, symbol, symbols
 from nnode.model.formula import inputs_of, starts_of
-from nnode.model.lane_dynamics import LaneDynamics
 from nnode.model.lane_rates import SAFE
 from nnode.model.names import check_symbols
 from nnode.model.steps import STAGES, stepped
 from nnode.model.system import System, Traffic, initial_with
 from nnode.model.tangent import with_tangents
 from nnode.model.term import Term
+from nnode.model.terms import LaneDynamics
 from nnode.model.text import plain
 from nnode.simulate.kernels.loops import Loop
 from nnode.simulate.kernels.runs import (
@@ -420,7 +420,7 @@ def tangents(
     start = {"x": x[0, ..., 0], "v": batch.v[0, ..., 0]}
     if every.starts:
         scene = replace(system.scene(batch), step=batch.dt / substeps)
-        values = dict(zip(lane.owned, q.T[..., None], strict=True))
+        values = dict(zip(lane.owned, q.T, strict=True))
         start |= starts_of(terms, every, x[0], batch.v[0], scene, values)
     zero = torch.zeros_like(start["x"])
     y0 = torch.stack([start.get(state, zero) for state in every.rates])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -45,10 +46,14 @@ def test_a_mapping_takes_any_name() -> None:
 
 
 def test_every_choice_composes() -> None:
-    # other commands have no group that this one does not have
-    for group in composed("train").hydra.runtime.choices:
-        for file in sorted((CONF / group).glob("*.yaml")):
-            composed("train", f"{group}={file.stem}")
+    # other commands have no group that this one does not have; one choice of every group at a time,
+    # but experiments choose themselves
+    groups = composed("train").hydra.runtime.choices
+    files = {group: sorted((CONF / group).glob("*.yaml")) for group in groups}
+    for experiment in files.pop("experiment"):
+        composed("train", f"experiment={experiment.stem}")
+    for chosen in zip_longest(*([f"{g}={f.stem}" for f in own] for g, own in files.items())):
+        composed("train", *filter(None, chosen))
 
 
 #: What is typed, what the answer has to contain, and the exit status.

@@ -36,32 +36,9 @@ MODELS = {
         make_law("relaxation"),
         make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1),
     ],
-    "sf_opposing": lambda: [
-        make_law(
-            "social_force",
-            A=2.0,
-            k=30.0,
-            kappa=9.0,
-            B=0.1,
-            r=0.3,
-            mass=2.0,
-            opposing_wall_friction=True,
-        ),
-        make_law("relaxation", tau=0.7),
-    ],
-    "sf_open": lambda: [
-        make_law("relaxation"),
-        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1, walls=False),
-    ],
     "nn": lambda: [make_law("relaxation"), network()],
-    "nn_open": lambda: [network(3, mass=2.0, walls=False), make_law("relaxation")],
     "nn_self": lambda: [make_law("relaxation"), network(self_interaction=True)],
 }
-#: Every model but those of which another one tells as much; each is compiled for seconds.
-COMPILED = [
-    pytest.param(name, marks=() if name in ("sf", "nn", "nn_self") else pytest.mark.thorough)
-    for name in MODELS
-]
 
 
 @pytest.fixture(autouse=True)
@@ -111,13 +88,6 @@ def check(model: System, batch: Batch, solver: Solver, limit: float = 1e-10) -> 
     torch.testing.assert_close(found.x[mask], exact.x[mask], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(found.v[mask], exact.v[mask], rtol=1e-12, atol=1e-12)
     assert difference(own, wanted) < limit
-
-
-@pytest.mark.parametrize("name", COMPILED)
-def test_states_and_gradient(name: str, people: list[Sequence]) -> None:
-    batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
-    for threads in (1, 2):
-        check(model, batch, FusedSolver(DT, threads))
 
 
 @pytest.mark.thorough  # each precision is compiled for

@@ -150,16 +150,6 @@ def test_refusals(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
         FusedSolver(DT)(Traffic([make_law("lin")]), collate([crowd(2)]))
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("hidden", [1, 2, 10])
-def test_other_networks(hidden: int, ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([network(hidden)])
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
-    found, own = gradient(model, FusedSolver(DT), batch)
-    torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-9)
-    assert difference(own, wanted) < 1e-10
-
-
 def test_code_of_one_s_own_is_not_taken_for_the_formula(platoon) -> None:  # type: ignore[no-untyped-def]
     class Slower(Law):
         def speed(self, gap: torch.Tensor) -> torch.Tensor:

@@ -1,8 +1,6 @@
-"""Compiled laws of people, smallest values over others included, against PyTorch's."""
+"""Smallest and largest values over others, against plain loops."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,8 @@ from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulate import FusedSolver
+from tests.simulate.test_engines import OWN_FORCES
 
 DT = 0.02
 #: Two sides of the room, and a wall in it; x1, y1, x2, y2 in m.
@@ -35,69 +34,10 @@ def batch() -> Batch:
     return collate([people(6, 1), people(9, 2, 4), people(1, 3), people(2, 4)])
 
 
-def both(model: System, batch: Batch) -> None:
-    """States, and gradients by all parameters and the start, agree to rounding."""
-    seen: list[tuple[torch.Tensor, tuple[torch.Tensor, ...]]] = []
-    fused = FusedSolver(DT)
-    for solver in (TorchdiffeqSolver("euler", "discrete", DT), fused):
-        x = batch.x.clone().requires_grad_()
-        found = solver(model, Batch(**{**vars(batch), "x": x})).x[batch.valid]
-        weight = torch.linspace(0.5, 2.0, found.numel(), dtype=found.dtype).reshape(found.shape)
-        cost = (weight * (found - 1.0) ** 2).sum()
-        seen.append((found.detach(), torch.autograd.grad(cost, [*model.parameters(), x])))
-    assert not fused.uncompiled
-    torch.testing.assert_close(seen[1][0], seen[0][0], rtol=1e-12, atol=1e-12)
-    for share, wanted in zip(seen[1][1], seen[0][1], strict=True):
-        assert float(wanted.abs().max()) > 1e-4
-        torch.testing.assert_close(share, wanted, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "cfsm",
-        pytest.param("ttc", marks=pytest.mark.thorough),
-        pytest.param("gcfm", marks=pytest.mark.thorough),
-        pytest.param("esf", marks=pytest.mark.thorough),
-    ],
-)
-def test_a_law_of_the_field(name: str) -> None:
-    options = model_options(
-        {"term": "formula", "name": name, "law": PEDESTRIAN_LAWS[name]}, "measured"
-    )
-    model = build_model({**options, "desired": "direction"})
-    if name == "ttc":
-        with torch.no_grad():
-            model.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
-    both(model, batch())
-
-
-#: of second order, with two smallest values and a largest that names the former's inputs
-MANY: dict[str, Any] = {
-    "parameters": {"A": "0.6 1/s", "B": "0.5 m", "C": "0.3 1/s²", "tau": "0.7 s"},
-    "where": {
-        "crowded": "1 + number",
-        "near": "d*crowded",
-        "push": "A*max(2*B - closest, 0)/tau",
-    },
-    "others": {"number": "exp(-d/B)"},
-    "smallest": {"closest": "near", "slow": "sqrt(dvx**2 + dvy**2 + small_v**2)"},
-    "largest": {"right": "choose(2.5*B - d, dx, -nobody)"},
-    "rate": {
-        "vx": "(speed*way_x - vx)/tau + push + C*max(right, -B)",
-        "vy": "(speed*way_y - vy)/tau + 0.1*A*min(slow, speed)",
-    },
-}
-
-
 def many() -> System:
+    """Of second order, with two smallest values and a largest that names the former's inputs."""
     options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
-    return build_model({**options, "law": MANY})
-
-
-@pytest.mark.thorough
-def test_several_smallest_values_that_depend_on_sums() -> None:
-    both(many(), batch())
+    return build_model({**options, "law": OWN_FORCES["smallest"]})
 
 
 def test_a_smallest_value_by_loops() -> None:

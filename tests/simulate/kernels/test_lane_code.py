@@ -18,13 +18,12 @@ import torch
 from nnode.errors import ConfigError
 from nnode.model import Crowd, Traffic, make_law
 from nnode.model.effects.lane import RelativeSpeed
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulate import FusedSolver
 from nnode.simulate.kernels import functions, lanes, source
 from nnode.simulate.kernels.cache import digest
 from nnode.simulate.kernels.lanes import LaneSource
 from nnode.simulate.kernels.runs import COMPILED_IN
-from tests.simulate.fused.compare import difference, gradient, single
-from tests.simulate.kernels import saturation
+from tests.simulate.fused.compare import gradient, single
 
 #: Divisions of several numbers at once, by processor.
 PACKED = {
@@ -109,15 +108,6 @@ def run(x, out):
     run = numba.njit(error_model="numpy", fastmath=functions.FLAGS)(names["run"])
     run(np.ones(4), np.ones(4))
     assert is_vector_code(run.inspect_asm(run.signatures[0])) == (body == "exp(-x[i])")
-
-
-def test_a_law_from_elsewhere(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([saturation.saturation()])
-    assert lanes.supports(model, batch)
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    found, own = gradient(model, FusedSolver(0.02), batch)
-    torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-12)
-    assert difference(own, wanted) < 1e-10
 
 
 def test_an_edit_of_what_is_compiled_in_changes_the_name(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]

@@ -71,16 +71,6 @@ def test_the_intelligent_driver_is_what_its_formula_says(method: str, ragged: An
         np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("leader", ["measured", "constant"])
-def test_its_gradient_is_that_of_the_discrete_scheme(leader: str, ragged: Any) -> None:
-    batch, system = single(ragged), build_model({**IDM, "leader": leader})
-    exact, wanted = gradient(system, TorchdiffeqSolver("ballistic", "discrete", DT), batch)
-    found, own = gradient(system, FusedSolver(DT, method="ballistic"), batch)
-    torch.testing.assert_close(found.x[batch.valid], exact.x[batch.valid], rtol=1e-12, atol=1e-11)
-    assert difference(own, wanted) < 1e-10
-    assert wanted.abs().max() > 0
-
-
 def test_a_platoon_keeps_the_gap_of_equilibrium() -> None:
     """At speed v the gap is (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     system = build_model(IDM)

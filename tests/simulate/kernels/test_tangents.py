@@ -13,8 +13,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, build_model
 from nnode.model.arrays import computed
 from nnode.model.effects.lane import ReactionDelay
-from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.model.steps import METHODS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.tangent import with_tangents
 from nnode.simulate import Solver, TorchdiffeqSolver
 from nnode.simulate.kernels import lanes
@@ -120,49 +119,6 @@ def test_every_sequence_with_parameters_of_its_own() -> None:
         found, exact = slopes[:, :, b, :, 0][:, follows], wanted[:, :, b][:, follows]
         assert (found - exact).norm() <= 1e-10 * exact.norm()
         assert exact.abs().max() > 0
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["idm", "ovm", "fvdm", "gipps", "krauss", "helly"])
-def test_of_the_field_s_laws(name: str) -> None:
-    system = model(name)
-    names = owned(system)
-    if name == "gipps":
-        names = [n for n in names if n[7:] not in ("v0", "a")]  # nobody drives freely here
-    compared(system, platoons(), [n for n in names if n != "krauss__v0"])
-
-
-@pytest.mark.thorough
-def test_of_the_weights_of_a_network() -> None:
-    system = model("a4")
-    assert NEURONS["a4"] == 4
-    with torch.no_grad():
-        for p in system.parameters():
-            p.mul_(0.3)
-    compared(system, platoons(), owned(system)[:8])
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("method", METHODS)
-def test_of_every_method(method: str) -> None:
-    compared(model("idm"), platoons(), ["idm__T", "idm__a"], method)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    "effect",
-    [
-        {"name": "memory", "tau_m": 2.0},
-        {"name": "inertia", "tau_v": 0.4},
-        {"name": "multi_anticipation", "c": 0.3},
-        {"name": "pure_delay", "T": 0.23},
-    ],
-    ids=lambda effect: effect["name"],
-)
-def test_of_effects_and_of_what_they_remember(effect: dict[str, Any]) -> None:
-    system = model("idm", effect)
-    names = [n for n in owned(system) if not n.startswith("idm__")] + ["idm__T", "idm__s0"]
-    compared(system, platoons(), names)
 
 
 def test_of_starts_that_depend_on_the_law_and_on_measured_speeds() -> None:
