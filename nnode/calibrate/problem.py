@@ -150,7 +150,8 @@ class ResidualProblem:
         they are given."""
         if self.fitted is None:
             return {}
-        found, agents = self._settled(rows).row.tolist(), self.batch.agent.sum(1).tolist()
+        self._last = self._settled(rows).row
+        found, agents = self._last.tolist(), self.batch.agent.sum(1).tolist()
         return {name: v[:n] for name, v, n in zip(self.batch.names, found, agents, strict=True)}
 
     def complain(self, cost: np.ndarray) -> None:
