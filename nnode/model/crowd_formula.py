@@ -127,10 +127,12 @@ def rates_of(
     v = state.v
     if v is None:
         v = torch.zeros_like(x) if law.order == 1 else state.others[1]
-    given: dict[str, Tensor] = {"t": state.t.to(x.dtype)}
-    given |= dict(zip(law.owned, values_of(law, own_values(terms, law)), strict=True))
-    given |= {name: x.new_tensor(value) for name, value in settings_of(terms, law).items()}
-    own = dict(zip(("x", "y", "vx", "vy"), (*x.unbind(-1), *v.unbind(-1)), strict=True))
+    given = {name: x.new_tensor(value) for name, value in settings_of(terms, law).items()}
+    # parameters are numbers, or ``(B, 1, 1)`` where each simulation has its own
+    values = values_of(law, own_values(terms, law))
+    own = {s: p[..., 0] if p.ndim else p for s, p in zip(law.owned, values, strict=True)}
+    own |= dict(zip(("x", "y", "vx", "vy"), (*x.unbind(-1), *v.unbind(-1)), strict=True))
+    own["t"] = state.t.to(x.dtype).reshape(-1, 1)
     own |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
     own |= people_of(terms, law, scene)
     sums: dict[str, Tensor] = {}
@@ -141,8 +143,8 @@ def rates_of(
         if over in (OTHERS, SMALLEST):
             seen |= {f"{name}_j": own[name][:, None] for name in law.inputs}
         known = own | sums if over == SMALLEST else own
-        values = given | {name: value[:, :, None] for name, value in known.items()} | seen
-        each = computed(list(found.values()), values, code=code)
+        wide = {name: value[:, :, None] if value.ndim else value for name, value in known.items()}
+        each = computed(list(found.values()), given | wide | seen, code=code)
         reduced = _least if over == SMALLEST else _sum
         sums |= {
             name: reduced(value, real).expand(x.shape[:2])

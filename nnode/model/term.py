@@ -25,7 +25,7 @@ class State:
     """What the terms of a model see at one moment.
 
     Attributes:
-        t: seconds since the first sample, a scalar tensor.
+        t: seconds since the first sample, a scalar tensor, or ``(B,)``.
         x: ``(B, N, D)`` positions, m.
         v: ``(B, N, D)`` velocities, m/s; None in first-order models.
         scene: everything that does not change during the simulation.
@@ -83,6 +83,8 @@ class Term(nn.Module):
         rule: what it does, as formulas, from which everything is made that computes it; None:
             ``forward`` is code of its own, which runs in PyTorch.
         second: what it does to a law that says an acceleration; None: nothing is known.
+        side_by_side: whether ``forward`` takes many simulations at once, with times ``(B,)`` and
+            scalar parameters ``(B, 1, 1)``.
     """
 
     name: ClassVar[str]
@@ -92,6 +94,7 @@ class Term(nn.Module):
     fast: ClassVar[dict[str, float]] = {}
     rule: Rule | CrowdRule | None = None
     second: Rule | None = None
+    side_by_side: ClassVar[bool] = False
 
     def __init__(self) -> None:
         super().__init__()

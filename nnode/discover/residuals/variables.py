@@ -84,6 +84,7 @@ class Curve(Term):
     name = "curve"
     formula = "f(variable)"
     source = "a curve without a formula, fitted to what a model leaves"
+    side_by_side = True
 
     def __init__(self, variable: Variable, amounts: np.ndarray) -> None:
         super().__init__()
@@ -93,8 +94,8 @@ class Curve(Term):
         self.scale: Tensor
 
     def forward(self, state: State) -> Tensor:
-        amount = self.scale * (self.variable.weights(state) @ self.amounts)
-        return amount[..., None] * self.variable.direction(state)
+        amount = self.variable.weights(state) @ self.amounts
+        return self.scale * amount[..., None] * self.variable.direction(state)
 
 
 def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:
