@@ -38,8 +38,7 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.discover.options import DiscoverOptions
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS, PEDESTRIAN_LAWS
 from nnode.model.options import (
     FormulaOptions,
     LawOptions,

@@ -15,7 +15,7 @@ from benchmarks.recovery.recover import Recovered, recover
 from nnode.data.options import SumoOptions
 from nnode.data.readers.sumo import read_sumo
 from nnode.data.sequence import Sequence
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 #: What SUMO calls the parameters.
 _SUMO = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 _IDM, _KRAUSS = CAR_FOLLOWING_LAWS["idm"], CAR_FOLLOWING_LAWS["krauss"]
 #: Gaps that SUMO counts as none, m, its slack in distances, m, and what stands for no speed, m/s.

@@ -19,7 +19,7 @@ from nnode.calibrate.least_squares import (
 )
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Crowd, Traffic
-from nnode.model.formula_law import law_from
+from nnode.model.laws import law_from
 from nnode.model.system import System
 from nnode.simulate.fused import FusedSolver
 

@@ -25,10 +25,9 @@ import torch
 from nnode.exchange.drive import drive
 from nnode.exchange.running_sumo import RunningSumo
 from nnode.files import write_json
-from nnode.model import Linear, Traffic
+from nnode.model import Traffic
 from nnode.model.build import add_effects
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.formula_law import law_from
+from nnode.model.laws import CAR_FOLLOWING_LAWS, Law, law_from
 
 #: Vehicles of a road, the step, s, and for how long, s.
 PLATOON, STEP, SECONDS = 20, 0.1, 60.0
@@ -38,7 +37,7 @@ def law(name: str) -> Traffic:
     """``idm``; ``chained``: a law of first order that looks at the speed ahead in the same step."""
     if name == "idm":
         return Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])], leader="measured")
-    system = Traffic([Linear(20.0, 7.0)], leader="measured")
+    system = Traffic([Law("lin", v0=20.0, L=7.0)], leader="measured")
     add_effects(system, [{"name": "relative_speed", "kappa": 0.3}])
     return system
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.speed.problems import Problem
-from nnode.model import NetworkSpeed
+from nnode.model import Law
 from nnode.simulate.kernels.functions import FLAGS, torch_softplus
 
 #: Numbers of a row: 8 kB at most, which stay in the first-level cache.
@@ -33,7 +33,9 @@ def evaluations(problem: Problem) -> int:
     """
     shape = problem.shape
     neurons = sum(
-        term.network.sizes[1] for term in problem.system.terms if isinstance(term, NetworkSpeed)
+        term.network.sizes[1]
+        for term in problem.system.terms
+        if isinstance(term, Law) and term.network
     )
     return neurons * shape.sequences * (shape.agents - 1) * shape.steps
 

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import Crowd, NetworkForce, Relaxation, SocialForce, System
-from nnode.model.build import MODELS, add_effects
+from nnode.model import Crowd, System, Traffic, make_law
+from nnode.model.build import add_effects
+from nnode.model.laws import law_from
 
 
 @dataclass(frozen=True)
@@ -171,17 +172,18 @@ def _system(model: str) -> System:
 def _law(model: str) -> System:
     generator = torch.Generator().manual_seed(1)
     if model == "sf":
-        return Crowd([Relaxation(), SocialForce(5.0, 30.0, 10.0, B=0.1)])
+        return Crowd(
+            [make_law("relaxation"), make_law("social_force", A=5.0, k=30.0, kappa=10.0, B=0.1)]
+        )
     if model == "nn":
-        return Crowd([Relaxation(), NetworkForce(4, generator=generator)])
-    extra: dict[str, Any]
+        return Crowd([make_law("relaxation"), make_law("network_force", generator=generator)])
     if model.startswith("n"):
-        term, extra = "network_speed", {"hidden": int(model[1:]), "box": None}
+        found = make_law("network_speed", hidden=int(model[1:]), v0=18.0, generator=generator)
     elif model == "idm":
-        term, extra = "formula", {"name": "idm", "law": IDM}
+        found = law_from("idm", IDM)
     else:
-        term, extra = model, {"L": 4.0, "L_min": 2.0}
-    return MODELS[term]({"v0": 18.0, "leader": "constant", **extra}, generator)
+        found = make_law(model, v0=18.0, L=4.0)
+    return Traffic([found], leader="constant")
 
 
 def pose(shape: Shape, model: str, dtype: torch.dtype) -> Problem:

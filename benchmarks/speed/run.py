@@ -62,19 +62,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
     if options.redraw is not None:
         _redraw(Path(options.redraw), folder)
         return
-    for name, chosen, known in (
-        ("shapes", options.shapes, [*SHAPES, _DIAGNOSIS]),
-        ("engines", options.engines or [], ENGINES),
-    ):
-        wrong = [item for item in chosen if item not in known]
-        if wrong:
-            raise ConfigError(
-                f"benchmark.{name} has {', '.join(wrong)}, expected some of {', '.join(known)}"
-            )
-    for name in ("repeats", "restarts", "sequences"):
-        least = min(options[name], default=1) if name == "sequences" else options[name]
-        if least < 1:
-            raise ConfigError(f"benchmark.{name}={options[name]} must be at least 1")
+    _check_options(options)
     # one thread for all; fused_2 brings its own second one
     torch.set_num_threads(1)
     dtype = getattr(torch, options.dtype.value)
@@ -91,28 +79,7 @@ def benchmark(config: DictConfig, folder: Path) -> None:
             write_json(folder / "benchmark.json", results)
         for shape in SHAPES.get(name, []):
             for model in shape.models:
-                problem = pose(shape, model, dtype)
-                if name == "tangents":
-                    found.append({"shape": name, **_tangents(problem, options.repeats)})
-                    write_json(folder / "benchmark.json", results)
-                    continue
-                if name == "methods":
-                    found.append({"shape": name, **_methods(problem, options.repeats)})
-                    write_json(folder / "benchmark.json", results)
-                    continue
-                chosen = {
-                    key: engine
-                    for key, engine in ENGINES.items()
-                    if key in (options.engines or ENGINES) and engine.covers(problem)
-                }
-                row = _measure(problem, chosen, options.repeats)
-                # those of ``steps`` are the ones of ``paper``, but for their length
-                if shape.domain == "traffic" and name != "steps":
-                    row["ensemble"] = _ensemble(problem, options.restarts, options.repeats)
-                if name in ("paper", "crowd") and "fused_1" in chosen:
-                    row["warm_start"] = warm_start(problem)
-                found.append({"shape": name, **row})
-                print_problem(found[-1])
+                found.append({"shape": name, **_timed(name, pose(shape, model, dtype), options)})
                 results["scale"] = per_person([r for r in found if r["shape"] == "scale"])
                 write_json(folder / "benchmark.json", results)
     print_methods([row for row in found if row["shape"] == "methods"])
@@ -121,6 +88,41 @@ def benchmark(config: DictConfig, folder: Path) -> None:
     print_growth([row for row in found if row["shape"] == _DIAGNOSIS])
     print(f"results: {folder / 'benchmark.json'}")
     _draw(results, folder)
+
+
+def _check_options(options: DictConfig) -> None:
+    for name, chosen, known in (
+        ("shapes", options.shapes, [*SHAPES, _DIAGNOSIS]),
+        ("engines", options.engines or [], ENGINES),
+    ):
+        wrong = [item for item in chosen if item not in known]
+        if wrong:
+            raise ConfigError(
+                f"benchmark.{name} has {', '.join(wrong)}, expected some of {', '.join(known)}"
+            )
+    for name in ("repeats", "restarts", "sequences"):
+        least = min(options[name], default=1) if name == "sequences" else options[name]
+        if least < 1:
+            raise ConfigError(f"benchmark.{name}={options[name]} must be at least 1")
+
+
+def _timed(name: str, problem: Problem, options: DictConfig) -> dict[str, Any]:
+    """What is measured of one problem of the shapes ``name``."""
+    if name in ("tangents", "methods"):
+        return (_tangents if name == "tangents" else _methods)(problem, options.repeats)
+    chosen = {
+        key: engine
+        for key, engine in ENGINES.items()
+        if key in (options.engines or ENGINES) and engine.covers(problem)
+    }
+    row = _measure(problem, chosen, options.repeats)
+    # the problems of ``steps`` are those of ``paper`` with another number of steps
+    if problem.shape.domain == "traffic" and name != "steps":
+        row["ensemble"] = _ensemble(problem, options.restarts, options.repeats)
+    if name in ("paper", "crowd") and "fused_1" in chosen:
+        row["warm_start"] = warm_start(problem)
+    print_problem({"shape": name, **row})
+    return row
 
 
 def _draw(results: dict[str, Any], folder: Path) -> bool:

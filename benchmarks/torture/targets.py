@@ -35,7 +35,7 @@ from nnode.data.readers.table import WALLS
 from nnode.data.sequence import Sequence
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
 from nnode.model import Traffic, build_model
-from nnode.model.formula_law import law_from
+from nnode.model.laws import law_from
 from nnode.simulate.kernels import source
 from nnode.study.runner import KEPT, Task, run_tasks
 

@@ -6,16 +6,12 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from nnode.model import Linear, Logarithmic, NetworkForce, NetworkSpeed, Relaxation, SocialForce
-from nnode.model.crowd_dynamics import CrowdRule
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
 from nnode.model.formula import rule_of
-from nnode.model.formula_law import FormulaForce, FormulaLaw, law_from
-from nnode.model.lane_dynamics import Rule
+from nnode.model.laws import Law, entries, make_law
 from nnode.model.term import Interval, Term
+from nnode.model.terms import Rule
 
 
 def main() -> None:
@@ -26,19 +22,17 @@ def main() -> None:
 def lines() -> Iterator[str]:
     """The catalogue, line by line."""
     yield "Laws of lanes (a law of your own: docs/method.md)"
-    for law in (Linear(), Logarithmic(), NetworkSpeed(4)):
-        yield from _of(law, "dx/dt = ")
-    for name, description in CAR_FOLLOWING_LAWS.items():
-        own = law_from(name, description, network=NEURONS.get(name))
-        yield from _of(own, "dx/dt = " if own.order == 1 else "dv/dt = ")
+    laws = [make_law(name) for name in entries()]
+    for own in laws:
+        if own.domain == "traffic":
+            yield from _of(own, "dx/dt = " if own.order == 1 else "dv/dt = ")
     for domain, title in (("traffic", "Effects in lanes; W is what law and effects before say"),
                           ("crowd", "Effects in crowds")):  # fmt: skip
         if domain == "crowd":
             yield "Forces on people"
-            for force in (Relaxation(), SocialForce(2.0, 30.0, 9.0), NetworkForce(4)):
-                yield from _of(force, "dv/dt = ")
-            for name, description in PEDESTRIAN_LAWS.items():
-                yield from _of(law_from(name, description), "")
+            for own in laws:
+                if own.domain == "crowd":
+                    yield from _of(own, "dv/dt = ")
         yield title
         for effect in CATALOGUE.of(domain, every=True):  # type: ignore[arg-type]
             yield from _of(effect(), "W becomes " if domain == "traffic" else "")
@@ -46,14 +40,12 @@ def lines() -> Iterator[str]:
 
 def _of(term: Term, left: str) -> Iterator[str]:
     rule = rule_of(term)
-    networks = isinstance(term, NetworkSpeed | NetworkForce)
-    about = (
-        ""
-        if isinstance(term, FormulaLaw | FormulaForce)
-        else (inspect.getdoc(term) or "").splitlines()[0]
-    )
+    if isinstance(term, Law):
+        about = entries()[term.entry]["about"]
+    else:
+        about = (inspect.getdoc(term) or "").splitlines()[0]
     yield f"  {term.name}: {about}".rstrip()
-    if networks or (rule is None and term.second is None):
+    if rule is None and term.second is None:
         yield f"    {left if not isinstance(term, Effect) else ''}{term.formula}"
     elif rule is not None:
         yield from _ruled(rule, left)
@@ -63,21 +55,20 @@ def _of(term: Term, left: str) -> Iterator[str]:
             yield f"    {of}the same"
         else:
             yield from _ruled(term.second, of + left, rule or Rule())
-    if isinstance(term, FormulaLaw) and term.network is not None:
-        yield f"    NN: {term.network.sizes[1]} neurons in one hidden layer, softplus"
+    for module, names in term.networks.items() if isinstance(term, Law) else ():
+        neurons = getattr(term, module).sizes[1]
+        yield f"    {', '.join(names)}: {neurons} neurons in one hidden layer, softplus"
     for name, unit in term.units.items():
         yield f"    {name}: {'a number' if unit == '1' else unit}{_bounds(term.bounds.get(name))}"
-    if isinstance(term, FormulaLaw) and term.step is not None:
+    if isinstance(term, Law) and term.step is not None:
         yield f"    steps: {term.step}"
     yield f"    source: {term.source}"
 
 
-def _ruled(
-    rule: Rule | CrowdRule, left: str, told: Rule | CrowdRule | None = None
-) -> Iterator[str]:
+def _ruled(rule: Rule, left: str, told: Rule | None = None) -> Iterator[str]:
     """A rule, line by line; parts that are told already are left out."""
     told = told or Rule()
-    if isinstance(rule, CrowdRule):
+    if rule.of_crowd:
         for axis, text in zip("xy", rule.rate, strict=True):
             yield f"    dv{axis}/dt: + {text}" if rule.order == 2 else f"    d{axis}/dt = {text}"
         for over, what in _REDUCED.items():

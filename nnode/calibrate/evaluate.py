@@ -12,28 +12,15 @@ from torch import Tensor
 from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs, squared_error
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
-from nnode.model import Crowd, FollowTheLeader, Relaxation, System, Traffic
-from nnode.model.formula_law import FormulaForce
-from nnode.model.lane_dynamics import Rule
-from nnode.model.term import Interval, Term
+from nnode.model import Crowd, Law, System, Traffic
+from nnode.model.laws import law_from
+from nnode.model.term import Interval
 from nnode.simulate.base import Solver, Trajectory
 
 #: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
 MOST = 1e24
 
 Simulate = Callable[[Batch], Trajectory]
-
-
-class FreeFlow(FollowTheLeader):
-    """Every vehicle drives at v0, whoever is ahead."""
-
-    name = "free_flow"
-    formula = "v0"
-    source = "the absence of interaction"
-    rule = Rule(rate="v0")
-
-    def speed(self, gap: Tensor) -> Tensor:
-        return super().speed(gap).expand_as(gap)
 
 
 @dataclass
@@ -211,10 +198,11 @@ def no_interaction(system: System, solver: Solver, free_speed: float | None) -> 
     bare: System
     if isinstance(system, Traffic):
         speed = 0.0 if free_speed is None else free_speed
-        bare = Traffic([FreeFlow(speed)], leader=system.leader)
+        free = law_from("free_flow", {"parameters": {"v0": f"{speed} m/s"}, "rate": {"x": "v0"}})
+        bare = Traffic([free], leader=system.leader)
     else:
-        kept: list[Term] = [t for t in system.terms if isinstance(t, Relaxation)]
-        kept += [t.alone() for t in system.terms if isinstance(t, FormulaForce)]
+        laws = [term for term in system.terms if isinstance(term, Law)]
+        kept = [law.alone() for law in laws if law.formulas.force is None]
         assert isinstance(system, Crowd)
         bare = Crowd(kept, system.wall_spacing, desired=system.desired)
     bare.to(next(system.parameters()))

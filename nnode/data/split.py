@@ -88,20 +88,28 @@ def split(sequences: Store | Sequences | Index, options: SplitOptions) -> Split:
     if mode is SplitMode.block:
         return _by_block(index, share, gap, rng)
     result = _by_component(index, share, gap, rng)
+    if mode is SplitMode.auto:
+        result = _or_block(result, index, share, gap, rng)
+    return _checked(result, share, "data.split.mode=block holds out a block of time instead")
+
+
+def _or_block(
+    result: Split, index: Index, share: float, gap: float, rng: np.random.Generator
+) -> Split:
+    """A block of time in place of components that miss the share that is to be held out."""
     target = share * len(index)
     near = abs(len(result.heldout) - target) <= max(1.0, TOLERANCE * target)
     sound = bool(result.heldout and result.train)
-    if mode is SplitMode.auto and not (near and sound):
-        try:
-            block = _by_block(index, share, gap, rng)
-        except DataError:
-            if not sound:
-                raise
-        else:
-            # runs in which everybody is there throughout lose all that stands beside a block
-            if not sound or len(block.dropped) <= len(block.train):
-                return block
-    return _checked(result, share, "data.split.mode=block holds out a block of time instead")
+    if near and sound:
+        return result
+    try:
+        block = _by_block(index, share, gap, rng)
+    except DataError:
+        if not sound:
+            raise
+        return result
+    # A block of a recording in which every agent is present throughout drops all other sequences.
+    return block if not sound or len(block.dropped) <= len(block.train) else result
 
 
 def _published(index: Index, gap: float) -> Split:

@@ -6,13 +6,13 @@ import copy
 
 from nnode.errors import ConfigError
 from nnode.model.build import add_effects
-from nnode.model.crowd import InteractionForce
 from nnode.model.crowd_dynamics import SMALLEST
-from nnode.model.crowd_formula import CrowdBase, crowd_of
 from nnode.model.effects import Effect, IndividualEffect
 from nnode.model.effects.crowd_force import ForceEffect
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of
+from nnode.model.formula import crowd_of
+from nnode.model.laws import InteractionForce, Law
 from nnode.model.system import Crowd, System, Traffic
 
 
@@ -55,7 +55,7 @@ def check_model(system: System) -> None:
     Raises:
         ConfigError: names the term and what to do.
     """
-    law = crowd_of([t for t in system.terms if isinstance(t, CrowdBase)])
+    law = crowd_of([t for t in system.terms if isinstance(t, Law)])
     if system.domain == "crowd" and law is not None and (law.order == 1 or law.sums[SMALLEST]):
         what = "of first order" if law.order == 1 else "with smallest values over others"
         raise ConfigError(

@@ -151,16 +151,7 @@ def _diagnosed(
     notes: list[str] = [division.note] if division.note else []
     imitations: list[NamedEffect] = []
     if nearer is not None and found.steps:
-        label = division.label[division.open]
-        steps, p_value = imitated(engine, found, label, nearer)
-        imitations = [named(engine, found.fit, step, math.nan) for step in steps]
-        found = without_steps(engine, found, steps, base_system)
-        if steps:
-            them = ", ".join(step.chosen.name for step in steps)
-            notes.append(
-                f"{them}: {nearer.name} does without and predicts left-out clusters better than "
-                f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
-            )
+        found, imitations = _without_imitations(look, nearer, notes)
     numbers = _clusters(look, options, len(effects))
     enough = numbers.open >= numbers.least
     stages.begin("comparing on sealed sequences")
@@ -172,9 +163,11 @@ def _diagnosed(
     kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
     beside = [individuals(engine, found.fit, kind) for kind in kinds]
     found, leads = sealed.confirmed(engine, found)
-    last = look.first
-    if found.fit is not base:
-        last = weighed(engine, found.fit, curves(engine, found.fit, look.variables), rules().sure)
+    last = (
+        look.first
+        if found.fit is base
+        else weighed(engine, found.fit, curves(engine, found.fit, look.variables), rules().sure)
+    )
     left = [one for one in last if one.removed > rules().least]
     assert found.screen is not None
     absent = absences(found, Way(found.screen, options.alpha, numbers.sealed))
@@ -184,8 +177,7 @@ def _diagnosed(
         pairs = [(a, b) for a, b in zip(beside, without, strict=True) if a and b]
         beside = [max(pair, key=lambda one: one.p_value) for pair in pairs]
     seen = [one for one in beside if one is not None]
-    for one in seen:
-        one.p_value = min(1.0, one.p_value * len(seen))
+    seen = [replace(one, p_value=min(1.0, one.p_value * len(seen))) for one in seen]
     agents = [sealed.agents(one, final.system, options.alpha, bool(left), enough) for one in seen]
     both = list(zip(seen, agents, strict=True))
     own = [one for one, agent in both if agent.named]
@@ -200,13 +192,13 @@ def _diagnosed(
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
     effects_found = [
-        named(engine, final, step, sealed.tried[step.chosen.name].p_value) for step in found.steps
+        *(named(engine, final, s, sealed.tried[s.chosen.name].p_value) for s in found.steps),
+        *(named_agents(one, agent.confirmed) for one, agent in both if agent.named),
     ]
-    effects_found += [named_agents(one, agent.confirmed) for one, agent in both if agent.named]
-    leads_found = [*leads, *imitations]
-    leads_found += [
-        named_agents(one, agent.confirmed) for one, agent in both if agent.found and not agent.named
-    ]
+    others = [pair for pair in both if pair[1].found and not pair[1].named]
+    leads_found = [
+        *leads, *imitations, *(named_agents(one, agent.confirmed) for one, agent in others),
+    ]  # fmt: skip
     diagnosis = Diagnosis(
         verdict=_verdict(
             found, left, removed, bool(own), bool(leads_found), enough, bool(imitations)
@@ -244,6 +236,26 @@ def _diagnosed(
         sealed=division.sealed,
         simulated=simulated,
     )
+
+
+def _without_imitations(
+    look: _Look, nearer: Nearer, notes: list[str]
+) -> tuple[Search, list[NamedEffect]]:
+    """Take out effects that a law which fits better does not need; they become leads.
+
+    Args:
+        notes: the reason is added to them.
+    """
+    engine, found, division = look.engine, look.found, look.division
+    steps, p_value = imitated(engine, found, division.label[division.open], nearer)
+    imitations = [named(engine, found.fit, step, math.nan) for step in steps]
+    if steps:
+        names = ", ".join(step.chosen.name for step in steps)
+        notes.append(
+            f"{names}: {nearer.name} does without and predicts left-out clusters better than "
+            f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
+        )
+    return without_steps(engine, found, steps, look.base_system), imitations
 
 
 def _looked_for(

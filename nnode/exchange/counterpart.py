@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from nnode.model import System
-from nnode.model.formula_law import law_from
+from nnode.model.laws import law_from
 from nnode.model.term import Term, short_names
 
 #: Address of a parameter to what a run says of it: ``low`` and ``high``, None where not known.

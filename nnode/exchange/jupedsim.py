@@ -29,10 +29,8 @@ from nnode.exchange.counterpart import (
     field_law,
     interval_lines,
 )
-from nnode.model import Relaxation, SocialForce, System
-from nnode.model.crowd_dynamics import CrowdRule
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
-from nnode.model.formula_law import FormulaForce
+from nnode.model import Law, System
+from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.model.scene import Scene, wall_points
 
 
@@ -96,7 +94,8 @@ _PACE = "desired_speed: the median of people's preferred speeds; each has his ow
 def has_parameters(system: System) -> bool:
     """Whether JuPedSim has a counterpart to a model."""
     return (
-        system.find(SocialForce) is not None or field_law(system, PEDESTRIAN_LAWS, SAME) is not None
+        system.find_law("social_force") is not None
+        or field_law(system, PEDESTRIAN_LAWS, SAME) is not None
     )
 
 
@@ -131,10 +130,9 @@ def _content(model: str, arguments: dict[str, Any], agent: dict[str, Any]) -> di
 
 def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
     """``cfsm`` or ``gcfm``."""
-    found, law = Counterpart(), cast(FormulaForce, system.terms[0])
+    found, law = Counterpart(), cast(Law, system.terms[0])
     own = {p: float(getattr(law, p).detach()) for p in law.scalars}
-    assert isinstance(law.rule, CrowdRule)
-    fixed = {name: value for name, (value, _) in law.rule.constants.items()}
+    fixed = {name: value for name, (value, _) in law.formulas.constants.items()}
     agent: dict[str, Any] = {"desired_speed": scenes.pace}
     if name == "cfsm":
         agent |= {"time_gap": own["T"], "radius": own["l"] / 2}
@@ -171,7 +169,8 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
 
 
 def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
-    force, relaxation = system.find(SocialForce), system.find(Relaxation)
+    force: Any = system.find_law("social_force")
+    relaxation: Any = system.find_law("relaxation")
     if force is None:
         raise ConfigError(
             "to=jupedsim: the run's model has no social force and is neither "

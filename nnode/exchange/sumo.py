@@ -25,8 +25,8 @@ from nnode.exchange.counterpart import (
     field_law,
     interval_lines,
 )
-from nnode.model import Linear, Logarithmic, System
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model import Law, System
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 #: SUMO's own length of a passenger car, m, where the data tell none.
 DEFAULT_LENGTH = 5.0
@@ -48,22 +48,24 @@ def traffic_of(sequences: Iterable[Sequence]) -> tuple[float, float | None]:
     return speed, float(np.median(known)) if len(known) else None
 
 
-def equilibrium_gap(law: Linear | Logarithmic, speed: float, time_gap: float = 0.0) -> float:
+def equilibrium_gap(law: Law, speed: float, time_gap: float = 0.0) -> float:
     """Gap (m, front to front) that a law asks for at ``speed`` (m/s); infinite from v0 on.
 
     Args:
         time_gap: h of the effect of this name, s.
     """
-    v0, standstill = float(law.v0.detach()), float(law.L.detach()) + time_gap * speed
-    if isinstance(law, Logarithmic):
+    v0, standstill = _value(law, "v0"), _value(law, "L") + time_gap * speed
+    if law.entry == "log":
         return standstill * math.exp(speed / v0)
     return standstill / (1 - speed / v0) if speed < v0 else math.inf
 
 
 def has_type(system: System) -> bool:
     """Whether SUMO has a counterpart to a model's law."""
-    simple = system.find(Linear) is not None or system.find(Logarithmic) is not None
-    return simple or field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME)) is not None
+    return (
+        system.find_law("lin", "log") is not None
+        or field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME)) is not None
+    )
 
 
 def sumo_type(
@@ -135,7 +137,7 @@ def _parted(whole: float, length: float) -> tuple[float, float]:
 
 def _of_the_gap(system: System, name: str, speed: float, length: float | None) -> Counterpart:
     """A law of the gap as Krauss' model."""
-    law = system.find(Linear) or system.find(Logarithmic)
+    law = system.find_law("lin", "log")
     if law is None:
         raise ConfigError(
             f"to=sumo: the run's model is neither {' nor '.join(SAME)} nor a law with a gap at "
@@ -144,7 +146,7 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
         )
     found = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}
-    L, v0 = float(law.L.detach()), float(law.v0.detach())
+    L, v0 = _value(law, "L"), _value(law, "v0")
     own, room = _parted(L, DEFAULT_LENGTH if length is None else length)
     values = {
         "id": name,
@@ -158,7 +160,7 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
     told += "SUMO's own, cut to L" if length is None else "the data's median, cut to L"
     found.notes.append(f"length + minGap = L = {L:.4g} m, the gap at rest; {told}")
 
-    limits = [v0] if isinstance(law, Linear) else []
+    limits = [v0] if law.entry == "lin" else []
     counted = set()
     if "free_flow_speed" in effects:
         limits.append(_value(effects["free_flow_speed"], "v_max"))

@@ -19,8 +19,8 @@ from nnode.model import Crowd, Traffic
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.crowd_individual import GaitSway
 from nnode.model.effects.traffic import DriverHeterogeneity
-from nnode.model.formula_law import law_from
 from nnode.model.lane_dynamics import Rule
+from nnode.model.laws import law_from
 from nnode.model.steps import STAGES
 from nnode.model.system import System
 from nnode.model.term import State, Term

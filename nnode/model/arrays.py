@@ -1,52 +1,57 @@
-"""Formulas as straight-line functions of NumPy arrays, every part computed once.
+"""Formulas computed with NumPy or PyTorch: straight-line code, every part computed once.
 
-Such a function takes milliseconds to make, and a call of it one NumPy call a node: what a search
-over many models needs, each of which is simulated a few times only.
+Such code takes milliseconds to make, and a call of it one call of the library a node: what a
+search over many models needs, each of which is simulated a few times only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
+import torch
+from torch import Tensor
 
 from nnode.model.expression import Expr, topological
+from nnode.model.operations import LIBRARIES, OPERATIONS
 
 #: Of symbols' values, and of those of nodes that are known, the outputs' values: arrays, or
 #: numbers where an output depends on nothing else.
 NumpyFunction = Callable[[Mapping[str, Any], tuple[Any, ...]], list[Any]]
-
-#: What a node is in Python, by operation; as PyTorch computes it, but for rounding.
-OPERATIONS = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "neg": "-{0}",
-    "recip": "1.0 / {0}",
-    "max": "where(({1} > {0}) | ({1} != {1}), {1}, {0})",
-    "min": "where(({1} < {0}) | ({1} != {1}), {1}, {0})",
-    "choose": "where({0} > 0, {1}, {2})",
-    **{name: name + "({0})" for name in ("sqrt", "exp", "log", "tanh", "sin", "cos")},
-    **{name: name + "({0})" for name in ("softplus", "softplus_slope", "logistic")},
-}
-
-
-def _softplus(a: Any) -> Any:
-    return np.where(a > 20, a, np.log1p(np.exp(np.minimum(a, 20.0))))
-
-
-_NAMES: dict[str, Any] = {
-    **{name: getattr(np, name) for name in ("where", "sqrt", "exp", "log", "tanh", "sin", "cos")},
-    "softplus": _softplus,
-    "softplus_slope": lambda a: np.where(a > 20, 1.0, expit(a)),
-    "logistic": expit,
-}
+#: What a call in a formula stands for.
+Code = Callable[..., Tensor]
 
 
 @lru_cache(maxsize=1024)
+def _straight_line(
+    outputs: tuple[Expr, ...], known: tuple[Expr, ...], library: str
+) -> tuple[Callable[..., list[Any]], list[float]]:
+    """A function of numbers, values of symbols, values of known nodes and code; and its numbers."""
+    label = {node: f"k[{i}]" for i, node in enumerate(known)}
+    numbers: dict[str, float] = {}
+    lines: list[str] = []
+    for node in topological(outputs, label):
+        args = [label[a] for a in node.args]
+        label[node] = f"n{len(lines)}"
+        if node.op == "const":
+            label[node] = f"c{len(numbers)}"
+            numbers[label[node]] = node.value
+        elif node.op == "symbol":
+            lines.append(f"{label[node]} = g[{node.value!r}]")
+        elif node.op == "call":
+            lines.append(f"{label[node]} = code[{node.value!r}]({', '.join(args)})")
+        else:
+            lines.append(f"{label[node]} = {OPERATIONS[node.op].code.format(*args)}")
+    given = [f"{', '.join(numbers)}, = c"] if numbers else []
+    found = ", ".join(label[node] for node in outputs)
+    body = "".join(f"    {line}\n" for line in [*given, *lines, f"return [{found}]"])
+    names = dict(LIBRARIES[library])
+    exec(f"def run(c, g, k, code=None):\n{body}", names)
+    return names["run"], list(numbers.values())
+
+
 def numpy_function(outputs: tuple[Expr, ...], known: tuple[Expr, ...] = ()) -> NumpyFunction:
     """A function of symbols and of known nodes.
 
@@ -54,21 +59,25 @@ def numpy_function(outputs: tuple[Expr, ...], known: tuple[Expr, ...] = ()) -> N
         outputs: formulas without calls of code.
         known: nodes that are computed already.
     """
-    label = {node: f"k[{i}]" for i, node in enumerate(known)}
-    lines: list[str] = []
-    names = dict(_NAMES)
-    for node in topological(outputs, label):
-        if node.op == "const":
-            label[node] = f"c{len(names)}"
-            # Python's own numbers would raise where one is divided by zero
-            names[label[node]] = np.float64(node.value)
-            continue
-        text = f"g[{node.value!r}]"
-        if node.op != "symbol":
-            text = OPERATIONS[node.op].format(*(label[a] for a in node.args))
-        label[node] = f"n{len(lines)}"
-        lines.append(f"    {label[node]} = {text}\n")
-    found = ", ".join(label[node] for node in outputs)
-    exec("def run(g, k):\n" + "".join(lines) + f"    return [{found}]\n", names)
-    run: NumpyFunction = names["run"]
-    return run
+    run, numbers = _straight_line(outputs, known, "array")
+    # Python's own numbers would raise where one is divided by zero
+    return partial(run, tuple(map(np.float64, numbers)))
+
+
+def computed(
+    outputs: Sequence[Expr],
+    values: Mapping[str, Tensor],
+    known: Mapping[Expr, Tensor] | None = None,
+    code: Mapping[str, Code] | None = None,
+) -> list[Tensor]:
+    """Formulas from the values of their symbols with PyTorch, differentiable as PyTorch is.
+
+    Args:
+        known: values of nodes that are computed already.
+        code: what calls stand for.
+    """
+    known = known or {}
+    run, numbers = _straight_line(tuple(outputs), tuple(known), "tensor")
+    like = next(iter(values.values()))
+    constants = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in numbers]
+    return run(constants, values, tuple(known.values()), code)

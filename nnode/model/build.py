@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, cast
 
@@ -11,118 +11,58 @@ import torch
 
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
-from nnode.model.crowd import NetworkForce, Relaxation, SocialForce
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
 from nnode.model.effects.own import VARIABLE, load_own
 from nnode.model.formula import rule_of
-from nnode.model.formula_law import FormulaForce, law_from
+from nnode.model.laws import Law, entries, law_from, make_law, takes_options
 from nnode.model.system import Crowd, System, Traffic
-from nnode.model.term import Term
-from nnode.model.traffic import Linear, Logarithmic, NetworkSpeed
 
 Options = Mapping[str, Any]
 
-#: Start values of the social force's parameters, uniform on this interval (section 6.4).
-START = (0.0, 50.0)
+
+def _formula(options: Options, generator: torch.Generator) -> list[Law]:
+    return [
+        law_from(
+            str(options["name"]),
+            options["law"],
+            network=options.get("network"),
+            box=options.get("box"),
+            generator=generator,
+        )
+    ]
 
 
-def _traffic(term: Linear | Logarithmic | NetworkSpeed, options: Options) -> Traffic:
-    if not (math.isfinite(options["v0"]) and options["v0"] > 0):
-        raise ConfigError(f"model.v0={options['v0']} must be a positive speed in m/s")
-    return Traffic([term], leader=str(getattr(options["leader"], "value", options["leader"])))
+def _of_entries(options: Options, generator: torch.Generator) -> list[Law]:
+    """The terms of a model of the package's entries, each with its options."""
+    v0 = options.get("v0", 1.0)
+    if not (math.isfinite(v0) and v0 > 0):
+        raise ConfigError(f"model.v0={v0} must be a positive speed in m/s")
+    # checkpoints from before there was an option do not name it
+    given = {**options, "preferred": _desired(options) != "last", "generator": generator}
+    every, found = entries(), []
+    for name in every[str(options["term"])]["model"]:
+        takes = takes_options(every[name])
+        found.append(make_law(name, **{key: given[key] for key in takes if key in given}))
+    return found
 
 
-def _lin(options: Options, generator: torch.Generator) -> System:
-    return _traffic(Linear(options["v0"], options["L"], options["L_min"]), options)
-
-
-def _log(options: Options, generator: torch.Generator) -> System:
-    return _traffic(Logarithmic(options["v0"], options["L"], options["L_min"]), options)
-
-
-def _formula(options: Options, generator: torch.Generator) -> System:
-    law = law_from(
-        str(options["name"]),
-        options["law"],
-        network=options.get("network"),
-        box=options.get("box"),
-        generator=generator,
-    )
-    if isinstance(law, FormulaForce):
-        return _crowd([law], options)
+def _lane(found: Law, options: Options) -> Traffic:
     leader = str(getattr(options["leader"], "value", options["leader"]))
-    if leader == "constant" and law.order == 1 and "v0" not in law.scalars:
+    if leader == "constant" and found.order == 1 and "v0" not in found.scalars:
         raise ConfigError(
             "model.leader=constant needs a law with a parameter v0, the speed of the first "
             "vehicle; name one, or take model.leader=measured"
         )
-    return Traffic([law], leader=leader)
-
-
-def _network_speed(options: Options, generator: torch.Generator) -> System:
-    term = NetworkSpeed(options["hidden"], options["v0"], options["box"], generator)
-    model = _traffic(term, options)
-    if model.leader == "measured":
-        term.idle("v0")  # no equation contains it then
-    return model
-
-
-def _social_force(options: Options, generator: torch.Generator) -> System:
-    low, high = START
-    draw = low + (high - low) * torch.rand(3, generator=generator, dtype=torch.float64)
-    start = {
-        name: float(value if options[name] is None else options[name])
-        for name, value in zip(("A", "k", "kappa"), draw, strict=True)
-    }
-    term = SocialForce(
-        **start,
-        r=options["r"],
-        B=options["B"],
-        mass=options["mass"],
-        walls=options["walls"],
-        opposing_wall_friction=options["opposing_wall_friction"],
-    )
-    return _crowd([_drive(options), term], options)
-
-
-def _network_force(options: Options, generator: torch.Generator) -> System:
-    term = NetworkForce(
-        options["hidden"],
-        mass=options["mass"],
-        walls=options["walls"],
-        box=options["box"],
-        # checkpoints from before there was this option do not name it
-        self_interaction=options.get("self_interaction", False),
-        generator=generator,
-    )
-    return _crowd([_drive(options), term], options)
+    if found.entry and leader == "measured" and not found.names("v0"):
+        found.idle("v0")
+    return Traffic([found], leader=leader)
 
 
 def _desired(options: Options) -> str:
     # checkpoints from before there was this option do not name it
     found = options.get("desired", "last")
     return str(getattr(found, "value", found))
-
-
-def _drive(options: Options) -> Relaxation:
-    """Towards the destination: at the present speed, as the paper's, or at the preferred one."""
-    return Relaxation(options["tau"], preferred=_desired(options) != "last")
-
-
-def _crowd(terms: list[Term], options: Options) -> Crowd:
-    return Crowd(terms, options.get("wall_spacing", 0.25), desired=_desired(options))
-
-
-#: Every calibrated term, by the name that ``model.term`` gives it.
-MODELS: dict[str, Callable[[Options, torch.Generator], System]] = {
-    "lin": _lin,
-    "log": _log,
-    "formula": _formula,
-    "network_speed": _network_speed,
-    "social_force": _social_force,
-    "network_force": _network_force,
-}
 
 
 def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
@@ -133,15 +73,19 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
     Raises:
         ConfigError: an unknown term, or a value outside what the model allows.
     """
-    term = str(options["term"])
-    if term not in MODELS:
-        near = get_close_matches(term, MODELS, n=1)
+    term, generator = str(options["term"]), torch.Generator().manual_seed(seed)
+    terms = [name for name, entry in entries().items() if entry.get("model")] + ["formula"]
+    if term not in terms:
+        near = get_close_matches(term, terms, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(
-            f"model.term={term} is unknown, expected one of {', '.join(MODELS)}{hint}"
-        )
+        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}{hint}")
     try:
-        model = MODELS[term](options, torch.Generator().manual_seed(seed))
+        laws = (_formula if term == "formula" else _of_entries)(options, generator)
+        model: System
+        if laws[0].domain == "crowd":
+            model = Crowd(laws, options.get("wall_spacing", 0.25), desired=_desired(options))
+        else:
+            model = _lane(laws[0], options)
     except (ValueError, KeyError) as error:
         raise ConfigError(f"model {options.get('name', term)}: {error}") from error
     add_effects(model, options.get("effects") or [])

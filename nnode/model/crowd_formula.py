@@ -1,109 +1,28 @@
-"""The formula of a model of a crowd, made from what its terms say of themselves, and its
-accelerations by PyTorch."""
+"""The right-hand side of a crowd, from the formula of its model."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.model.crowd_dynamics import (
+from nnode.model.arrays import Code, computed, numpy_function
+from nnode.model.expression import Expr
+from nnode.model.scene import Scene
+from nnode.model.term import State, Term
+from nnode.model.terms import (
     NOBODY,
     OTHERS,
     POINTS,
     SMALLEST,
     WALLS,
     CrowdDynamics,
-    CrowdRule,
-    with_rule,
-)  # fmt: skip
-from nnode.model.expression import const
-from nnode.model.formula import own_values, owners, parameters_of, rule_of, values_of
-from nnode.model.scene import Scene
-from nnode.model.tensors import Code, computed
-from nnode.model.term import State, Term
-
-
-class CrowdBase(Term):
-    """A term that others may look at: what drives a person, or a force between people."""
-
-    def written(self, law: CrowdDynamics, owner: str, place: int) -> CrowdDynamics:
-        """A law with this term, as a formula."""
-        return ruled(law, self, owner, place)
-
-    def told(self, law: CrowdDynamics, owner: str, place: int) -> CrowdDynamics:
-        """A law with what others may name of this term; its acceleration does not matter."""
-        return self.written(law, owner, place)
-
-    def code(self) -> dict[str, Code]:
-        """What calls in its formula stand for, by name."""
-        return {}
-
-    def forward(self, state: State) -> Tensor:
-        """By its rule; a term without one defines its own."""
-        return contribution(self, state)
-
-
-def ruled(
-    law: CrowdDynamics, term: Term, owner: str, place: int, own: CrowdRule | None = None
-) -> CrowdDynamics:
-    """A law with a term that has a rule, or ``own`` in its place."""
-    rule = own or term.rule
-    if not isinstance(rule, CrowdRule):
-        raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
-    parameters, owned, units = parameters_of(term, owner, place)
-    return with_rule(law, owner, rule, parameters, owned, units, whose=place)
-
-
-def formula_of(base: CrowdBase) -> CrowdDynamics:
-    """The formula of one term."""
-    if (base.shape,) not in _KNOWN:
-        _KNOWN[base.shape,] = base.written(CrowdDynamics(), base.name, 0).flat()
-    return _KNOWN[base.shape,]
-
-
-#: Terms' shapes to the formula of all of them, and of the first one beside what it looks at.
-_KNOWN: dict[tuple[Any, ...], CrowdDynamics] = {}
-_ALONE: dict[tuple[Any, ...], CrowdDynamics] = {}
-
-
-def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
-    """The formula of a model with these terms; None where one is code without a formula."""
-    if any(rule_of(term) is None or term.memory for term in terms):
-        return None
-    key = tuple(term.shape for term in terms)
-    if key not in _KNOWN:
-        law, names = CrowdDynamics(), owners(terms)
-        # a law is known to effects wherever it stands
-        for i, term in sorted(enumerate(terms), key=lambda it: not isinstance(it[1], CrowdBase)):
-            add = term.written if isinstance(term, CrowdBase) else _ruled(term)
-            law = add(law, names[i], i)
-        _KNOWN[key] = law.flat()
-    return _KNOWN[key]
-
-
-def _ruled(term: Term) -> Callable[[CrowdDynamics, str, int], CrowdDynamics]:
-    return lambda law, owner, place: ruled(law, term, owner, place)
-
-
-def contribution(term: Term, state: State) -> Tensor:
-    """``(B, N, 2)`` m/s²: what one term adds to the accelerations, by its rule."""
-    around = [] if state.system is None else list(state.system.terms)
-    effect = not isinstance(term, CrowdBase)
-    bases = [t for t in around if effect and isinstance(t, CrowdBase)]
-    terms = [term, *bases]
-    key = tuple(t.shape for t in terms)
-    if key not in _ALONE:
-        law, names = CrowdDynamics(), owners(terms)
-        for i, base in enumerate(bases, start=1):
-            law = base.told(law, names[i], i)
-        law = replace(law, rate=(const(0), const(0)))
-        _ALONE[key] = ruled(law, term, names[0], 0).flat()
-    code = {name: call for base in bases for name, call in base.code().items()}
-    return rates_of(terms, _ALONE[key], state, code)
+    own_values,
+    values_of,
+)
 
 
 def settings_of(terms: Sequence[Any], law: CrowdDynamics) -> dict[str, float]:
@@ -119,78 +38,131 @@ def people_of(terms: Sequence[Any], law: CrowdDynamics, scene: Scene) -> dict[st
     return {name: value.to(scene.destination.dtype) for name, value in found.items()}
 
 
+class CrowdRates:
+    """The right-hand side of a crowd's formula, by PyTorch or NumPy.
+
+    Arrays of people are ``(B, N)``, those of what people see ``(M, B, N)``: M others, wall points
+    or walls. An axis has length 1 where all values along it are the same.
+
+    Args:
+        terms: of the model.
+        law: their formula.
+        scene: surroundings of the B simulations.
+        parameters: by name; None: those of the terms.
+        code: what calls stand for.
+        numpy: whether to compute by NumPy; a formula with code cannot be.
+    """
+
+    def __init__(
+        self,
+        terms: Sequence[Term],
+        law: CrowdDynamics,
+        scene: Scene,
+        parameters: Mapping[str, Tensor] | None = None,
+        code: Mapping[str, Code] | None = None,
+        numpy: bool = False,
+    ) -> None:
+        self.law, self._code, self._numpy = law, code, numpy
+        values = values_of(law, {**own_values(terms, law), **(parameters or {})})
+        known = dict(zip(law.owned, values, strict=True))
+        like = scene.destination
+        known |= {name: like.new_tensor(value) for name, value in settings_of(terms, law).items()}
+        known |= dict(zip(("goal_x", "goal_y"), like.unbind(-1), strict=True))
+        known |= people_of(terms, law, scene)
+        self._known = self._arrays(known)
+        self._places: dict[str, dict[str, Any]] = {}
+        self._real: dict[str, Any] = {}
+        for over, sums in law.sums.items():
+            if sums:
+                places, real = _PLACES[over](scene)
+                self._places[over] = self._arrays(places)
+                self._real[over] = self._arrays({over: real.to(like.dtype)})[over]
+
+    def __call__(self, t: Any, states: Any, others: Any) -> list[Any]:
+        """Both components of the rates, ``(B, N)``, m/s² or m/s.
+
+        Args:
+            t: s, a number or ``(B, 1)``.
+            states: ``(4, B, N)`` positions and velocities.
+            others: ``(4, B, N)`` of those whom people see.
+        """
+        own = dict(zip(("x", "y", "vx", "vy"), states, strict=True)) | self._known | {"t": t}
+        sums: dict[str, Any] = {}
+        for over, found in self.law.sums.items():
+            if not found:
+                continue
+            places, seen = self._places[over], {}
+            if over in (OTHERS, SMALLEST):
+                places = dict(zip(("x", "y", "vx", "vy"), map(_of_each, others), strict=True))
+                seen = {f"{name}_j": _of_each(own[name]) for name in self.law.inputs}
+            for name, value in places.items():
+                seen |= {f"d{name}": own[name] - value} if name in own else {name: value}
+            known = own | sums if over == SMALLEST else own
+            each = self._computed(found.values(), known | seen)
+            real = self._real[over]
+            for name, value in zip(found, each, strict=True):
+                sums[name] = _smallest(value, real) if over == SMALLEST else (value * real).sum(0)
+        return self._computed(self.law.rate, own | sums)
+
+    def _computed(self, formulas: Iterable[Expr], values: Mapping[str, Any]) -> list[Any]:
+        if self._numpy:
+            return numpy_function(tuple(formulas))(values, ())
+        return computed(list(formulas), values, code=self._code)
+
+    def _arrays(self, values: Mapping[str, Tensor]) -> dict[str, Any]:
+        if not self._numpy:
+            return dict(values)
+        return {name: np.ascontiguousarray(value.detach()) for name, value in values.items()}
+
+
 def rates_of(
     terms: Sequence[Term], law: CrowdDynamics, state: State, code: Mapping[str, Code] | None = None
 ) -> Tensor:
     """``(B, N, 2)`` m/s² of a crowd's formula, m/s where it is of first order."""
-    x, scene = state.x, state.scene
-    v = state.v
+    x, v = state.x, state.v
     if v is None:
         v = torch.zeros_like(x) if law.order == 1 else state.others[1]
-    given = {name: x.new_tensor(value) for name, value in settings_of(terms, law).items()}
-    # parameters are numbers, or ``(B, 1, 1)`` where each simulation has its own
-    values = values_of(law, own_values(terms, law))
-    own = {s: p[..., 0] if p.ndim else p for s, p in zip(law.owned, values, strict=True)}
-    own |= dict(zip(("x", "y", "vx", "vy"), (*x.unbind(-1), *v.unbind(-1)), strict=True))
-    own["t"] = state.t.to(x.dtype).reshape(-1, 1)
-    own |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
-    own |= people_of(terms, law, scene)
-    sums: dict[str, Tensor] = {}
-    for over, found in law.sums.items():
-        if not found:
-            continue
-        seen, real = _SEEN[over](state, x, v)
-        if over in (OTHERS, SMALLEST):
-            seen |= {f"{name}_j": own[name][:, None] for name in law.inputs}
-        known = own | sums if over == SMALLEST else own
-        wide = {name: value[:, :, None] if value.ndim else value for name, value in known.items()}
-        each = computed(list(found.values()), given | wide | seen, code=code)
-        reduced = _least if over == SMALLEST else _sum
-        sums |= {
-            name: reduced(value, real).expand(x.shape[:2])
-            for name, value in zip(found, each, strict=True)
-        }
-    rate = computed(law.rate, given | own | sums, code=code)
-    return torch.stack([part.expand(x.shape[:2]) for part in rate], -1)
+    states = torch.cat([x, v], -1)
+    others = states if state.seen is None else torch.cat(state.seen, -1)
+    found = CrowdRates(terms, law, state.scene, code=code)(
+        state.t.to(x.dtype).reshape(-1, 1), states.movedim(-1, 0), others.movedim(-1, 0)
+    )
+    return torch.stack([part.expand(x.shape[:2]) for part in found], -1)
 
 
-def _sum(value: Tensor, real: Tensor) -> Tensor:
-    """Over the third axis, of what exists."""
-    return (value * real).sum(2)
+def _of_each(values: Any) -> Any:
+    """``(M, B, 1)`` of the values ``(B, M)`` of others."""
+    return values.T[..., None]
 
 
-def _least(value: Tensor, real: Tensor) -> Tensor:
-    """The smallest over the third axis, of what exists; the slope is that of the first of them."""
+def _smallest(value: Any, real: Any) -> Any:
+    """Over the first axis, of what exists; the slope is that of the first of them."""
+    if isinstance(value, np.ndarray):
+        return np.where(real > 0, value, NOBODY).min(0, initial=NOBODY)
     value = torch.where(real > 0, value, NOBODY)
-    nobody = value.new_full((*value.shape[:2], 1), NOBODY)
-    value = torch.cat([value, nobody], 2)
-    return value.gather(2, value.detach().argmin(2, keepdim=True))[..., 0]
+    value = torch.cat([value, value.new_full((1, *value.shape[1:]), NOBODY)])
+    return value.gather(0, value.detach().argmin(0, keepdim=True))[0]
 
 
-_Seen = tuple[dict[str, Tensor], Tensor]
+_Places = tuple[dict[str, Tensor], Tensor]
 
 
-def _others(state: State, x: Tensor, v: Tensor) -> _Seen:
-    """What everybody (second axis) sees of the others (third), and 1 where they are others."""
-    other, speed = state.seen or (x, v)
-    dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
-    apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
-    seen = {"dx": dx[..., 0], "dy": dx[..., 1], "dvx": dv[..., 0], "dvy": dv[..., 1]}
-    return seen, (state.scene.agent[:, None, :] & apart).to(x.dtype)
+def _others(scene: Scene) -> _Places:
+    """Nothing that is fixed, and ``(N, B, N)`` whom (first axis) a person (third) sees."""
+    apart = ~torch.eye(scene.agent.shape[1], dtype=torch.bool, device=scene.agent.device)
+    return {}, (scene.agent[:, None, :] & apart).movedim(2, 0)
 
 
-def _points(state: State, x: Tensor, v: Tensor) -> _Seen:
-    wall, normal, real = state.scene.walls_of_each()
-    dx = x[:, :, None] - wall
-    seen = {"dx": dx[..., 0], "dy": dx[..., 1]}
-    return seen | {"normal_x": normal[..., 0], "normal_y": normal[..., 1]}, real.to(x.dtype)
+def _points(scene: Scene) -> _Places:
+    wall, normal, real = (part.movedim(2, 0) for part in scene.walls_of_each())
+    axes = zip("xy", wall.unbind(-1), normal.unbind(-1), strict=True)
+    return {k: v for c, x, n in axes for k, v in ((c, x), (f"normal_{c}", n))}, real
 
 
-def _walls(state: State, x: Tensor, v: Tensor) -> _Seen:
-    ends, real = walls_of(state.scene)
-    dx, along = x[:, :, None] - ends[:, None, :, :2], ends[:, None, :, 2:]
-    seen = {"dx": dx[..., 0], "dy": dx[..., 1]}
-    return seen | {"along_x": along[..., 0], "along_y": along[..., 1]}, real[:, None].to(x.dtype)
+def _walls(scene: Scene) -> _Places:
+    ends, real = walls_of(scene)
+    parts = ends.movedim(1, 0)[..., None].unbind(2)
+    return dict(zip(("x", "y", "along_x", "along_y"), parts, strict=True)), real.T[..., None]
 
 
 def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -201,4 +173,4 @@ def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
     return torch.cat([ends[..., :2], ends[..., 2:] - ends[..., :2]], -1), real
 
 
-_SEEN = {OTHERS: _others, POINTS: _points, WALLS: _walls, SMALLEST: _others}
+_PLACES = {OTHERS: _others, POINTS: _points, WALLS: _walls, SMALLEST: _others}

@@ -3,49 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
-from nnode.model.expression import Expr, apply, const, reciprocal, topological
+from nnode.model.expression import Expr, apply, as_expr, const, topological
+from nnode.model.operations import OPERATIONS, compiled
 
 _ONE, _ZERO = const(1), const(0)
+_BUILDERS = {name: partial(apply, name) for name in OPERATIONS}
+_SLOPES = {
+    name: compiled(f"({row.slope},)", ", ".join("fabc"[: row.arguments + 1]), _BUILDERS)
+    for name, row in OPERATIONS.items()
+}
 
 
 def slopes(node: Expr) -> list[Expr]:
     """The derivative of an operation by each of what it is applied to."""
-    a = node.args
-    match node.op:
-        case "add":
-            return [_ONE, _ONE]
-        case "sub":
-            return [_ONE, const(-1)]
-        case "neg":
-            return [const(-1)]
-        case "mul":
-            return [a[1], a[0]]
-        case "recip":
-            return [-(node * node)]
-        case "sqrt":
-            return [0.5 * reciprocal(node)]
-        case "exp":
-            return [node]
-        case "log":
-            return [reciprocal(a[0])]
-        case "tanh":
-            return [1 - node * node]
-        case "sin":
-            return [apply("cos", a[0])]
-        case "cos":
-            return [-apply("sin", a[0])]
-        case "softplus":
-            return [apply("softplus_slope", a[0])]
-        case "logistic" | "softplus_slope":
-            return [node * (1 - node)]
-        case "max" | "min":
-            less = a[1] - a[0] if node.op == "max" else a[0] - a[1]
-            second = apply("choose", less, _ONE, _ZERO)
-            return [1 - second, second]
-        case "choose":
-            return [_ZERO, apply("choose", a[0], _ONE, _ZERO), apply("choose", a[0], _ZERO, _ONE)]
-    raise ValueError(f"there is no derivative of {node.op}")
+    if node.op not in _SLOPES:
+        raise ValueError(f"there is no derivative of {node.op}")
+    return [as_expr(slope) for slope in _SLOPES[node.op](node, *node.args)]
 
 
 def _weighted(weight: Expr, slope: Expr) -> Expr:

@@ -1,23 +1,8 @@
-"""Formulas as graphs of nodes: equal parts are one node, whoever writes them.
+"""A formula is a directed acyclic graph; equal subexpressions share one node.
 
-A node is a number, a symbol, or an operation on nodes. Nodes are interned: building the same part
-twice gives the same object, so that what a formula names or repeats is computed once.
-
-=================  ==============================  ==============================================
-operation          value                           slope
-=================  ==============================  ==============================================
-add, sub, mul      a + b, a - b, a b
-neg, recip         -a, 1 / a
-sqrt, exp, log     of a
-tanh, sin, cos     of a
-softplus           log(1 + e^a), a beyond 20       softplus_slope, as PyTorch's
-softplus_slope     logistic(a), 1 beyond 20
-logistic           1 / (1 + e^-a)
-max, min           the larger, the smaller, none   that of a where both are equal
-                   where either is no number
-choose             b where a > 0, c elsewhere      none by a
-call               of code by its name; PyTorch's alone
-=================  ==============================  ==============================================
+A node is a number, a symbol, a call of code by its name, or an operation on nodes
+(:mod:`nnode.model.operations`). Building an expression twice gives the same object, so that what a
+formula names or repeats is computed once.
 """
 
 from __future__ import annotations
@@ -29,25 +14,14 @@ from contextlib import suppress
 from typing import Any
 from weakref import WeakValueDictionary
 
-#: Functions of one argument, by their names in formulas.
-UNARY: dict[str, Callable[[float], float]] = {
-    "sqrt": math.sqrt,
-    "exp": math.exp,
-    "log": math.log,
-    "tanh": math.tanh,
-    "sin": math.sin,
-    "cos": math.cos,
-    "softplus": lambda a: a if a > 20 else math.log1p(math.exp(a)),
-    "softplus_slope": lambda a: 1.0 if a > 20 else 1 / (1 + math.exp(-a)),
-    "logistic": lambda a: 1 / (1 + math.exp(-a)) if a > 0 else math.exp(a) / (1 + math.exp(a)),
-}
+from nnode.model.operations import LIBRARIES, OPERATIONS, compiled
 
 
 class Expr:
     """A node; made by :func:`symbol`, :func:`const`, arithmetic and :func:`apply`.
 
     Attributes:
-        op: ``const``, ``symbol``, or an operation of the table above.
+        op: ``const``, ``symbol``, ``call``, or the name of an operation.
         args: what it is applied to.
         value: the number, or the symbol's or the code's name.
         key: a digest of the whole formula below, the same in every process.
@@ -69,7 +43,7 @@ class Expr:
             return a - b.args[0]
         if a.op == "neg":
             return b - a.args[0]
-        return _folded("add", lambda p, q: p + q, a, b)
+        return _folded("add", a, b)
 
     def __sub__(self, other: Expr | float) -> Expr:
         a, b = self, as_expr(other)
@@ -83,7 +57,7 @@ class Expr:
             return a + b.args[0]
         if a.op == "add" and b in a.args:
             return a.args[1 - a.args.index(b)]
-        return _folded("sub", lambda p, q: p - q, a, b)
+        return _folded("sub", a, b)
 
     def __mul__(self, other: Expr | float) -> Expr:
         a, b = self, as_expr(other)
@@ -96,12 +70,12 @@ class Expr:
                 return -v
             if u.op == "neg":
                 return -(u.args[0] * v)
-        return _folded("mul", lambda p, q: p * q, a, b)
+        return _folded("mul", a, b)
 
     def __neg__(self) -> Expr:
         if self.op == "neg":
             return self.args[0]
-        return _folded("neg", lambda p: -p, self)
+        return _folded("neg", self)
 
     def __truediv__(self, other: Expr | float) -> Expr:
         return self * reciprocal(as_expr(other))
@@ -144,10 +118,17 @@ def _made(op: str, args: tuple[Expr, ...], value: Any = None) -> Expr:
     return node
 
 
-def _folded(op: str, number: Callable[..., float], *args: Expr) -> Expr:
+#: Values of operations on numbers.
+_NUMBERS = {
+    name: compiled(row.code.format(*"abc"), ", ".join("abc"[: row.arguments]), LIBRARIES["number"])
+    for name, row in OPERATIONS.items()
+}
+
+
+def _folded(op: str, *args: Expr) -> Expr:
     if all(a.op == "const" for a in args):
         with suppress(ValueError, OverflowError, ZeroDivisionError):
-            value = number(*(a.value for a in args))
+            value = _NUMBERS[op](*(a.value for a in args))
             if math.isfinite(value) or not all(math.isfinite(a.value) for a in args):
                 return const(value)
         # An overflow of finite numbers stays an operation, and says so when it is computed.
@@ -173,7 +154,7 @@ def reciprocal(a: Expr) -> Expr:
         return a.args[0]
     if a.op == "neg":
         return -reciprocal(a.args[0])
-    return _folded("recip", lambda p: 1 / p, a)
+    return _folded("recip", a)
 
 
 def power(base: Expr, exponent: Expr) -> Expr:
@@ -196,20 +177,29 @@ def _whole_power(base: Expr, n: int) -> Expr:
     return square * base if n % 2 else square
 
 
-def apply(name: str, *args: Expr) -> Expr:
-    """A function of the table by its name."""
-    if name in UNARY:
-        return _folded(name, UNARY[name], *args)
-    if name == "max":
-        return _folded(name, lambda p, q: q if q > p or q != q else p, *args)
-    if name == "min":
-        return _folded(name, lambda p, q: q if q < p or q != q else p, *args)
-    if name == "choose":
-        a, b, c = args
-        if a.op == "const":
-            return b if a.value > 0 else c
-        return b if b is c else _made("choose", args)
-    raise ValueError(f"there is no function {name}")
+def _chosen(a: Expr, b: Expr, c: Expr) -> Expr:
+    if a.op == "const":
+        return b if a.value > 0 else c
+    return b if b is c else _made("choose", (a, b, c))
+
+
+#: Operations that simplify what they are applied to.
+_SIMPLIFIED: dict[str, Callable[..., Expr]] = {
+    "add": Expr.__add__,
+    "sub": Expr.__sub__,
+    "mul": Expr.__mul__,
+    "neg": Expr.__neg__,
+    "recip": reciprocal,
+    "choose": _chosen,
+}
+
+
+def apply(name: str, *args: Expr | float) -> Expr:
+    """An operation by its name."""
+    if name not in OPERATIONS:
+        raise ValueError(f"there is no operation {name}")
+    nodes = map(as_expr, args)
+    return _SIMPLIFIED[name](*nodes) if name in _SIMPLIFIED else _folded(name, *nodes)
 
 
 def call(name: str, *args: Expr) -> Expr:
@@ -242,32 +232,15 @@ def symbols(outputs: Iterable[Expr]) -> list[str]:
     return [node.value for node in topological(outputs) if node.op == "symbol"]
 
 
-def rebuild(node: Expr, args: tuple[Expr, ...]) -> Expr:
-    """The same operation on other nodes."""
-    if not node.args or args == node.args:
-        return node
-    binary: dict[str, Callable[[Expr, Expr], Expr]] = {
-        "add": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-    }
-    if node.op in binary:
-        return binary[node.op](*args)
-    if node.op == "neg":
-        return -args[0]
-    if node.op == "call":
-        return call(node.value, *args)
-    if node.op == "recip":
-        return reciprocal(args[0])
-    return apply(node.op, *args)
-
-
 def substitute(node: Expr, values: Mapping[str, Expr]) -> Expr:
     """A formula with other ones in place of symbols, all at once."""
     done: dict[Expr, Expr] = {}
     for part in topological([node]):
+        args = tuple(done[a] for a in part.args)
         if part.op == "symbol":
             done[part] = values.get(part.value, part)
+        elif args == part.args:
+            done[part] = part
         else:
-            done[part] = rebuild(part, tuple(done[a] for a in part.args))
+            done[part] = call(part.value, *args) if part.op == "call" else apply(part.op, *args)
     return done[node]

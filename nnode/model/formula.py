@@ -11,57 +11,15 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from nnode.model.crowd_dynamics import CrowdDynamics
-from nnode.model.expression import Expr, const, substitute, symbol
-from nnode.model.lane_dynamics import UNITS, LaneDynamics, add_effect
+from nnode.model.crowd_formula import rates_of as crowd_rates
+from nnode.model.expression import const, symbol
+from nnode.model.laws import Law, parameters_of
 from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
-from nnode.model.tensors import Code, LaneRates, computed
+from nnode.model.tensors import LaneRates
 from nnode.model.term import State, Term
-
-
-class Law(Term):
-    """A term that others change.
-
-    Attributes:
-        order: 1: it says a speed; 2: an acceleration.
-        step: its own method of stepping; None: that of its order.
-    """
-
-    order = 1
-    step: str | None = None
-
-    @property
-    def has_formula(self) -> bool:
-        """Whether it has a formula, or code that a formula can call."""
-        return rule_of(self) is not None
-
-    def code(self) -> dict[str, Code]:
-        """What calls in its formula stand for, by name."""
-        return {}
-
-    def lane(self, owner: str) -> LaneDynamics:
-        """Its formula, by symbols that begin with the owner's name."""
-        raise NotImplementedError  # pragma: no cover - every law defines its own
-
-    def speed(self, gap: Tensor) -> Tensor:
-        """Speed, m/s, at a gap, m, elementwise: of a law of second order that in equilibrium."""
-        raise NotImplementedError  # pragma: no cover - every law defines its own
-
-    def evaluated(self, values: Mapping[str, Tensor]) -> Tensor:
-        """What its formula says of the quantities in it."""
-        lane = lane_of([self])
-        assert lane is not None, "a law without a formula defines its speed"
-        assert lane.law is not None
-        return self.computed([substitute(lane.law, lane.fixed)], values)[0]
-
-    def computed(self, formulas: Sequence[Expr], values: Mapping[str, Tensor]) -> list[Tensor]:
-        """Formulas of its parameters and of other quantities."""
-        lane = lane_of([self])
-        assert lane is not None
-        own = dict(zip(lane.owned, values_of(lane, own_values([self], lane)), strict=True))
-        return computed(formulas, {**own, **values})
+from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, own_values, values_of
 
 
 def rule_of(term: Term) -> Any:
@@ -89,47 +47,59 @@ def begins(term: Term, order: int) -> bool:
 
 
 #: What computes a term.
-_CODE = {
-    "forward", "speed", "memory_rate", "pair_force", "wall_force", "pairs", "components",
-}  # fmt: skip
+_CODE = {"forward", "memory_rate"}
+
+
+#: What terms say of their formulas to the formula of all.
+_KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
 def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
     """The formula of a lane with these terms; None where one is code without a formula."""
-    if not terms or not isinstance(terms[0], Law) or not terms[0].has_formula:
+    if not terms or not isinstance(terms[0], Law) or terms[0].rule is None:
         return None
     order = terms[0].order
     if any(isinstance(e, Law) or _effect_rule(e, order) is None for e in terms[1:]):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _KNOWN:
-        _KNOWN[key] = _made(terms)
-    return _KNOWN[key]
+        lane = LaneDynamics(order=order)
+        for place, (term, owner) in enumerate(zip(terms, owners(terms), strict=True)):
+            lane = with_term(lane, term, owner, place)
+        _KNOWN[key] = lane.flat()
+    found: LaneDynamics = _KNOWN[key]
+    return found
 
 
-#: What terms say of their formulas to the formula of all.
-_KNOWN: dict[tuple[Any, ...], LaneDynamics] = {}
+def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
+    """The formula of a crowd with these terms; None where one is code without a formula."""
+    if any(rule_of(term) is None or term.memory for term in terms):
+        return None
+    key = tuple(term.shape for term in terms)
+    if key not in _KNOWN:
+        law, names = CrowdDynamics(), owners(terms)
+        # a law is known to effects wherever it stands
+        for i, term in sorted(enumerate(terms), key=lambda it: not isinstance(it[1], Law)):
+            law = with_term(law, term, names[i], i)
+        _KNOWN[key] = law.flat() if law.is_formula else None
+    found: CrowdDynamics | None = _KNOWN[key]
+    return found
 
 
-def _made(terms: Sequence[Term]) -> LaneDynamics:
-    names = owners(terms)
-    assert isinstance(terms[0], Law)
-    lane = terms[0].lane(names[0])
-    for i, (term, owner) in enumerate(zip(terms[1:], names[1:], strict=True), start=1):
-        lane = with_effect(lane, term, owner, i)
-    return lane.flat()
-
-
-def with_effect(lane: LaneDynamics, term: Term, owner: str, place: int) -> LaneDynamics:
-    """A lane's formula with that of one term more.
+def with_term(model: Any, term: Term, owner: str, place: int, called: bool = False) -> Any:
+    """The formulas of a model with those of one term more.
 
     Args:
+        owner: name of the term in the model; symbols begin with it.
         place: of the term in the model.
+        called: whether networks of laws stay functions.
     """
-    parameters, owned, units = parameters_of(term, owner, place)
-    rule = _effect_rule(term, lane.order)
-    assert rule is not None
-    return add_effect(lane, owner, rule, parameters, owned, units, whose=place)
+    if isinstance(term, Law):
+        return term.written(model, owner, place, called=called)
+    rule = term.rule if isinstance(model, CrowdDynamics) else _effect_rule(term, model.order)
+    if rule is None:
+        raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
+    return add_term(model, owner, rule, *parameters_of(term, owner, place), place)
 
 
 def inputs_of(terms: Sequence[Any], lane: LaneDynamics, scene: Scene) -> dict[str, Tensor]:
@@ -146,28 +116,6 @@ def _length_ahead(scene: Scene) -> Tensor:
     return torch.cat([length[:, 1:], torch.zeros_like(length[:, :1])], 1)
 
 
-def values_of(lane: LaneDynamics | CrowdDynamics, parameters: Mapping[str, Tensor]) -> list[Tensor]:
-    """Of the parameters' symbols, in their order, from the model's parameters by name; what stands
-    before the parameters' own axes stays."""
-    found = []
-    for name, place, size in lane.owned.values():
-        value = parameters[name]
-        found.append(value if size is None else value.flatten(value.ndim - size)[..., place])
-    return found
-
-
-def own_values(terms: Sequence[Term], lane: LaneDynamics | CrowdDynamics) -> dict[str, Tensor]:
-    """The terms' parameters that a lane's formula needs, by their names in the model."""
-    found = {}
-    for name, _, _ in lane.owned.values():
-        _, place, path = name.split(".", 2)
-        value: Any = terms[int(place)]
-        for part in path.split("."):
-            value = getattr(value, part)  # may be a tensor in place of a parameter
-        found[name] = value
-    return found
-
-
 def owners(terms: Sequence[Term]) -> list[str]:
     """The name of each term; of several of one name the second is numbered.
 
@@ -181,17 +129,6 @@ def owners(terms: Sequence[Term]) -> list[str]:
         seen[term.name] += 1
         found.append(term.name if seen[term.name] == 1 else f"{term.name}_{seen[term.name]}")
     return found
-
-
-def parameters_of(
-    term: Term, owner: str, place: int
-) -> tuple[dict[str, Expr], dict[str, Any], dict[str, str]]:
-    """Of a term's scalar parameters: symbols by name, where they are, and their units."""
-    names = term.scalars
-    parameters: dict[str, Expr] = {name: symbol(f"{owner}__{name}") for name in names}
-    owned = {f"{owner}__{name}": (f"terms.{place}.{name}", 0, None) for name in names}
-    units = {f"{owner}__{name}": term.units.get(name, "*") for name in names}
-    return parameters, owned, units
 
 
 def rates_of(
@@ -224,24 +161,48 @@ def effect_increment(term: Term, state: State) -> Tensor:
     law = state.system.terms[0]
     if rule_of(term) is None:
         raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
-    key = (law.shape, term.shape)
-    if key not in _BEYOND:
-        before_it, units = symbol("before"), {**UNITS, "before": "m/s"}
-        alone = LaneDynamics(1, {"x": before_it}, before_it, None, {}, {}, units)
-        if isinstance(law, Law) and law.has_formula:
-            own = law.lane(law.name)
-            alone = replace(own, rates=alone.rates, leader=before_it, units={**own.units, **units})
-        _BEYOND[key] = with_effect(alone, term, term.name, 1).flat()
+    key = ("increment", law.shape, term.shape)
+    if key not in _KNOWN:
+        alone, before_it = LaneDynamics(order=1), symbol("before")
+        if isinstance(law, Law) and law.rule is not None:
+            alone = with_term(LaneDynamics(order=law.order), law, law.name, 0)
+        units = {**alone.units, "before": "m/s"}
+        alone = replace(alone, rates={"x": before_it}, leader=before_it, units=units)
+        _KNOWN[key] = with_term(alone, term, term.name, 1).flat()
     y = state.x if state.memory is None else torch.cat([state.x, state.memory], -1)
     more = {"before": before[..., 0]}
-    found = rates_of([cast(Term, law), term], _BEYOND[key], y, state.t, state.scene, False, more)
+    found = rates_of([cast(Term, law), term], _KNOWN[key], y, state.t, state.scene, False, more)
     followers = state.scene.follower | state.scene.leader
     change = torch.where(followers, found[..., 0] - before[..., 0], 0.0)
     return torch.cat([change[..., None], found[..., 1:]], -1)
 
 
-#: A law and an effect to the formula of what the effect changes.
-_BEYOND: dict[tuple[Any, ...], LaneDynamics] = {}
+def added_to(laws: Sequence[Term], effects: Sequence[Term], called: bool = False) -> CrowdDynamics:
+    """The formula of what effects add to a crowd's laws.
+
+    Args:
+        called: whether networks of laws stay functions.
+    """
+    terms = [*laws, *effects]
+    key = ("added", len(laws), called, *(t.shape for t in terms))
+    if key not in _KNOWN:
+        model, names = CrowdDynamics(), owners(terms)
+        for i, law in enumerate(laws):
+            model = with_term(model, law, names[i], i, called)
+        model = replace(model, rate=(const(0), const(0)))
+        for i, effect in enumerate(effects, start=len(laws)):
+            model = with_term(model, effect, names[i], i)
+        _KNOWN[key] = model.flat()
+    found: CrowdDynamics = _KNOWN[key]
+    return found
+
+
+def contribution(term: Term, state: State) -> Tensor:
+    """``(B, N, 2)`` m/s²: what one effect adds to the accelerations, by its rule."""
+    around = [] if state.system is None else list(state.system.terms)
+    laws = [t for t in around if isinstance(t, Law)]
+    code = {name: call for law in laws for name, call in law.code().items()}
+    return crowd_rates([*laws, term], added_to(laws, [term], called=True), state, code)
 
 
 def starts_of(

@@ -12,7 +12,8 @@ import math
 from collections.abc import Callable, Mapping
 
 from nnode.errors import ConfigError
-from nnode.model.expression import UNARY, Expr, apply, const, substitute, symbol, topological
+from nnode.model import operations
+from nnode.model.expression import Expr, apply, const, substitute, symbol, topological
 
 #: Limits of a text's characters, of nested parts, and of exponents.
 LENGTH, DEPTH, EXPONENT = 2000, 60, 64
@@ -22,20 +23,13 @@ LENGTH, DEPTH, EXPONENT = 2000, 60, 64
 #: 1,200 takes more than three minutes.
 OPERATIONS = 10_000
 #: Names of functions and their numbers of arguments.
-FUNCTIONS = {
-    **{name: 1 for name in UNARY if name != "softplus_slope"},
-    "max": 2,
-    "min": 2,
-    "choose": 3,
-    "abs": 1,
-    "clip": 3,
-}
+FUNCTIONS = {**operations.FUNCTIONS, "abs": 1, "clip": 3}
 _BINARY: dict[type, Callable[[Expr, Expr], Expr]] = {
-    ast.Add: lambda a, b: a + b,
-    ast.Sub: lambda a, b: a - b,
-    ast.Mult: lambda a, b: a * b,
-    ast.Div: lambda a, b: a / b,
-    ast.Pow: lambda a, b: a**b,
+    ast.Add: Expr.__add__,
+    ast.Sub: Expr.__sub__,
+    ast.Mult: Expr.__mul__,
+    ast.Div: Expr.__truediv__,
+    ast.Pow: Expr.__pow__,
 }
 #: What a name that is called stands for.
 Part = Expr | Callable[..., Expr]

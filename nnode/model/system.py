@@ -12,12 +12,11 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
-from nnode.model.crowd_dynamics import CrowdDynamics, CrowdRule
-from nnode.model.crowd_formula import crowd_of
-from nnode.model.formula import Law, begins, lane_of, rates_of, starts_of
-from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.formula import begins, crowd_of, lane_of, rates_of, starts_of
+from nnode.model.laws import Law
 from nnode.model.scene import DESIRED, Scene, wanted
 from nnode.model.term import Interval, State, Term, physical_parameters, short_names
+from nnode.model.terms import CrowdDynamics, LaneDynamics
 
 T = TypeVar("T", bound=Term)
 
@@ -127,6 +126,11 @@ class System(nn.Module):
         """The first term of a kind, or None."""
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
+    def find_law(self, *entries: str) -> Law | None:
+        """The first term that was made from one of these entries of the package, or None."""
+        laws = (term for term in self.terms if isinstance(term, Law))
+        return next((law for law in laws if law.entry in entries), None)
+
     def extra_repr(self) -> str:
         """The parameters that have a physical meaning, for those who print a model."""
         values = self.physical()
@@ -220,8 +224,9 @@ class Traffic(System):
                 ],
                 -1,
             )
-        # a law that is a class of its own is what it computes anyway
-        alone = len(self.terms) == 1 and "rule" not in vars(self.terms[0])
+        law = self.terms[0]
+        # a law of the gap alone computes its speed without a formula of the lane
+        alone = len(self.terms) == 1 and isinstance(law, Law) and law.of_gap
         lane = None if alone else self.lane
         if lane is not None:
             rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
@@ -280,7 +285,7 @@ class Crowd(System):
         if desired not in DESIRED:
             raise ValueError(f"desired={desired} is unknown, expected {', '.join(DESIRED)}")
         self.desired = desired
-        if any(isinstance(rule := term.rule, CrowdRule) and rule.order == 1 for term in terms):
+        if any(isinstance(term, Law) and term.order == 1 for term in self.terms):
             self.order = 1
         if neighbours not in ("simulated", "measured"):
             raise ValueError(f"neighbours={neighbours} is unknown, expected simulated or measured")

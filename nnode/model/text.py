@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from nnode.model.expression import Expr, topological
+from nnode.model.operations import ATOM, OPERATIONS, POWER, PRODUCT, SIGN, SUM, Notation
 
-#: How tightly an operation binds.
-_SUM, _PRODUCT, _SIGN, _POWER, _ATOM = 1, 2, 3, 4, 5
+#: Characters of a part that is written out: what can be read again. A part that is named often
+#: is written as often: without a bound, 40 parts that double have 10^12 characters.
+LONGEST = 2000
+#: Notations of products of equal factors and of products with a reciprocal.
+_SQUARE = {
+    "plain": Notation("{0}**2", POWER, (ATOM,)),
+    "latex": Notation("{{{0}}}^{{2}}", POWER, (ATOM,)),
+}
+_QUOTIENT = {
+    "plain": Notation("{0}/{1}", PRODUCT, (PRODUCT, POWER)),
+    "latex": Notation("\\frac{{{0}}}{{{1}}}", ATOM, (SUM, SUM)),
+}
+_BRACKETS = {"plain": "({0})", "latex": "\\left({0}\\right)"}
 
 
 def number(value: float) -> str:
@@ -19,103 +31,54 @@ def number(value: float) -> str:
 def plain(node: Expr) -> str:
     """As :func:`nnode.model.parse.parse` reads it; parts that are longer than it reads are
     written ``(...)``."""
-    return _written(node, _plain)
+    return _written(node, "plain", {})
 
 
 def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
     """For a page; ``names`` of symbols that are written otherwise."""
-    names = names or {}
-
-    def one(part: Expr, found: _Found) -> tuple[str, int]:
-        return _latex(part, found, names)
-
-    return _written(node, one)
+    return _written(node, "latex", names or {})
 
 
-_Found = Mapping[Expr, tuple[str, int]]
-_Writer = Callable[[Expr, _Found], tuple[str, int]]
-
-#: Characters of a part that is written out: what can be read again. A part that is named often
-#: is written as often: without a bound, 40 parts that double have 10^12 characters.
-LONGEST = 2000
-
-
-def _written(node: Expr, writer: _Writer) -> str:
+def _written(node: Expr, language: str, names: Mapping[str, str]) -> str:
+    """Every part with how tightly it binds, each after what it is made of."""
     found: dict[Expr, tuple[str, int]] = {}
     for part in topological([node]):
-        text, level = writer(part, found)
-        found[part] = (text, level) if len(text) <= LONGEST else ("(...)", _ATOM)
+        if part.op == "const":
+            text, level = number(part.value), ATOM if part.value >= 0 else SIGN
+        elif part.op == "symbol":
+            # in plain text a parameter by its address
+            own = part.value.replace("__", ".") if language == "plain" else _subscript(part.value)
+            text, level = names.get(part.value, own), ATOM
+        else:
+            notation, args = _notation(part, language)
+            level = notation.level
+            text = notation.text.format(
+                *(
+                    found[a][0] if found[a][1] >= least else _BRACKETS[language].format(found[a][0])
+                    for a, least in zip(args, notation.least, strict=True)
+                )
+            )
+        found[part] = (text, level) if len(text) <= LONGEST else ("(...)", ATOM)
     return found[node][0]
 
 
-def _in(text: tuple[str, int], least: int, brackets: str = "plain") -> str:
-    left, right = ("\\left(", "\\right)") if brackets == "latex" else ("(", ")")
-    return text[0] if text[1] >= least else f"{left}{text[0]}{right}"
-
-
-def _plain(part: Expr, found: _Found) -> tuple[str, int]:
-    of = [found[a] for a in part.args]
-    match part.op:
-        case "const":
-            return number(part.value), _ATOM if part.value >= 0 else _SIGN
-        case "symbol":
-            return part.value.replace("__", "."), _ATOM  # a parameter by its address
-        case "add" | "sub":
-            sign = "+" if part.op == "add" else "-"
-            # what is added as a whole stays in brackets, so that it is read as it was written
-            return f"{_in(of[0], _SUM)} {sign} {_in(of[1], _SUM + 1)}", _SUM
-        case "mul":
-            if part.args[0] is part.args[1]:
-                return f"{_in(of[0], _ATOM)}**2", _POWER
-            for i in (1, 0):
-                if part.args[i].op == "recip":
-                    under = part.args[i].args[0]
-                    return (
-                        f"{_in(of[1 - i], _PRODUCT)}/{_in((found[under][0], _level(under)), 4)}",
-                        2,
-                    )
-            return f"{_in(of[0], _PRODUCT)}*{_in(of[1], _PRODUCT + 1)}", _PRODUCT
-        case "neg":
-            return f"-{_in(of[0], _PRODUCT)}", _SIGN
-        case "recip":
-            return f"1/{_in(of[0], 4)}", _PRODUCT
+def _notation(part: Expr, language: str) -> tuple[Notation, tuple[Expr, ...]]:
+    """How an operation is written, and the arguments of that."""
+    if part.op == "mul":
+        a, b = part.args
+        if a is b:
+            return _SQUARE[language], (a,)
+        for over, under in ((a, b), (b, a)):
+            if under.op == "recip":
+                return _QUOTIENT[language], (over, under.args[0])
+    if part.op != "call" and (notation := getattr(OPERATIONS[part.op], language)) is not None:
+        return notation, part.args
     name = part.value if part.op == "call" else part.op
-    return f"{name}({', '.join(text for text, _ in of)})", _ATOM
-
-
-def _level(node: Expr) -> int:
-    if node.op == "mul" and node.args[0] is node.args[1]:
-        return _POWER
-    return {"add": 1, "sub": 1, "mul": 2, "recip": 2, "neg": 3}.get(node.op, _ATOM)
-
-
-def _latex(part: Expr, found: _Found, names: Mapping[str, str]) -> tuple[str, int]:
-    of = [found[a] for a in part.args]
-    match part.op:
-        case "const":
-            return number(part.value), _ATOM if part.value >= 0 else _SIGN
-        case "symbol":
-            return names.get(part.value, _subscript(part.value)), _ATOM
-        case "add" | "sub":
-            sign = "+" if part.op == "add" else "-"
-            right = _in(of[1], _SUM + (part.op == "sub"), "latex")
-            return f"{_in(of[0], _SUM, 'latex')} {sign} {right}", _SUM
-        case "mul":
-            if part.args[0] is part.args[1]:
-                return f"{{{_in(of[0], _ATOM, 'latex')}}}^{{2}}", _POWER
-            for i in (1, 0):
-                if part.args[i].op == "recip":
-                    under = found[part.args[i].args[0]][0]
-                    return f"\\frac{{{of[1 - i][0]}}}{{{under}}}", _ATOM
-            return f"{_in(of[0], _PRODUCT, 'latex')}\\,{_in(of[1], _PRODUCT, 'latex')}", _PRODUCT
-        case "neg":
-            return f"-{_in(of[0], _PRODUCT, 'latex')}", _SIGN
-        case "recip":
-            return f"\\frac{{1}}{{{of[0][0]}}}", _ATOM
-        case "sqrt":
-            return f"\\sqrt{{{of[0][0]}}}", _ATOM
-    name = part.value if part.op == "call" else part.op
-    return f"\\mathrm{{{name}}}\\left({', '.join(text for text, _ in of)}\\right)", _ATOM
+    name = name if language == "plain" else f"\\mathrm{{{{{name}}}}}"
+    fields = ", ".join(f"{{{i}}}" for i in range(len(part.args)))
+    return Notation(name + _BRACKETS[language].format(fields), ATOM, (SUM,) * len(part.args)), (
+        part.args
+    )
 
 
 _GREEK = {"alpha", "beta", "gamma", "kappa", "tau", "phi", "sigma", "lambda", "eta"}

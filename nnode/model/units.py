@@ -15,6 +15,7 @@ from typing import Any
 
 from nnode.errors import ConfigError
 from nnode.model.expression import Expr, topological
+from nnode.model.operations import OPERATIONS
 from nnode.model.text import plain
 
 Dimension = tuple[Fraction, Fraction, Fraction]
@@ -158,32 +159,28 @@ def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Di
             return dimension(units[part.value])
         case "call":
             return None
-        case "add" | "sub" | "max" | "min" | "choose":
-            pairs = list(zip(part.args, of, strict=True))[part.op == "choose" :]
-            return _same(part, pairs)
-        case "mul":
-            if None in of:
-                return None
-            a, b = of
-            assert a is not None
-            assert b is not None
-            total = (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-            if max(map(abs, total)) > _HIGHEST_POWER:
-                raise ConfigError(
-                    f"{plain(part)} has a unit to a power above {_HIGHEST_POWER}; divide by a "
-                    "scale of the same unit first"
-                )
-            return total
-        case "neg":
-            return of[0]
-        case "recip" | "sqrt":
-            factor = Fraction(-1) if part.op == "recip" else Fraction(1, 2)
-            own = of[0]
-            return own and (factor * own[0], factor * own[1], factor * own[2])
-    if of[0] not in (None, NONE):
+    operation = OPERATIONS[part.op]
+    if operation.alike:
+        return _same(part, [(part.args[i], of[i]) for i in operation.alike])
+    known = [one for one in of if one is not None]
+    if operation.powers:
+        if len(known) < len(of):
+            return None
+        powers = [Fraction(power) for power in operation.powers]
+        length, time, mass = (
+            sum((p * one for p, one in zip(powers, axis, strict=True)), Fraction(0))
+            for axis in zip(*known, strict=True)
+        )
+        if max(abs(length), abs(time), abs(mass)) > _HIGHEST_POWER:
+            raise ConfigError(
+                f"{plain(part)} has a unit to a power above {_HIGHEST_POWER}; divide by a "
+                "scale of the same unit first"
+            )
+        return length, time, mass
+    if any(one != NONE for one in known):
         argument = plain(part.args[0])
         raise ConfigError(
-            f"{plain(part)}: the argument {argument} of {part.op} has the unit {shown(of[0])}, "
+            f"{plain(part)}: the argument {argument} of {part.op} has the unit {shown(known[0])}, "
             "expected a number without one; divide by a scale of the same unit"
         )
     return NONE

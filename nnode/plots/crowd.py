@@ -15,7 +15,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from nnode.errors import ConfigError
-from nnode.model import SocialForce, System
+from nnode.model import System
 from nnode.model.extend import beside
 from nnode.plots.interaction import (
     Part,
@@ -144,8 +144,9 @@ def _contours(
     ]
     levels, extend, peak = _levels(np.stack(fields))
     contact = None
-    if isinstance(term, SocialForce):
-        contact = term.r if chosen_part(term, part) == "wall" else 2 * term.r
+    if term.entry == "social_force":
+        radius = float(term.r)  # type: ignore[arg-type]
+        contact = radius if chosen_part(term, part) == "wall" else 2 * radius
     lines = levels[levels > 0][:: max(1, len(levels) // 8)]
     filled: ContourSet | None = None
     for (ax, *_), field in zip(panels, fields, strict=True):

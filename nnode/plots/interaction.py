@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from nnode.errors import ConfigError
-from nnode.model import InteractionForce, SocialForce, System
+from nnode.model import InteractionForce, System
 
 Part = Literal["sum", "pair", "wall"]
 Vector = tuple[float, float]
@@ -70,13 +70,13 @@ def evaluate_force(
 
 def force_range(term: InteractionForce) -> str:
     """``short`` for the social force, ``long`` for others: the paper draws them differently."""
-    return "short" if isinstance(term, SocialForce) else "long"
+    return "short" if term.entry == "social_force" else "long"
 
 
 def chosen_part(term: InteractionForce, part: str | None) -> str:
     """``part``, or the default of ``term``; see :func:`evaluate_force` for both."""
     if part is None:
-        return "pair" if isinstance(term, SocialForce) else "sum"
+        return "pair" if term.entry == "social_force" else "sum"
     if part not in ("sum", "pair", "wall"):
         raise ConfigError(f"part must be sum, pair or wall, got {part!r}")
     if part == "wall" and not term.walls:

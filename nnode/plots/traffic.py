@@ -17,7 +17,7 @@ from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 from nnode.model import System
 from nnode.model.extend import beside
-from nnode.model.formula import Law
+from nnode.model.laws import Law
 from nnode.plots.style import (
     GREY,
     OKABE_ITO,

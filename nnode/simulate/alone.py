@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.model.crowd import NetworkForce
-from nnode.model.crowd_dynamics import CrowdDynamics
-from nnode.model.crowd_formula import CrowdBase, crowd_of, people_of, settings_of, walls_of
-from nnode.model.formula import own_values, rule_of, values_of
+from nnode.model.crowd_formula import CrowdRates, people_of, settings_of, walls_of
+from nnode.model.formula import added_to, crowd_of, rule_of
+from nnode.model.laws import InteractionForce, Law
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State, Term
+from nnode.model.terms import CrowdDynamics, own_values, values_of
 from nnode.simulate.kernels.crowds.alone import FIELDS, WalkSource, compiled
 from nnode.simulate.linear import DenseSolver
 from nnode.simulate.numpy import simulated
@@ -72,10 +72,15 @@ class Surroundings:
         return self._scenes[number]
 
     @cached_property
+    def others(self) -> np.ndarray:
+        """``(H, 4, W, N)`` measured positions and velocities."""
+        return torch.cat([self.x, self.v], -1).permute(0, 3, 1, 2).contiguous().numpy()
+
+    @cached_property
     def tables(self) -> tuple[np.ndarray, ...]:
         """Arguments of the compiled law, see :mod:`nnode.simulate.kernels.crowds.alone`."""
         scene, which, who = self.scene, self.window.numpy(), self.person.numpy()
-        others = np.concatenate([self.x.numpy(), self.v.numpy()], -1).transpose(0, 1, 3, 2)
+        others = self.others.transpose(0, 2, 1, 3)
         meets = scene.agent.numpy()[which].astype(float)
         meets[np.arange(len(who)), who] = 0.0
         place, normal, real = (part.numpy() for part in scene.walls_of_each())
@@ -114,30 +119,41 @@ class PersonAlone:
         self.around = around
         self.number = len(next(iter(parameters.values()))) if parameters else 1
         terms = cast(list[Term], list(system.terms))
-        bases = list(takewhile(lambda term: isinstance(term, CrowdBase), terms))
-        force, law = system.find(NetworkForce), crowd_of(bases)
+        laws = list(takewhile(lambda term: isinstance(term, Law), terms))
+        force, law = system.find(InteractionForce), crowd_of(laws)
         self.compiled = law is not None and not (force is not None and force.self_interaction)
-        self._first = 0
+        effects: list[Term] = []
         if law is not None and self.compiled:
-            self._first, self._kernel = len(bases), compiled(WalkSource(law))
-            values = {name: own.detach() for name, own in own_values(bases, law).items()}
-            rows = [*values_of(law, values | parameters), *settings_of(bases, law).values()]
+            self._kernel = compiled(WalkSource(law))
+            own = {name: value.detach() for name, value in own_values(laws, law).items()}
+            rows = [*values_of(law, own | parameters), *settings_of(laws, law).values()]
             every = [torch.as_tensor(row, dtype=torch.float64).expand(self.number) for row in rows]
             self._law = torch.stack(every, 1).numpy() if every else np.zeros((self.number, 1))
-        added = terms[self._first :]
-        scalar = all(own.ndim == 1 for own in parameters.values())
-        if self.number > 1 and scalar and all(_side_by_side(t) for t in added):
-            windows = len(around.scene.agent)
+            effects = list(takewhile(_is_formula, terms[len(laws) :]))
+        self._runs = [
+            {name: value[r] for name, value in parameters.items()} for r in range(self.number)
+        ]
+        self._effects = [
+            CrowdRates([*laws, *effects], added_to(laws, effects), around.scene, own, numpy=True)
+            for own in (self._runs if effects else ())
+        ]
+        first = len(laws) + len(effects) if self.compiled else 0
+        self._code = range(first, len(terms))
+        self._system, self._parameters = system, parameters
+
+    @cached_property
+    def _systems(self) -> list[System]:
+        """The model with the parameters of all runs, or those of each."""
+        own = self._parameters
+        code = cast(list[Term], [self._system.terms[i] for i in self._code])
+        scalar = all(value.ndim == 1 for value in own.values())
+        if self.number > 1 and scalar and all(term.side_by_side for term in code):
+            windows = len(self.around.scene.agent)
             wide = {
-                name: own.repeat_interleave(windows)[:, None, None]
-                for name, own in parameters.items()
+                name: value.repeat_interleave(windows)[:, None, None] for name, value in own.items()
             }
-            self._systems = [_with_values(system, wide)]
-        else:
-            self._systems = [
-                _with_values(system, {name: own[r] for name, own in parameters.items()})
-                for r in range(self.number)
-            ]
+            return [_with_values(self._system, wide)]
+        return [_with_values(self._system, run) for run in self._runs]
 
     @torch.no_grad()
     def __call__(self, moment: np.ndarray, x: Tensor, v: Tensor) -> Tensor:
@@ -148,18 +164,32 @@ class PersonAlone:
             x, v: ``(L, W, N, 2)`` positions (m) and velocities (m/s).
         """
         rate = self.by_law(moment, x, v)
-        if self._first == len(self._systems[0].terms):
+        if self._effects:
+            self._add_effects(moment, x, v, rate)
+        if not self._code:
             return rate
         size = len(x) // len(self._systems)
         found = []
         for k, system in enumerate(self._systems):
             part = slice(k * size, (k + 1) * size)
             state = self._state(system, moment[part], x[part], v[part], rate[part])
-            for term in cast(list[Term], list(system.terms))[self._first :]:
-                state = replace(state, rate=state.rate + term(state))
+            for place in self._code:
+                assert state.rate is not None
+                state = replace(state, rate=state.rate + system.terms[place](state))
             assert state.rate is not None
             found.append(state.rate.view(rate[part].shape))
         return torch.cat(found)
+
+    def _add_effects(self, moment: np.ndarray, x: Tensor, v: Tensor, rate: Tensor) -> None:
+        """Add the accelerations by effects; one simulation after the other, for arrays that fit
+        the cache."""
+        around, out = self.around, rate.numpy()
+        states = torch.cat([x, v], -1).permute(0, 3, 1, 2).contiguous().numpy()
+        for k, at in enumerate(moment):
+            effects = self._effects[k if self.number > 1 else 0]
+            found = effects(at * around.step / 2, states[k], around.others[at])
+            for axis in range(2):
+                out[k, ..., axis] += found[axis]
 
     def simulated(self, start: Tensor, steps: int) -> Tensor:
         """``(F, R, W, N, 4)`` positions (m) and velocities (m/s) at the steps, from ``start``
@@ -203,9 +233,9 @@ class PersonAlone:
         return State(t, x, v, scene, system, rate=rate, seen=others)
 
 
-def _side_by_side(term: Term) -> bool:
-    """Whether a term takes many simulations at once, each with its own parameters."""
-    return term.side_by_side or (rule_of(term) is not None and not isinstance(term, CrowdBase))
+def _is_formula(term: Term) -> bool:
+    """Whether a term is an effect with a rule."""
+    return rule_of(term) is not None and not isinstance(term, Law)
 
 
 class RunAlone:

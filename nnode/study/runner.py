@@ -14,8 +14,8 @@ import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping
-from contextlib import closing, suppress
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,16 +135,11 @@ def run_tasks(
 
     with InterruptGuard() as guard, progress, closing(outcomes(guard)) as found:
         for key, outcome in found:
-            try:
+            with _kept_or_refused(key, places[key].parent):
                 if outcome.text is None:
                     failed[key] = _failure(outcome, places[key])
                 else:
                     results[key] = _keep(outcome, places[key], identities[key])
-            except OSError as error:
-                raise StudyError(
-                    f"the result of task {key} cannot be kept in {places[key].parent}: "
-                    f"{error.strerror}; make room or choose another folder, and start again"
-                ) from error
             progress.advance(costs[key])
     done = sum(result is not None for result in results.values())
     if guard.requested is not None:
@@ -196,6 +191,18 @@ def _kept(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
 def _canonical(identity: dict[str, Any]) -> str:
     # as text, NaN equals itself
     return json.dumps(identity, sort_keys=True)
+
+
+@contextmanager
+def _kept_or_refused(key: str, folder: Path) -> Iterator[None]:
+    """Report a result that cannot be written as an error of the study."""
+    try:
+        yield
+    except OSError as error:
+        raise StudyError(
+            f"the result of task {key} cannot be kept in {folder}: {error.strerror}; make room or "
+            "choose another folder, and start again"
+        ) from error
 
 
 def _keep(outcome: Outcome, path: Path, identity: dict[str, Any]) -> dict[str, Any]:

@@ -24,8 +24,7 @@ from nnode.data.readers.juelich import read_juelich
 from nnode.data.readers.sumo import read_sumo
 from nnode.data.readers.table import read_table
 from nnode.errors import CheckpointError, ConfigError
-from nnode.model import Linear, Relaxation, SocialForce, Traffic
-from nnode.model.crowd import NetworkForce
+from nnode.model import Traffic, make_law
 from nnode.model.system import Crowd
 from tests.app.conftest import Script
 
@@ -161,10 +160,14 @@ def test_one_clear_error(script: Script, traffic: Path, tmp_path: Path) -> None:
 
 
 def test_which_targets_fit() -> None:
-    force = SocialForce(1.0, 1.0, 1.0)
-    assert targets_of("auto", Traffic([Linear()])) == ["sumo", "fcd", "parquet", "csv"]
+    force = make_law("social_force", A=1.0, k=1.0, kappa=1.0)
+    assert targets_of("auto", Traffic([make_law("lin")])) == ["sumo", "fcd", "parquet", "csv"]
     assert targets_of("auto", Crowd([force])) == ["jupedsim", "pedpy", "parquet", "csv"]
-    assert targets_of("auto", Crowd([Relaxation(), NetworkForce()])) == ["pedpy", "parquet", "csv"]
+    assert targets_of("auto", Crowd([make_law("relaxation"), make_law("network_force")])) == [
+        "pedpy",
+        "parquet",
+        "csv",
+    ]
     assert targets_of(["csv", "pedpy"], Crowd([force])) == ["pedpy", "csv"]
     assert targets_of("sumo", Crowd([force])) == ["sumo"]  # refused later, with the reason
     with pytest.raises(ConfigError, match="to=fcd is not for crowd"):

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 from nnode.model.effects import CATALOGUE
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 
 def test_the_catalogue_is_printed_whole() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import nnode
 from nnode.errors import NotFittedError
-from nnode.model import Linear, Traffic
+from nnode.model import Traffic, make_law
 from tests.app.following import table
 
 pytest.importorskip("sklearn")
@@ -98,7 +98,7 @@ def test_a_clone_has_the_parameters_and_no_fit(sequences: nnode.Sequences) -> No
 
 
 def test_a_module_is_cloned_with_its_values() -> None:
-    own = nnode.Calibrator(Traffic([Linear(v0=21.0, L=4.0)], leader="measured"))
+    own = nnode.Calibrator(Traffic([make_law("lin", v0=21.0, L=4.0)], leader="measured"))
     copied = clone(own)
     assert copied.model is not own.model
     assert float(copied.model.physical()["lin.v0"][0]) == pytest.approx(21.0)

@@ -12,7 +12,7 @@ from scipy.io import loadmat
 from nnode.calibrate.cost import Convention, sequence_costs, squared_error
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import Linear, Traffic
+from nnode.model import Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver, Trajectory
 
 
@@ -100,7 +100,7 @@ def test_cost_of_a_recording(real_data: Path, recording: str) -> None:
             cost += 0.5 * 0.2 * ((x - z[:, k]) ** 2).sum()
         costs.append(cost)
     batches = [collate(items[i : i + 8]) for i in range(0, len(items), 8)]
-    model, solver = Traffic([Linear(v0, length)]), TorchdiffeqSolver("euler", dt=dt)
+    model, solver = Traffic([make_law("lin", v0=v0, L=length)]), TorchdiffeqSolver("euler", dt=dt)
     metrics = evaluate(lambda batch: solver(model, batch), batches)
     assert metrics.sequences == len(items) > 20
     np.testing.assert_allclose(list(metrics.costs.values()), costs, rtol=1e-6)

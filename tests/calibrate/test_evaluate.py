@@ -18,7 +18,7 @@ from nnode.calibrate.evaluate import (
     no_interaction,
 )
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import Crowd, Linear, Relaxation, SocialForce, Traffic
+from nnode.model import Crowd, Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver, Trajectory
 
 
@@ -148,7 +148,7 @@ def steady(n: int, speeds: list[float], samples: int) -> Sequence:
 @pytest.mark.parametrize("leader", ["constant", "measured"])
 def test_constant_velocity_is_exact_on_steady_traffic(leader: str) -> None:
     batch = collate([steady(3, [11.0, 14.0, 12.5], 5), steady(1, [9.0], 3)])
-    metrics = evaluate(constant_velocity(Traffic([Linear()], leader)), [batch])
+    metrics = evaluate(constant_velocity(Traffic([make_law("lin")], leader)), [batch])
     assert metrics.rmse < 1e-12
 
 
@@ -158,14 +158,14 @@ def test_no_interaction_is_exact_where_all_share_a_speed(leader: str) -> None:
     solver = TorchdiffeqSolver("euler", dt=0.02)
     speed = best_common_speed([batch])
     assert speed == pytest.approx(12.5)
-    simulate = no_interaction(Traffic([Linear()], leader), solver, speed)
+    simulate = no_interaction(Traffic([make_law("lin")], leader), solver, speed)
     assert evaluate(simulate, [batch]).rmse < 1e-11
 
 
 def test_no_interaction_lets_everyone_but_a_measured_leader_drive_at_free_speed() -> None:
     item = steady(2, [9.0, 14.0], 4)
     simulate = no_interaction(
-        Traffic([Linear()], "measured"), TorchdiffeqSolver("euler", dt=0.02), 12.0
+        Traffic([make_law("lin")], "measured"), TorchdiffeqSolver("euler", dt=0.02), 12.0
     )
     x = simulate(collate([item])).x[:, 0, :, 0].detach()
     np.testing.assert_allclose(x[:, 0], 7.0 + 12.0 * item.time, rtol=1e-12)
@@ -189,7 +189,9 @@ def walkers() -> Sequence:
 
 
 def touchy() -> Crowd:
-    return Crowd([Relaxation(0.5), SocialForce(1.0, 40.0, 9.0)])
+    return Crowd(
+        [make_law("relaxation", tau=0.5), make_law("social_force", A=1.0, k=40.0, kappa=9.0)]
+    )
 
 
 def test_both_baselines_are_exact_on_people_walking_straight() -> None:
@@ -219,7 +221,7 @@ def test_no_interaction_in_crowds_is_relaxation_alone() -> None:
 
 
 def test_baselines_follow_the_model_s_precision() -> None:
-    model = Traffic([Linear()]).to(torch.float32)
+    model = Traffic([make_law("lin")]).to(torch.float32)
     batch = collate([steady(2, [12.5] * 2, 4)]).to(dtype=torch.float32)
     for simulate in baselines(model, TorchdiffeqSolver("euler", dt=0.02), 12.5).values():
         assert simulate(batch).x.dtype == torch.float64  # positions, whatever the precision
@@ -227,7 +229,7 @@ def test_baselines_follow_the_model_s_precision() -> None:
 
 def test_a_leader_that_follows_its_measured_path_is_left_out() -> None:
     batch = collate([traffic("a", [[0, 10], [5, 16], [9, 21]]), traffic("c", [[0, 8], [4, 12]])])
-    model = Traffic([Linear(20.0, 5.0)], leader="measured")
+    model = Traffic([make_law("lin", v0=20.0, L=5.0)], leader="measured")
 
     def late(given: bool) -> Trajectory:
         x = batch.x.clone()
@@ -248,7 +250,10 @@ def test_a_leader_that_follows_its_measured_path_is_left_out() -> None:
 @pytest.mark.parametrize("leader", ["constant", "measured"])
 def test_errors_of_followers_by_hand(leader: str) -> None:
     batch = collate([steady(3, [12.0, 15.0, 9.0], 8)])
-    model, solver = Traffic([Linear(14.0, 5.0)], leader=leader), TorchdiffeqSolver("euler", dt=0.02)
+    model, solver = (
+        Traffic([make_law("lin", v0=14.0, L=5.0)], leader=leader),
+        TorchdiffeqSolver("euler", dt=0.02),
+    )
     for simulate in (lambda b: solver(model, b), *baselines(model, solver, 12.0).values()):
         away = (simulate(batch).x - batch.x)[1:, 0, :, 0].detach()
         own = away[:, :-1] if leader == "measured" else away
@@ -261,6 +266,6 @@ def test_the_common_speed_is_that_of_vehicles_that_are_simulated() -> None:
     time = 0.5 * np.arange(5)[:, None]
     batch = collate([traffic("a", (time * [8.0, 12.0, 30.0] + [0.0, 50.0, 100.0]).tolist())])
     assert best_common_speed([batch]) == pytest.approx(50 / 3)
-    assert best_common_speed([batch], Traffic([Linear()])) == pytest.approx(50 / 3)
-    led = Traffic([Linear()], leader="measured")
+    assert best_common_speed([batch], Traffic([make_law("lin")])) == pytest.approx(50 / 3)
+    led = Traffic([make_law("lin")], leader="measured")
     assert best_common_speed([batch], led) == pytest.approx(10.0)

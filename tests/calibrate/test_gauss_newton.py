@@ -12,8 +12,8 @@ from nnode.calibrate.gauss_newton.method import TangentCost, alone, pooled, sand
 from nnode.calibrate.optimizers.damped import GaussNewton
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Relaxation, System, build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model import Crowd, System, build_model, make_law
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.simulate.fused.compare import RungeKutta
 
@@ -159,7 +159,7 @@ def test_the_optimiser_goes_on_as_if_it_had_not_stopped(pairs: Batch) -> None:
 
 def test_what_has_no_tangents_is_refused(pairs: Batch) -> None:
     with pytest.raises(ConfigError, match="gauss_newton needs a model of a lane"):
-        TangentCost(Crowd([Relaxation()]), pairs, FusedSolver())
+        TangentCost(Crowd([make_law("relaxation")]), pairs, FusedSolver())
     with pytest.raises(ConfigError, match="needs solver=fused"):
         GaussNewton(model()).attach(TorchdiffeqSolver(), pairs, Convention.gap)
     lin = {"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0, "L": 5.0, "L_min": 2.0}

@@ -21,7 +21,7 @@ from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.model import Linear, Traffic
+from nnode.model import Traffic, make_law
 from nnode.simulate import FusedSolver
 
 #: v0 (m/s) and L (m) that the data are made with.
@@ -62,7 +62,7 @@ def made_with_lin() -> Batch:
     ids=lambda o: getattr(o, "name", ""),
 )
 def test_each_optimiser_calibrates(options: OptimizerOptions, steps: int, share: float) -> None:
-    batch, model = made_with_lin(), Traffic([Linear()])
+    batch, model = made_with_lin(), Traffic([make_law("lin")])
     optimizer = build_optimizer(model, options, seed=1)
 
     def closure() -> Tensor:
@@ -83,7 +83,7 @@ def test_each_optimiser_calibrates(options: OptimizerOptions, steps: int, share:
 
 
 def test_options_reach_the_optimiser() -> None:
-    model = Traffic([Linear()])
+    model = Traffic([make_law("lin")])
     adam = build_optimizer(model, AdamOptions(lr=0.3, beta1=0.7, beta2=0.8, eps=1e-5))
     assert isinstance(adam, torch.optim.Adam)
     group = adam.param_groups[0]
@@ -103,7 +103,7 @@ def test_options_reach_the_optimiser() -> None:
 
 
 def test_the_paper_s_constants_are_the_defaults() -> None:
-    group = build_optimizer(Traffic([Linear()]), AdadeltaOptions()).param_groups[0]
+    group = build_optimizer(Traffic([make_law("lin")]), AdadeltaOptions()).param_groups[0]
     expected = {"lr": 1.0, "rho": 0.95, "eps": 1e-6, "eta1": 1.0, "eta2": 0.55}
     assert {key: group[key] for key in expected} == expected
 
@@ -111,7 +111,7 @@ def test_the_paper_s_constants_are_the_defaults() -> None:
 @pytest.mark.parametrize("options", [AdadeltaOptions(), ConsensusOptions()], ids=lambda o: o.name)
 def test_the_seed_reaches_the_optimiser(options: OptimizerOptions) -> None:
     states = [
-        build_optimizer(Traffic([Linear()]), options, seed=s).state_dict()["generator"]
+        build_optimizer(Traffic([make_law("lin")]), options, seed=s).state_dict()["generator"]
         for s in (4, 4, 5)
     ]
     assert torch.equal(states[0], states[1])
@@ -119,7 +119,7 @@ def test_the_seed_reaches_the_optimiser(options: OptimizerOptions) -> None:
 
 
 def test_consensus_projects_with_the_model() -> None:
-    model = Traffic([Linear(v0=20.0, L=2.0)])
+    model = Traffic([make_law("lin", v0=20.0, L=2.0)])
     optimizer = build_optimizer(model, ConsensusOptions())
     lengths = []
 
@@ -152,4 +152,4 @@ def test_who_compares_costs_of_different_steps(name: str, full: bool) -> None:
 )
 def test_errors_name_the_option(options: OptimizerOptions, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        build_optimizer(Traffic([Linear()]), options)
+        build_optimizer(Traffic([make_law("lin")]), options)

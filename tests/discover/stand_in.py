@@ -31,9 +31,8 @@ from nnode.discover.result import (
     Place,
     Structure,
 )
-from nnode.model import Linear, System
+from nnode.model import System
 from nnode.model.build import add_effects
-from nnode.model.crowd import SocialForce
 from nnode.model.effects import CATALOGUE, Effect, Strength
 from nnode.model.term import Interval, State
 from tests.discover.recorded import ALPHA, PUSH, V0, WIND, ZONE, L
@@ -211,7 +210,7 @@ def drivers() -> Agents:
 def calibrated(system: System) -> System:
     """A copy with parameters that fit the recorded data without the effect."""
     base = deepcopy(system)
-    law, force = base.find(Linear), base.find(SocialForce)
+    law, force = base.find_law("lin"), base.find_law("social_force")
     if law is not None:
         law.v0.fill_(V0)
         law.L.fill_(L)

@@ -20,7 +20,7 @@ from nnode.discover.residuals.fit import evaluated
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.score import traces
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Relaxation, SocialForce, System, Traffic
+from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import build_model
 from nnode.model.crowd import norm, velocity
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
@@ -128,8 +128,8 @@ def lane() -> System:
 
 
 def crowd(*more: Term) -> Crowd:
-    force = SocialForce(walkers.A, 0.0, 0.0, B=walkers.B)
-    return Crowd([Relaxation(walkers.TAU), force, *more])
+    force = make_law("social_force", A=walkers.A, k=0.0, kappa=0.0, B=walkers.B)
+    return Crowd([make_law("relaxation", tau=walkers.TAU), force, *more])
 
 
 @pytest.fixture(scope="module")
@@ -279,4 +279,4 @@ def test_models_that_no_engine_can_simulate_are_refused() -> None:
     with pytest.raises(ConfigError, match="effect speed_zone twice"):
         check_model(Traffic([Optimal(), SpeedZone(), SpeedZone(a=200.0, b=300.0)]))
     with pytest.raises(ConfigError, match="no parameter that is calibrated"):
-        check_model(Crowd([Relaxation(0.5)]))
+        check_model(Crowd([make_law("relaxation", tau=0.5)]))

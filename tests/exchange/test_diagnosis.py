@@ -15,7 +15,7 @@ import pytest
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.exchange.sumo import equilibrium_gap
-from nnode.model import Linear, System
+from nnode.model import Law, System
 from tests.app.conftest import Script, forks, script  # noqa: F401
 from tests.exchange import by_jupedsim, by_sumo
 
@@ -53,8 +53,8 @@ def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]: 
     return report
 
 
-def law(model: System) -> Linear:
-    found = model.find(Linear)
+def law(model: System) -> Law:
+    found = model.find_law("lin")
     assert found is not None
     return found
 

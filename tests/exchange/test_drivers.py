@@ -12,8 +12,8 @@ from torch import Tensor
 from nnode.app.python.inputs import model_options
 from nnode.errors import ConfigError, SimulationError
 from nnode.exchange.drivers import Drivers, Seen, drivable, one_behind_the_other
-from nnode.model import Linear, System, Traffic, build_model
-from nnode.model.traffic import FollowTheLeader
+from nnode.model import System, Traffic, build_model, make_law
+from nnode.model.laws import FollowTheLeader
 
 DT = 0.1
 
@@ -215,4 +215,4 @@ def test_what_cannot_drive_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"leader_length needs longer.*SUMO cannot tell"):
         drivable(model("lin", {"leader_length": {"beta": 0.3}}))
     drivable(model("lin", {"leader_speed": {"weight": 0.5}}, leader="constant"))
-    drivable(Traffic([Linear()]))
+    drivable(Traffic([make_law("lin")]))

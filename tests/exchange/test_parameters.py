@@ -21,29 +21,17 @@ from nnode.exchange.jupedsim import (
     scenes_of,
 )
 from nnode.exchange.sumo import equilibrium_gap, has_type, sumo_type, traffic_of
-from nnode.model import (
-    Crowd,
-    Linear,
-    Logarithmic,
-    NetworkForce,
-    NetworkSpeed,
-    Relaxation,
-    SocialForce,
-    System,
-    Traffic,
-)
+from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import add_effects
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
-from nnode.model.formula_law import law_from
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
 from nnode.model.term import State
 
 SCENES = Scenes(people=12.0, points=50.0, spacing=0.25, speed=1.3)
 
 
 def crowd(**options: object) -> Crowd:
-    force = SocialForce(30.0, 10.0, 5.0, **options)  # type: ignore[arg-type]
-    return Crowd([Relaxation(0.7), force])
+    force = make_law("social_force", A=30.0, k=10.0, kappa=5.0, **options)  # type: ignore[arg-type]
+    return Crowd([make_law("relaxation", tau=0.7), force])
 
 
 def test_social_force_by_jupedsim_s_names() -> None:
@@ -84,7 +72,7 @@ def test_without_walls_nobody_is_pushed_by_them() -> None:
 
 @pytest.mark.parametrize(
     "model",
-    [Crowd([Relaxation(), NetworkForce()]), Traffic([Linear()])],
+    [Crowd([make_law("relaxation"), make_law("network_force")]), Traffic([make_law("lin")])],
 )
 def test_jupedsim_knows_no_other_model(model: System) -> None:
     with pytest.raises(ConfigError, match=r"to=jupedsim: .* no social force"):
@@ -122,7 +110,7 @@ def values(model: System, speed: float = 15.0, length: float | None = 4.2) -> di
 
 
 def test_a_linear_law_as_a_vehicle_type() -> None:
-    found = values(Traffic([Linear(30.0, 7.0)]))
+    found = values(Traffic([make_law("lin", v0=30.0, L=7.0)]))
     assert found["id"] == "lin"
     assert (float(found["length"]), float(found["minGap"])) == (4.2, pytest.approx(2.8))
     assert float(found["maxSpeed"]) == 30
@@ -132,12 +120,12 @@ def test_a_linear_law_as_a_vehicle_type() -> None:
 
 
 def test_a_law_shorter_than_a_car() -> None:
-    found = values(Traffic([Linear(30.0, 3.5)]), length=None)
+    found = values(Traffic([make_law("lin", v0=30.0, L=3.5)]), length=None)
     assert (float(found["length"]), float(found["minGap"])) == (3.5, 0)
 
 
 def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
-    model = Traffic([Logarithmic(10.0, 6.0)])
+    model = Traffic([make_law("log", v0=10.0, L=6.0)])
     assert "maxSpeed" not in values(model)
     assert any("v0 = 10" in line for line in sumo_type(model, "log", 15.0, None).missing)
     assert float(values(model)["tau"]) == pytest.approx(6 * (np.exp(1.5) - 1) / 15, rel=1e-5)
@@ -211,7 +199,7 @@ def test_laws_of_people_that_jupedsim_has() -> None:
 
 
 def test_effects_with_a_counterpart() -> None:
-    model = Traffic([Linear(30.0, 7.0)])
+    model = Traffic([make_law("lin", v0=30.0, L=7.0)])
     chosen = [
         {"name": "reaction_delay", "T": 0.8},
         {"name": "free_flow_speed", "v_max": 25.0},
@@ -230,14 +218,14 @@ def test_effects_with_a_counterpart() -> None:
 
 @pytest.mark.parametrize("speed", [0.0, 30.0, 35.0])
 def test_no_gap_at_the_recorded_speed(speed: float) -> None:
-    model = Traffic([Linear(30.0, 7.0)])
+    model = Traffic([make_law("lin", v0=30.0, L=7.0)])
     assert "tau" not in values(model, speed)
     assert any(t.startswith("tau") for t in sumo_type(model, "lin", speed, None).missing)
 
 
 @pytest.mark.parametrize(
     "model",
-    [crowd(), Traffic([NetworkSpeed(4)])],
+    [crowd(), Traffic([make_law("network_speed", hidden=4)])],
 )
 def test_sumo_knows_no_other_model(model: System) -> None:
     with pytest.raises(ConfigError, match=r"to=sumo: .* nor a law with a gap at rest.*drive\.py"):
@@ -249,7 +237,7 @@ def test_sumo_knows_no_other_model(model: System) -> None:
 def test_at_its_equilibrium_gap_a_law_drives_at_that_speed(
     v0: float, L: float, share: float, log: bool
 ) -> None:
-    law = Logarithmic(v0, L) if log else Linear(v0, L)
+    law = make_law("log", v0=v0, L=L) if log else make_law("lin", v0=v0, L=L)
     speed = share * v0
     gap = torch.tensor(equilibrium_gap(law, speed), dtype=torch.float64)
     assert float(law.speed(gap).detach()) == pytest.approx(speed, rel=1e-9)
@@ -257,9 +245,9 @@ def test_at_its_equilibrium_gap_a_law_drives_at_that_speed(
 
 @pytest.mark.parametrize("h", [-0.1, 0.3])
 def test_the_time_gap_s_equilibrium_is_the_model_s(h: float) -> None:
-    model = Traffic([Linear(30.0, 7.0)])
+    model = Traffic([make_law("lin", v0=30.0, L=7.0)])
     add_effects(model, [{"name": "time_gap", "h": h}])
-    law = model.find(Linear)
+    law = model.find_law("lin")
     assert law is not None
     gap = equilibrium_gap(law, 12.0, h)
     lead = equilibrium_gap(law, 12.0, h)

@@ -21,7 +21,7 @@ from nnode.data.store import Store
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import equilibrium_gap, sumo_type
 from nnode.exchange.trajectories import write_pedpy
-from nnode.model import Crowd, Linear, Relaxation, SocialForce, Traffic
+from nnode.model import Crowd, Traffic, make_law
 from nnode.model.term import State
 from tests.app.conftest import Script, forks, script  # noqa: F401
 from tests.exchange.by_sumo import call
@@ -156,13 +156,18 @@ def forces(model: Crowd, x: np.ndarray, v: np.ndarray, walls: np.ndarray | None)
     )  # fmt: skip
     batch = collate([s])
     state = State(torch.tensor(0.0), batch.x[0], batch.v[0], model.scene(batch))
-    force = model.find(SocialForce)
+    force = model.find_law("social_force")
     assert force is not None
     return force(state)[0].detach().numpy()
 
 
 def test_people_push_each_other_alike_in_jupedsim(jupedsim: ModuleType) -> None:
-    model = Crowd([Relaxation(0.5), SocialForce(20.0, 30.0, 40.0, B=0.3, mass=1.5)])
+    model = Crowd(
+        [
+            make_law("relaxation", tau=0.5),
+            make_law("social_force", A=20.0, k=30.0, kappa=40.0, B=0.3, mass=1.5),
+        ]
+    )
     # the middle pair touches, all are near each other and far from walls
     x = np.array([[5.0, 2.0], [5.4, 2.1], [5.5, 1.4], [4.6, 2.5]])
     v = np.array([[1.0, 0.2], [-0.8, 0.1], [0.3, 0.9], [0.0, -1.0]])
@@ -175,7 +180,13 @@ def test_people_push_each_other_alike_in_jupedsim(jupedsim: ModuleType) -> None:
 
 
 def test_a_wall_pushes_alike_who_touches_it(jupedsim: ModuleType) -> None:
-    model = Crowd([Relaxation(0.5), SocialForce(20.0, 0.0, 0.0, B=0.2)], wall_spacing=0.02)
+    model = Crowd(
+        [
+            make_law("relaxation", tau=0.5),
+            make_law("social_force", A=20.0, k=0.0, kappa=0.0, B=0.2),
+        ],
+        wall_spacing=0.02,
+    )
     walls = np.hstack([ROOM, np.roll(ROOM, -1, axis=0)]).astype(float)
     x, v = np.array([[6.0, 0.25]]), np.zeros((1, 2))
     s = Sequence(name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x]), walls=walls)
@@ -261,8 +272,8 @@ def test_a_platoon_by_sumo_calibrates(
 
 
 def test_sumo_s_drivers_keep_the_law_s_gap(sumo: Path, road: Path, tmp_path: Path) -> None:
-    model, speed = Traffic([Linear(25.0, 6.5)]), 12.0
-    law = model.find(Linear)
+    model, speed = Traffic([make_law("lin", v0=25.0, L=6.5)]), 12.0
+    law = model.find_law("lin")
     assert law is not None
     root = ElementTree.fromstring(sumo_type(model, "own", speed, 4.0).text)
     ElementTree.SubElement(root, "vType", id="lead", length="4", maxSpeed="12", speedDev="0")

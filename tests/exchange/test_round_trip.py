@@ -23,10 +23,8 @@ from nnode.data.readers.sumo import read_sumo
 from nnode.data.sequence import Sequence, collate
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import SAME, sumo_type
-from nnode.model import Crowd, Relaxation, SocialForce, System, Traffic
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
-from nnode.model.formula_law import law_from
+from nnode.model import Crowd, System, Traffic, make_law
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
 from nnode.simulate import FusedSolver
 from tests.exchange.test_recovery import recovered
 
@@ -124,8 +122,12 @@ def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
         agent_scale=160.0, force_distance=0.3, radius=0.3,
     )  # fmt: skip
     first = people(jupedsim, tmp_path / "a", typed, dt=dt)
-    force = SocialForce(24.0, 0.0, 0.0, r=0.3, B=0.3)  # 8 people: 16 is what was typed in
-    system = Crowd([Relaxation(0.5, preferred=True), force], desired="exit").double()
+    force = make_law(
+        "social_force", A=24.0, k=0.0, kappa=0.0, r=0.3, B=0.3
+    )  # 8 people: 16 is what was typed in
+    system = Crowd(
+        [make_law("relaxation", tau=0.5, preferred=True), force], desired="exit"
+    ).double()
     for name in ("k", "kappa"):
         getattr(force, name).requires_grad_(False)
     parts = [part for whole in first for part in by_jupedsim.pieces(whole, seconds=1.0)]

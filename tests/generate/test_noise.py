@@ -17,8 +17,8 @@ from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
 from nnode.generate.scores import band
 from nnode.model import Traffic, build_model
+from nnode.model.laws import make_law
 from nnode.model.term import State, Term
-from nnode.model.traffic import Linear
 from nnode.simulate import TorchdiffeqSolver
 from tests.app.following import TRUE, platoon
 from tests.simulate.fused.compare import RungeKutta
@@ -86,8 +86,8 @@ class Nothing(Term):
 
 def test_a_model_that_is_code_is_sampled_as_its_formula() -> None:
     batch, noise = platoons(3, 10.0), Noise(0.5, 2.0, 0.0, 0.1)
-    by_formula = Traffic([Linear(25.0, 6.0, 0.0)], "measured")
-    by_code = Traffic([Linear(25.0, 6.0, 0.0), Nothing()], "measured")
+    by_formula = Traffic([make_law("lin", v0=25.0, L=6.0, L_min=0.0)], "measured")
+    by_code = Traffic([make_law("lin", v0=25.0, L=6.0, L_min=0.0), Nothing()], "measured")
     assert by_code.lane is None
     assert takes_drivers(by_code, batch)
     one, two = (sample(m, batch, noise, 3, seed=0, dt=0.05).x for m in (by_formula, by_code))

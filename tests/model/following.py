@@ -12,7 +12,7 @@ import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Traffic, build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 
 DT = 0.1
 

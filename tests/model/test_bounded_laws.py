@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 
 from nnode.errors import ConfigError, NNodeError
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.formula_law import FormulaLaw, law_from
 from nnode.model.lane_dynamics import REMEMBERED
+from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.model.names import ENTRIES
 from nnode.model.network import NEURONS, FeedForward
 from nnode.model.parse import OPERATIONS
@@ -49,8 +48,7 @@ def chain(number: int, step: str, first: str = "1 + L/gap") -> dict[str, Any]:
 def test_parts_that_double_are_built(step: str) -> None:
     with soon():
         law = law_from("mine", chain(ENTRIES - 2, step))
-        assert isinstance(law, FormulaLaw)
-        rate = law.lane("mine").rates["x"]
+        rate = law.dynamics().rates["x"]
         for text in (plain(rate), latex(rate)):  # written out: 2**98 characters
             assert len(text) < 4 * LONGEST
             assert "(...)" in text

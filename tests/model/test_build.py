@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 
 from nnode.errors import ConfigError
-from nnode.model import Crowd, NetworkForce, System, Traffic, build_model
+from nnode.model import Crowd, System, Traffic, build_model
 from nnode.model.options import (
     LawOptions,
     NetworkForceOptions,
@@ -60,10 +60,10 @@ def test_two_networks_of_30_weights_move_the_crowd() -> None:
 
 def test_people_act_on_themselves_where_the_options_say_so() -> None:
     chosen = options(NetworkForceOptions, "network_force")
-    printed = build_model({**chosen, "self_interaction": True}).find(NetworkForce)
+    printed = build_model({**chosen, "self_interaction": True}).find_law("network_force")
     # checkpoints of earlier versions have no such option
     chosen.pop("self_interaction")
-    earlier = build_model(chosen).find(NetworkForce)
+    earlier = build_model(chosen).find_law("network_force")
     assert printed is not None
     assert earlier is not None
     assert (printed.self_interaction, earlier.self_interaction) == (True, False)

@@ -9,17 +9,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from nnode.data.sequence import Sequence, collate
-from nnode.model import (
-    Linear,
-    Logarithmic,
-    NetworkForce,
-    NetworkSpeed,
-    Relaxation,
-    Scene,
-    SocialForce,
-    State,
-    Term,
-)
+from nnode.model import Scene, State, Term, make_law
 
 #: Distances of two people: overlapping, barely touching, barely apart, out of reach (2 r = 0.5 m).
 DISTANCES = [0.2, 0.499, 0.501, 2.0]
@@ -46,7 +36,9 @@ def seed(number: int) -> torch.Generator:
 
 
 @pytest.mark.parametrize(
-    "term", [Linear(), Logarithmic(), NetworkSpeed(4, generator=seed(0))], ids=lambda t: t.name
+    "term",
+    [make_law("lin"), make_law("log"), make_law("network_speed", hidden=4, generator=seed(0))],
+    ids=lambda t: t.name,
 )
 def test_traffic(term: Term) -> None:
     items = [
@@ -60,10 +52,10 @@ def test_traffic(term: Term) -> None:
 @pytest.mark.parametrize(
     "term",
     [
-        Relaxation(0.5),
-        SocialForce(2.0, 30.0, 9.0, B=0.1),
-        SocialForce(2.0, 30.0, 9.0, B=0.1, opposing_wall_friction=True),
-        NetworkForce(4, generator=seed(1)),
+        make_law("relaxation", tau=0.5),
+        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1),
+        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1, opposing_wall_friction=True),
+        make_law("network_force", hidden=4, generator=seed(1)),
     ],
     ids=["relaxation", "social_force", "social_force_opposing", "network_force"],
 )
@@ -85,7 +77,11 @@ def test_crowd(term: Term, distance: float) -> None:
     check(term, batch.x[0], batch.v[0], Scene.of(batch, 1.0))
 
 
-@pytest.mark.parametrize("term", [SocialForce(2.0, 30.0, 9.0), Relaxation()], ids=lambda t: t.name)
+@pytest.mark.parametrize(
+    "term",
+    [make_law("social_force", A=2.0, k=30.0, kappa=9.0), make_law("relaxation")],
+    ids=lambda t: t.name,
+)
 def test_people_at_one_place_and_at_rest_have_a_finite_gradient(term: Term) -> None:
     x = np.zeros((2, 2, 2))
     item = Sequence(name="a", recording="r", time=np.arange(2.0), x=x, destination=x[0])

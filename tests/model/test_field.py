@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nnode.data.sequence import collate
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.model.following import (
     DT,

@@ -9,16 +9,7 @@ import pytest
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import (
-    Crowd,
-    InteractionForce,
-    NetworkForce,
-    Relaxation,
-    Scene,
-    SocialForce,
-    State,
-    Term,
-)
+from nnode.model import Crowd, InteractionForce, Scene, State, Term, make_law
 from nnode.model.effects.crowd_force import FieldOfView
 
 A, K, KAPPA, R, B, MASS = 3.0, 40.0, 9.0, 0.25, 0.1, 70.0
@@ -77,7 +68,7 @@ def social_force_loop(item: Sequence, wall_sign: float) -> np.ndarray:
     return total
 
 
-def network_loop(term: NetworkForce, item: Sequence, oneself: bool = False) -> np.ndarray:
+def network_loop(term: InteractionForce, item: Sequence, oneself: bool = False) -> np.ndarray:
     def evaluate(network: torch.nn.Module, inputs: list[float]) -> np.ndarray:
         (w1, w2), (b1, b2) = (
             [getattr(layer, name).detach().numpy() for layer in network.layers]
@@ -103,7 +94,9 @@ CROWDS = [people(5, 1), people(3, 2), people(1, 3), people(4, 4, walls=None)]
 
 @pytest.mark.parametrize(("opposing", "sign"), [(False, 1.0), (True, -1.0)])
 def test_social_force(opposing: bool, sign: float) -> None:
-    term = SocialForce(A, K, KAPPA, r=R, B=B, mass=MASS, opposing_wall_friction=opposing)
+    term = make_law(
+        "social_force", A=A, k=K, kappa=KAPPA, r=R, B=B, mass=MASS, opposing_wall_friction=opposing
+    )
     found = accelerations(term, collate(CROWDS))
     for b, item in enumerate(CROWDS):
         expected = social_force_loop(item, sign)
@@ -121,7 +114,7 @@ def test_the_samples_contain_contacts_with_people_and_walls() -> None:
 @pytest.mark.parametrize("oneself", [False, True])
 def test_network_force(oneself: bool) -> None:
     draw = torch.Generator().manual_seed(2)
-    term = NetworkForce(4, mass=MASS, self_interaction=oneself, generator=draw)
+    term = make_law("network_force", hidden=4, mass=MASS, self_interaction=oneself, generator=draw)
     found = accelerations(term, collate(CROWDS))
     for b, item in enumerate(CROWDS):
         expected = network_loop(term, item, oneself)
@@ -135,7 +128,9 @@ def test_the_push_of_oneself_does_not_depend_on_where_others_are_seen() -> None:
     found = []
     for oneself in (False, True):
         draw = torch.Generator().manual_seed(2)
-        term = NetworkForce(4, mass=MASS, self_interaction=oneself, generator=draw)
+        term = make_law(
+            "network_force", hidden=4, mass=MASS, self_interaction=oneself, generator=draw
+        )
         found.append(term(state))
     at_nought = term.pair(torch.zeros_like(x[0, 0].repeat(2))) / MASS
     for b, item in enumerate(CROWDS):
@@ -149,7 +144,7 @@ def test_effects_change_no_force_of_a_person_on_himself() -> None:
     changes = []
     for oneself in (False, True):
         draw = torch.Generator().manual_seed(2)
-        force = NetworkForce(4, self_interaction=oneself, generator=draw)
+        force = make_law("network_force", hidden=4, self_interaction=oneself, generator=draw)
         terms = [force, FieldOfView(lambda_=0.2)]
         state = State(torch.zeros(()), batch.x[0], batch.v[0], scene, system=Crowd(terms))
         changes.append(terms[1](state))
@@ -158,7 +153,7 @@ def test_effects_change_no_force_of_a_person_on_himself() -> None:
 
 def test_relaxation() -> None:
     tau = 0.4
-    found = accelerations(Relaxation(tau), collate(CROWDS))
+    found = accelerations(make_law("relaxation", tau=tau), collate(CROWDS))
     for b, item in enumerate(CROWDS):
         for i in range(item.n_agents):
             way = item.destination[i] - item.x[0, i]
@@ -168,7 +163,7 @@ def test_relaxation() -> None:
 
 
 def test_walls_can_be_left_out() -> None:
-    term = SocialForce(A, K, KAPPA, r=R, B=B, mass=MASS, walls=False)
+    term = make_law("social_force", A=A, k=K, kappa=KAPPA, r=R, B=B, mass=MASS, walls=False)
     item = people(4, 4)
     bare = people(4, 4, walls=None)
     np.testing.assert_allclose(
@@ -176,7 +171,13 @@ def test_walls_can_be_left_out() -> None:
     )
 
 
-@pytest.mark.parametrize("make", [lambda: SocialForce(A, K, KAPPA), lambda: NetworkForce(4)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: make_law("social_force", A=A, k=K, kappa=KAPPA),
+        lambda: make_law("network_force", hidden=4),
+    ],
+)
 def test_components_add_up_to_the_term(make) -> None:  # type: ignore[no-untyped-def]
     term: InteractionForce = make()
     batch = collate(CROWDS)
@@ -190,7 +191,7 @@ def test_components_add_up_to_the_term(make) -> None:  # type: ignore[no-untyped
 
 def test_a_crowd_is_relaxation_plus_interaction_of_second_order() -> None:
     batch = collate(CROWDS[:1])
-    terms = [Relaxation(0.5), SocialForce(A, K, KAPPA)]
+    terms = [make_law("relaxation", tau=0.5), make_law("social_force", A=A, k=K, kappa=KAPPA)]
     model = Crowd(terms, SPACING)
     y = model.initial(batch)
     rate = model(torch.zeros(()), y, model.scene(batch)).detach()
@@ -213,7 +214,7 @@ PRINTED = [
 
 @pytest.mark.parametrize(("blue", "red", "v_blue", "v_red", "force"), PRINTED)
 def test_the_six_printed_settings(blue, red, v_blue, v_red, force) -> None:  # type: ignore[no-untyped-def]
-    term = SocialForce(0.0044, 34.9539, 9.8894)
+    term = make_law("social_force", A=0.0044, k=34.9539, kappa=9.8894)
     x, y, v, w = (torch.tensor(p, dtype=torch.float64) for p in (blue, red, v_blue, v_red))
     on_blue, on_red = term.pair_force(x - y, v - w), term.pair_force(y - x, w - v)
     np.testing.assert_allclose(on_blue.detach(), force, atol=1e-4)
@@ -221,13 +222,13 @@ def test_the_six_printed_settings(blue, red, v_blue, v_red, force) -> None:  # t
 
 
 def test_parameters_are_kept_non_negative() -> None:
-    term = SocialForce(-1.0, 2.0, -1e-9)
+    term = make_law("social_force", A=-1.0, k=2.0, kappa=-1e-9)
     term.project_()
     assert [term.A.item(), term.k.item(), term.kappa.item()] == [0.0, 2.0, 0.0]
 
 
 def test_box_bounds_both_networks() -> None:
-    term = NetworkForce(4, box=0.5, generator=torch.Generator().manual_seed(0))
+    term = make_law("network_force", hidden=4, box=0.5, generator=torch.Generator().manual_seed(0))
     before = [p.detach().clone() for p in term.parameters()]
     term.project_()
     for p, old in zip(term.parameters(), before, strict=True):
@@ -238,11 +239,11 @@ def test_box_bounds_both_networks() -> None:
 @pytest.mark.parametrize(
     ("make", "name"),
     [
-        (lambda: Relaxation(0.0), "tau"),
-        (lambda: SocialForce(1, 1, 1, r=-0.1), "r"),
-        (lambda: SocialForce(1, 1, 1, B=0.0), "B"),
-        (lambda: NetworkForce(mass=0.0), "mass"),
-        (lambda: Crowd([Relaxation()], wall_spacing=0.0), "wall_spacing"),
+        (lambda: make_law("relaxation", tau=0.0), "tau"),
+        (lambda: make_law("social_force", A=1, k=1, kappa=1, r=-0.1), "r"),
+        (lambda: make_law("social_force", A=1, k=1, kappa=1, B=0.0), "B"),
+        (lambda: make_law("network_force", mass=0.0), "mass"),
+        (lambda: Crowd([make_law("relaxation")], wall_spacing=0.0), "wall_spacing"),
     ],
 )
 def test_impossible_values_are_refused(make, name: str) -> None:  # type: ignore[no-untyped-def]
@@ -253,4 +254,4 @@ def test_impossible_values_are_refused(make, name: str) -> None:  # type: ignore
 def test_a_crowd_needs_velocities() -> None:
     batch = collate(CROWDS[:1])
     with pytest.raises(ValueError, match="velocities"):
-        Relaxation()(State(torch.zeros(()), batch.x[0], None, Scene.of(batch)))
+        make_law("relaxation")(State(torch.zeros(()), batch.x[0], None, Scene.of(batch)))

@@ -10,15 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Sequence, collate
-from nnode.model import (
-    FollowTheLeader,
-    Linear,
-    Logarithmic,
-    NetworkSpeed,
-    Scene,
-    State,
-    Traffic,
-)
+from nnode.model import Law, Scene, State, Traffic, make_law
 
 GAPS = [2.5, 5.0, 7.3, 18.0, 60.0]
 
@@ -29,7 +21,7 @@ def platoon(name: str, positions: list[float], samples: int = 2) -> Sequence:
     return Sequence(name=name, recording="r", time=0.2 * np.arange(samples), x=x)
 
 
-def rates(term: FollowTheLeader, *platoons: list[float]) -> Tensor:
+def rates(term: Law, *platoons: list[float]) -> Tensor:
     batch = collate([platoon(str(i), p) for i, p in enumerate(platoons)])
     scene = Scene.of(batch)
     return term(State(torch.zeros(()), batch.x[0], None, scene))[..., 0].detach()
@@ -37,19 +29,19 @@ def rates(term: FollowTheLeader, *platoons: list[float]) -> Tensor:
 
 @pytest.mark.parametrize("gap", GAPS)
 def test_lin(gap: float) -> None:
-    speed = Linear(v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
+    speed = make_law("lin", v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
     assert speed.item() == pytest.approx(27.0 * (1 - 4.0 / gap), rel=1e-14)
 
 
 @pytest.mark.parametrize("gap", GAPS)
 def test_log(gap: float) -> None:
-    speed = Logarithmic(v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
+    speed = make_law("log", v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
     assert speed.item() == pytest.approx(27.0 * math.log(gap / 4.0), rel=1e-14)
 
 
 @pytest.mark.parametrize("gap", [0.0, -3.0, -1e6])
 def test_log_and_its_gradient_are_finite_without_a_gap(gap: float) -> None:
-    term = Logarithmic()
+    term = make_law("log")
     at = torch.tensor(gap, dtype=torch.float64, requires_grad=True)
     speed = term.speed(at)
     gradients = torch.autograd.grad(speed, [at, *term.parameters()])
@@ -59,7 +51,7 @@ def test_log_and_its_gradient_are_finite_without_a_gap(gap: float) -> None:
 
 
 def test_network_speed_is_its_network_of_the_gap() -> None:
-    term = NetworkSpeed(hidden=2, generator=torch.Generator().manual_seed(1))
+    term = make_law("network_speed", hidden=2, generator=torch.Generator().manual_seed(1))
     (w1, w2), (b1, b2) = (
         [getattr(layer, name).detach().numpy() for layer in term.network.layers]
         for name in ("weight", "bias")
@@ -73,43 +65,45 @@ def test_network_speed_is_its_network_of_the_gap() -> None:
 
 
 def test_each_vehicle_looks_at_the_next_and_the_last_drives_at_v0() -> None:
-    found = rates(Linear(v0=20.0, L=4.0), [0.0, 8.0, 28.0, 30.0], [5.0, 15.0])
+    found = rates(make_law("lin", v0=20.0, L=4.0), [0.0, 8.0, 28.0, 30.0], [5.0, 15.0])
     expected = [20 * (1 - 4 / 8), 20 * (1 - 4 / 20), 20 * (1 - 4 / 2), 20.0]
     np.testing.assert_allclose(found[0], expected, rtol=1e-14)
     np.testing.assert_allclose(found[1], [20 * (1 - 4 / 10), 20.0, 0.0, 0.0], rtol=1e-14)
 
 
 def test_a_vehicle_alone_drives_at_v0() -> None:
-    np.testing.assert_allclose(rates(Logarithmic(v0=17.0), [3.0]), [[17.0]])
+    np.testing.assert_allclose(rates(make_law("log", v0=17.0), [3.0]), [[17.0]])
 
 
 def test_a_measured_leader_is_not_driven_by_the_law() -> None:
     batch = collate([platoon("a", [0.0, 8.0])])
-    model = Traffic([Linear(v0=20.0, L=4.0)], leader="measured")
+    model = Traffic([make_law("lin", v0=20.0, L=4.0)], leader="measured")
     rate = model(torch.zeros(()), batch.x[0], model.scene(batch))
     np.testing.assert_allclose(rate[0, :, 0].detach(), [10.0, 0.0])
 
 
 def test_terms_add_up() -> None:
     batch = collate([platoon("a", [0.0, 8.0])])
-    model = Traffic([Linear(v0=20.0, L=4.0), Linear(v0=3.0, L=2.0)])
+    model = Traffic([make_law("lin", v0=20.0, L=4.0), make_law("lin", v0=3.0, L=2.0)])
     rate = model(torch.zeros(()), batch.x[0], model.scene(batch))
     np.testing.assert_allclose(rate[0, :, 0].detach(), [10.0 + 2.25, 23.0])
 
 
-@pytest.mark.parametrize("law", [Linear, Logarithmic])
-def test_length_is_projected_onto_its_bound(law: type[Linear]) -> None:
-    term = law(v0=-3.0, L=0.5, L_min=2.0)
+@pytest.mark.parametrize("law", ["lin", "log"])
+def test_length_is_projected_onto_its_bound(law: str) -> None:
+    term = make_law(law, v0=-3.0, L=0.5, L_min=2.0)
     term.project_()
     assert term.L.item() == 2.0
     assert term.v0.item() == -3.0
-    far = law(L=7.25, L_min=2.0)
+    far = make_law(law, L=7.25, L_min=2.0)
     far.project_()
     assert far.L.item() == 7.25
 
 
 def test_box_bounds_the_weights_and_nothing_else() -> None:
-    term = NetworkSpeed(hidden=4, v0=30.0, box=0.25, generator=torch.Generator().manual_seed(0))
+    term = make_law(
+        "network_speed", hidden=4, v0=30.0, box=0.25, generator=torch.Generator().manual_seed(0)
+    )
     before = {name: p.detach().clone() for name, p in term.named_parameters()}
     term.project_()
     for name, p in term.named_parameters():
@@ -119,7 +113,7 @@ def test_box_bounds_the_weights_and_nothing_else() -> None:
 
 
 def test_without_a_box_weights_stay() -> None:
-    term = NetworkSpeed(hidden=4)
+    term = make_law("network_speed", hidden=4)
     with torch.no_grad():
         term.network.layers[0].weight.fill_(1e3)
     term.project_()
@@ -128,4 +122,4 @@ def test_without_a_box_weights_stay() -> None:
 
 def test_unknown_leader_is_refused() -> None:
     with pytest.raises(ValueError, match="leader=first"):
-        Traffic([Linear()], leader="first")
+        Traffic([make_law("lin")], leader="first")

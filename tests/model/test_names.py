@@ -9,16 +9,19 @@ import torch
 
 from nnode.errors import ConfigError
 from nnode.model.crowd_dynamics import CrowdRule
-from nnode.model.crowd_formula import formula_of
 from nnode.model.effects import CATALOGUE
 from nnode.model.expression import symbol
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
-from nnode.model.formula_law import FormulaForce, FormulaLaw, law_from
 from nnode.model.lane_dynamics import Rule
+from nnode.model.laws import (
+    CAR_FOLLOWING_LAWS,
+    NEURONS,
+    PEDESTRIAN_LAWS,
+    Law,
+    law_from,
+    make_law,
+)
 from nnode.model.names import check_names, check_symbols
 from nnode.model.term import Term
-from nnode.model.traffic import Linear
 from nnode.simulate.kernels.crowds.alone import WalkSource
 from nnode.simulate.kernels.crowds.source import CrowdSource
 from nnode.simulate.kernels.lanes.source import LaneSource
@@ -99,13 +102,13 @@ def test_nor_has_an_effect() -> None:
 
     from nnode.model.system import Traffic
 
-    model = Traffic([Linear(), Wrong(kappa=0.3)])
+    model = Traffic([make_law("lin"), Wrong(kappa=0.3)])
     with pytest.raises(ConfigError, match=r"^terms: "):
         model.lane  # noqa: B018
 
 
 def test_all_names_of_the_package_are_such_names() -> None:
-    laws: list[FormulaLaw | FormulaForce] = [
+    laws: list[Law] = [
         *(
             law_from(name, law, network=NEURONS.get(name))
             for name, law in CAR_FOLLOWING_LAWS.items()
@@ -117,10 +120,10 @@ def test_all_names_of_the_package_are_such_names() -> None:
         check_names(type(term).__name__, [term.name])
         check_names(type(term).__name__, term.scalars, in_code=True)
     for law in laws:
-        if isinstance(law, FormulaLaw):
-            LaneSource(law.lane(law.name).flat()).text()
+        if law.domain == "traffic":
+            LaneSource(law.dynamics().flat()).text()
         else:
-            CrowdSource(formula_of(law)).text()
+            CrowdSource(law.dynamics()).text()
 
 
 @pytest.mark.parametrize("name", ["x__d0", "mine__v0", "D_mine__v0__d1_1", "who_mine__a", "G_a__b"])
@@ -137,15 +140,13 @@ def test_generated_source_takes_no_other_name(name: str) -> None:
 def test_each_generator_checks_the_names_itself() -> None:
     """Also where a formula did not come by way of a law."""
     law = law_from("mine", LAW)
-    assert isinstance(law, FormulaLaw)
-    lane, bad = law.lane("mine").flat(), symbol(f"a: {CODE}")
+    lane, bad = law.dynamics().flat(), symbol(f"a: {CODE}")
     lane.rates["v"] = lane.rates["v"] + bad
     with pytest.raises(ConfigError, match="no source is generated"):
         LaneSource(lane).text()
     force = law_from("mine", PERSON)
-    assert isinstance(force, FormulaForce)
     for source in (CrowdSource, WalkSource):
-        crowd = formula_of(force)
+        crowd = force.dynamics()
         object.__setattr__(crowd, "sums", {**crowd.sums, "walls": {bad.value: crowd.rate[0]}})
         with pytest.raises(ConfigError, match="no source is generated"):
             source(crowd).text()
@@ -154,7 +155,6 @@ def test_each_generator_checks_the_names_itself() -> None:
 def test_numbers_too_large_for_floats_stay_operations() -> None:
     """``inf`` would be a name in generated source."""
     law = law_from("mine", {**LAW, "rate": {"v": "(v0 - v)/T*min(1e308*10, 1)"}})
-    assert isinstance(law, FormulaLaw)
-    assert "inf" not in LaneSource(law.lane("mine").flat()).text()
+    assert "inf" not in LaneSource(law.dynamics().flat()).text()
     gap = torch.tensor([10.0], dtype=torch.float64)
     assert law.speed(gap).item() == pytest.approx(30.0)

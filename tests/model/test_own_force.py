@@ -9,7 +9,7 @@ import torch
 
 from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Relaxation, build_model
+from nnode.model import Crowd, build_model, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.model.test_forces import people
@@ -35,7 +35,7 @@ def own(**changes: Any) -> Crowd:
 def same() -> Crowd:
     """The same of terms of the package."""
     more = CATALOGUE.effects["pair_repulsion"](A_2=2.0, B_2=0.4)
-    return Crowd([Relaxation(0.7), more])
+    return Crowd([make_law("relaxation", tau=0.7), more])
 
 
 def rates(model: Crowd, batch: Batch) -> torch.Tensor:
@@ -88,12 +88,12 @@ def test_what_is_wrong_is_told(changes: dict[str, Any], message: str) -> None:
 def test_without_interaction_it_is_its_drive() -> None:
     batch, model = collate([people(5, 1), people(3, 2)]), own()
     bare = Crowd([model.terms[0].alone()])  # type: ignore[union-attr, operator]
-    wanted = rates(Crowd([Relaxation(0.7)]), batch)
+    wanted = rates(Crowd([make_law("relaxation", tau=0.7)]), batch)
     torch.testing.assert_close(rates(bare, batch), wanted, rtol=1e-12, atol=1e-12)
     with torch.no_grad():
         torch.testing.assert_close(
             FusedSolver(0.02)(bare, batch).x[batch.valid],
-            FusedSolver(0.02)(Crowd([Relaxation(0.7)]), batch).x[batch.valid],
+            FusedSolver(0.02)(Crowd([make_law("relaxation", tau=0.7)]), batch).x[batch.valid],
             rtol=1e-12, atol=1e-12,
         )  # fmt: skip
     torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nnode.model.arrays import computed
 from nnode.model.expression import Expr, const, symbol, topological
 from nnode.model.parse import FormulaError, parse
-from nnode.model.tensors import computed
 from nnode.model.text import latex, plain
 
 IDM = "a*(1 - (v/v0)**4 - ((s0 + max(0, v*T + v*dv/(2*sqrt(a*b))))/gap)**2)"

@@ -8,7 +8,7 @@ import torch
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import DataError
-from nnode.model import Crowd, Linear, Relaxation, Scene, Traffic
+from nnode.model import Crowd, Scene, Traffic, make_law
 from nnode.model.scene import wall_points
 
 NAN = float("nan")
@@ -111,7 +111,7 @@ def test_measured_positions_between_samples(dtype: torch.dtype) -> None:
 def test_models_refuse_data_of_the_other_domain() -> None:
     batch = collate([ramp("a", 3, 2)])
     with pytest.raises(DataError, match="2-dimensional"):
-        Crowd([Relaxation()]).scene(batch)
+        Crowd([make_law("relaxation")]).scene(batch)
     flat = Sequence(name="p", recording="r", time=np.arange(3.0), x=np.zeros((3, 2, 2)))
     with pytest.raises(DataError, match="1-dimensional"):
-        Traffic([Linear()]).scene(collate([flat]))
+        Traffic([make_law("lin")]).scene(collate([flat]))

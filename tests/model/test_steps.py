@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, SimulationError
-from nnode.model import Linear, Traffic, build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model import Traffic, build_model, make_law
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS, STAGES, stepped
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.model.following import DT, behind, driven, model, numbers
@@ -143,14 +143,14 @@ def test_compiled_steps_and_their_gradient_are_those_of_a_loop(method: str) -> N
 
 
 def test_speeds_are_stepped_as_they_are() -> None:
-    lane = Traffic([Linear()]).lane
+    lane = Traffic([make_law("lin")]).lane
     assert lane is not None
     assert all(stepped(lane, method) is lane for method in METHODS)
     assert set(STAGES) == set(METHODS)
 
 
 def test_a_method_is_the_law_s_own_the_field_s_or_the_one_that_is_asked_for() -> None:
-    assert Traffic([Linear()]).step == "euler"
+    assert Traffic([make_law("lin")]).step == "euler"
     assert {law: model(law).step for law in CAR_FOLLOWING_LAWS} == {
         **dict.fromkeys(CAR_FOLLOWING_LAWS, "rk4"), "gipps": "ballistic",
         "krauss": "semi_implicit", "newell": "semi_implicit",

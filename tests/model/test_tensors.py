@@ -1,4 +1,5 @@
-"""Values and derivatives of formulas in PyTorch, against Python's own numbers and autograd."""
+"""Values and derivatives of operations and formulas in every library, against Python's numbers and
+autograd."""
 
 from __future__ import annotations
 
@@ -9,13 +10,15 @@ import pytest
 import torch
 from numba import njit
 
-from nnode.model.arrays import numpy_function
-from nnode.model.differentiate import derivatives
-from nnode.model.expression import apply, const
+from nnode.model.arrays import computed, numpy_function
+from nnode.model.differentiate import derivatives, slopes
+from nnode.model.expression import apply, const, symbol
+from nnode.model.operations import OPERATIONS, compiled
 from nnode.model.parse import parse
-from nnode.model.tensors import computed
-from nnode.simulate.kernels import loops
+from nnode.simulate.kernels import functions
 
+#: Names in compiled code that are no functions of the kernels' own.
+SCALARS = {"zero": 0.0, "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}
 FORMULAS = [
     "a*(1 - (b/c)**4) - exp(-a)*log(b)",
     "sqrt(a*b)/c + tanh(c - a) - sin(a)*cos(b)",
@@ -52,6 +55,32 @@ def test_values_and_derivatives(text: str) -> None:
         torch.testing.assert_close(slope, wanted, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_an_operation_is_the_same_in_every_library(name: str) -> None:
+    row = OPERATIONS[name]
+    names = "abc"[: row.arguments]
+    rng = np.random.default_rng(5)
+    values = {n: np.append(rng.uniform(0.1, 3.0, 40), [1.0, 30.0]) for n in names}
+    values["a"][1] = values[names[-1]][0]  # a tie, also where there is one argument only
+    points = list(zip(*values.values(), strict=True))
+    node = apply(name, *map(symbol, names))
+    wanted = [apply(name, *map(const, point)).value for point in points]
+    np.testing.assert_allclose(numpy_function((node,))(values, ())[0], wanted, rtol=1e-14)
+    tensors = {n: torch.tensor(v, requires_grad=True) for n, v in values.items()}
+    found = computed([node], tensors)[0]
+    np.testing.assert_allclose(found.detach(), wanted, rtol=1e-14)
+    code = compiled(row.code.format(*names), ", ".join(names), vars(functions) | SCALARS)
+    machine = njit(error_model="numpy")(code)
+    np.testing.assert_allclose([machine(*point) for point in points], wanted, rtol=2e-14)
+    exact = torch.autograd.grad(found.sum(), list(tensors.values()), allow_unused=True)
+    for own, slope in zip(slopes(node), exact, strict=True):
+        if slope is not None:
+            other = computed([own], tensors)[0].expand_as(slope)
+            torch.testing.assert_close(other, slope, rtol=1e-13, atol=1e-15)
+        else:
+            assert own.is_number(0)
+
+
 @pytest.mark.parametrize("op", ["max", "min"])
 def test_the_larger_of_a_number_and_none_is_none(op: str) -> None:
     nan = math.nan
@@ -61,10 +90,11 @@ def test_the_larger_of_a_number_and_none_is_none(op: str) -> None:
     tensors = {name: torch.from_numpy(value) for name, value in values.items()}
     np.testing.assert_array_equal(computed([node], tensors)[0].numpy(), wanted)
     np.testing.assert_array_equal(numpy_function((node,))(values, ())[0], wanted)
-    code = njit(error_model="numpy")(eval("lambda a, b: " + loops.OPERATIONS[op].format("a", "b")))
-    pairs = zip(values["a"], values["b"], strict=True)
+    text = OPERATIONS[op].code.format("a", "b")
+    code = njit(error_model="numpy")(compiled(text, "a, b", vars(functions)))
+    pairs = list(zip(*values.values(), strict=True))
     np.testing.assert_array_equal([code(a, b) for a, b in pairs], wanted)
-    folded = [apply(op, const(a), const(b)).value for a, b in zip(*values.values(), strict=True)]
+    folded = [apply(op, const(a), const(b)).value for a, b in pairs]
     np.testing.assert_array_equal(folded, wanted)
 
 

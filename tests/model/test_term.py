@@ -7,8 +7,8 @@ import pytest
 from nnode.model import System, build_model
 from nnode.model.build import add_effects
 from nnode.model.effects.traffic import SpeedZone
+from nnode.model.laws import make_law
 from nnode.model.term import short_names
-from nnode.model.traffic import Linear
 
 LAW = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 
@@ -29,7 +29,7 @@ def test_an_address_does_not_depend_on_other_terms(others: tuple[str, ...]) -> N
 
 
 def test_two_terms_of_one_name_are_told_apart() -> None:
-    two = System([Linear(30.0), SpeedZone(alpha=0.7), SpeedZone(alpha=0.9)])
+    two = System([make_law("lin", v0=30.0), SpeedZone(alpha=0.7), SpeedZone(alpha=0.9)])
     physical = {name: float(value) for name, (value, _) in two.physical().items()}
     assert (physical["speed_zone.alpha"], physical["speed_zone_2.alpha"]) == (0.7, 0.9)
 

@@ -10,16 +10,7 @@ from matplotlib.contour import ContourSet
 from torch import Tensor
 
 from nnode.errors import ConfigError
-from nnode.model import (
-    Crowd,
-    InteractionForce,
-    Linear,
-    NetworkForce,
-    NetworkSpeed,
-    Relaxation,
-    SocialForce,
-    Traffic,
-)
+from nnode.model import Crowd, InteractionForce, Traffic, make_law
 from nnode.plots import crowd_figures, force_contours, force_figure, save
 from nnode.plots.crowd import ENCOUNTERS
 from nnode.plots.interaction import evaluate_force
@@ -42,7 +33,12 @@ class Spring(InteractionForce):
 
 
 def _network() -> Crowd:
-    return Crowd([Relaxation(), NetworkForce(generator=torch.Generator().manual_seed(1))])
+    return Crowd(
+        [
+            make_law("relaxation"),
+            make_law("network_force", generator=torch.Generator().manual_seed(1)),
+        ]
+    )
 
 
 def _panels(figure):
@@ -70,7 +66,9 @@ def test_lines_lie_where_the_force_has_their_value(component, part, slope, push)
 
 
 @pytest.mark.parametrize("component", [0, 1])
-@pytest.mark.parametrize("system", [Crowd([SocialForce(**PAPER)]), _network()], ids=["sf", "nn"])
+@pytest.mark.parametrize(
+    "system", [Crowd([make_law("social_force", **PAPER)]), _network()], ids=["sf", "nn"]
+)
 def test_all_panels_share_one_symmetric_scale(system, component) -> None:
     figure = force_contours(system, component)
     levels = [tuple(_sets(ax, filled=True)[0].levels) for ax in _panels(figure)]
@@ -81,14 +79,14 @@ def test_all_panels_share_one_symmetric_scale(system, component) -> None:
 
 
 def test_extents_follow_the_paper() -> None:
-    social, network = Crowd([SocialForce(**PAPER)]), _network()
+    social, network = Crowd([make_law("social_force", **PAPER)]), _network()
     assert _panels(force_contours(social, 0))[0].get_xlim() == (-0.5, 0.5)
     assert _panels(force_contours(network, 0))[0].get_xlim() == (-4.0, 4.0)
     assert _panels(force_contours(social, 0, extent=1.5))[3].get_ylim() == (-1.5, 1.5)
 
 
 def test_labels_units_and_velocities() -> None:
-    figure = force_contours(Crowd([SocialForce(**PAPER)]), 1)
+    figure = force_contours(Crowd([make_law("social_force", **PAPER)]), 1)
     panels = _panels(figure)
     assert panels[2].get_xlabel() == "$x_i - x_j$ (m)"
     assert panels[0].get_ylabel() == "$y_i - y_j$ (m)"
@@ -103,7 +101,7 @@ def test_labels_units_and_velocities() -> None:
 
 
 def test_social_force_is_antisymmetric_and_obeys_its_formula() -> None:
-    system = Crowd([SocialForce(**PAPER)]).double()
+    system = Crowd([make_law("social_force", **PAPER)]).double()
     random = np.random.default_rng(0)
     dx, dv = random.uniform(-0.5, 0.5, (2, 500, 2))
     force = evaluate_force(system, dx, dv)
@@ -126,7 +124,7 @@ def test_a_network_is_not_antisymmetric() -> None:
 
 
 def test_parts_without_walls() -> None:
-    system = Crowd([NetworkForce(walls=False)])
+    system = Crowd([make_law("network_force", walls=False)])
     dx = np.ones((3, 2))
     np.testing.assert_array_equal(
         evaluate_force(system, dx, dx), evaluate_force(system, dx, dx, "pair")
@@ -137,7 +135,11 @@ def test_parts_without_walls() -> None:
 
 
 def test_crowd_figures() -> None:
-    assert set(crowd_figures(Crowd([SocialForce(**PAPER)]))) == {"force_x", "force_y", "settings"}
+    assert set(crowd_figures(Crowd([make_law("social_force", **PAPER)]))) == {
+        "force_x",
+        "force_y",
+        "settings",
+    }
     assert set(crowd_figures(_network())) == {
         "force_x", "force_y", "settings",
         "force_x_pair", "force_x_wall", "force_y_pair", "force_y_wall",
@@ -149,7 +151,7 @@ def test_crowd_figures() -> None:
 @pytest.mark.parametrize("value", [0.0, float("nan"), float("inf")])
 @pytest.mark.parametrize("kind", ["sf", "nn"])
 def test_degenerate_models_are_drawn(kind: str, value: float, tmp_path) -> None:
-    system = Crowd([SocialForce(**PAPER)]) if kind == "sf" else _network()
+    system = Crowd([make_law("social_force", **PAPER)]) if kind == "sf" else _network()
     with torch.no_grad():
         for parameter in system.parameters():
             parameter.fill_(value)
@@ -161,7 +163,7 @@ def test_degenerate_models_are_drawn(kind: str, value: float, tmp_path) -> None:
 
 
 def test_bad_options_are_named() -> None:
-    system = Crowd([SocialForce(**PAPER)])
+    system = Crowd([make_law("social_force", **PAPER)])
     with pytest.raises(ConfigError, match=r"component must be 0 .*got 2"):
         force_contours(system, 2)
     for extent in (0.0, -1.0, float("nan")):
@@ -170,16 +172,16 @@ def test_bad_options_are_named() -> None:
     with pytest.raises(ConfigError, match="part must be sum, pair or wall, got 'pairs'"):
         force_contours(system, 0, part="pairs")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"crowd model.*relaxation"):
-        force_contours(Crowd([Relaxation()]), 0)
+        force_contours(Crowd([make_law("relaxation")]), 0)
     with pytest.raises(ConfigError, match=r"found a traffic model.*lin"):
-        force_contours(Traffic([Linear()]), 0)
+        force_contours(Traffic([make_law("lin")]), 0)
 
 
 @pytest.mark.parametrize(
     ("system", "titles"),
     [
-        (Traffic([NetworkSpeed(4)]), 0),
-        (Crowd([SocialForce(**PAPER)]), 2),
+        (Traffic([make_law("network_speed", hidden=4)]), 0),
+        (Crowd([make_law("social_force", **PAPER)]), 2),
         (_network(), 2),
     ],
     ids=["traffic", "sf", "nn"],

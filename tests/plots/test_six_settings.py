@@ -8,7 +8,7 @@ import torch
 from matplotlib.quiver import Quiver
 
 from nnode.errors import ConfigError
-from nnode.model import Crowd, NetworkForce, Relaxation, SocialForce
+from nnode.model import Crowd, make_law
 from nnode.plots import save, six_settings
 from nnode.plots.settings import SETTINGS, Setting
 
@@ -28,7 +28,9 @@ TABLE = {
 
 
 def _social(B: float = 0.05) -> Crowd:
-    return Crowd([Relaxation(0.5), SocialForce(**PRINTED, r=0.25, B=B)]).double()
+    return Crowd(
+        [make_law("relaxation", tau=0.5), make_law("social_force", **PRINTED, r=0.25, B=B)]
+    ).double()
 
 
 def _tolerance(x_blue, v_blue) -> np.ndarray:
@@ -66,7 +68,7 @@ def test_the_other_B_does_not_give_the_printed_table() -> None:
 
 
 def test_settings_of_networks_are_the_papers() -> None:
-    force = NetworkForce(generator=torch.Generator().manual_seed(0))
+    force = make_law("network_force", generator=torch.Generator().manual_seed(0))
     _, table = six_settings(Crowd([force]))
     assert list(table.columns) == [
         "setting", "x_blue", "x_red", "v_blue", "v_red", "force_blue", "force_red",
@@ -80,7 +82,7 @@ def test_settings_of_networks_are_the_papers() -> None:
 
 
 def test_networks_add_pair_and_wall() -> None:
-    force = NetworkForce(generator=torch.Generator().manual_seed(0)).double()
+    force = make_law("network_force", generator=torch.Generator().manual_seed(0)).double()
     system = Crowd([force])
     total, pair, wall = (
         np.array([*six_settings(system, part=part)[1]["force_red"]])

@@ -12,15 +12,7 @@ from scipy.io import loadmat
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
-from nnode.model import (
-    Crowd,
-    Linear,
-    Logarithmic,
-    NetworkSpeed,
-    Relaxation,
-    System,
-    Traffic,
-)
+from nnode.model import Crowd, System, Traffic, make_law
 from nnode.plots import curve_table, measured_gaps, save, speed_curves, traffic_figures
 from nnode.plots.traffic import SHOWN
 
@@ -28,9 +20,9 @@ from nnode.plots.traffic import SHOWN
 def _models() -> dict[str, System]:
     generator = torch.Generator().manual_seed(0)
     return {
-        "lin": Traffic([Linear(22.0, 4.69)]).double(),
-        "log": Traffic([Logarithmic(21.0, 8.43)]).double(),
-        "n4": Traffic([NetworkSpeed(4, 20.0, generator=generator)]),
+        "lin": Traffic([make_law("lin", v0=22.0, L=4.69)]).double(),
+        "log": Traffic([make_law("log", v0=21.0, L=8.43)]).double(),
+        "n4": Traffic([make_law("network_speed", hidden=4, v0=20.0, generator=generator)]),
     }
 
 
@@ -107,13 +99,15 @@ def test_steep_curves_are_cut_and_the_figure_says_so() -> None:
     assert any("below −20 m/s" in word for word in _text(steep))
     mild = speed_curves({"lin": _models()["lin"]}, span=(5.0, 50.0))
     assert not any("cut" in word for word in _text(mild))
-    fast = speed_curves({"lin": Traffic([Linear(400.0, 4.0)])}, span=(5.0, 50.0))
+    fast = speed_curves({"lin": Traffic([make_law("lin", v0=400.0, L=4.0)])}, span=(5.0, 50.0))
     assert fast.axes[0].get_ylim()[1] == SHOWN[1]
     assert any("above 60 m/s" in word for word in _text(fast))
 
 
 def test_many_checkpoints_share_a_short_legend() -> None:
-    models: dict[str, System] = {f"step {i}": Traffic([Linear(20.0 + i / 5)]) for i in range(50)}
+    models: dict[str, System] = {
+        f"step {i}": Traffic([make_law("lin", v0=20.0 + i / 5)]) for i in range(50)
+    }
     figure = speed_curves(models, np.linspace(5, 40, 100))
     lines = [ln for ln in figure.axes[0].get_lines() if str(ln.get_gid()).startswith("curve:")]
     assert len(lines) == 50
@@ -125,12 +119,12 @@ def test_many_checkpoints_share_a_short_legend() -> None:
 
 
 def test_a_measured_leader_has_no_v0() -> None:
-    figure = speed_curves({"lin": Traffic([Linear()], leader="measured")})
+    figure = speed_curves({"lin": Traffic([make_law("lin")], leader="measured")})
     assert not any(str(ln.get_gid()).startswith("v0") for ln in figure.axes[0].get_lines())
 
 
 def _zero() -> System:
-    system = Traffic([NetworkSpeed(4, 0.0)])
+    system = Traffic([make_law("network_speed", hidden=4, v0=0.0)])
     with torch.no_grad():
         for weight in system.parameters():
             weight.zero_()
@@ -141,10 +135,10 @@ def _zero() -> System:
     "system",
     [
         _zero(),
-        Traffic([Linear(0.0, 5.0)]),
-        Traffic([Logarithmic(0.0, 5.0)]),
-        Traffic([Linear(float("nan"), 5.0)]),
-        Traffic([Linear(float("inf"), 5.0)]),
+        Traffic([make_law("lin", v0=0.0, L=5.0)]),
+        Traffic([make_law("log", v0=0.0, L=5.0)]),
+        Traffic([make_law("lin", v0=float("nan"), L=5.0)]),
+        Traffic([make_law("lin", v0=float("inf"), L=5.0)]),
     ],
     ids=["zero weights", "lin v0=0", "log v0=0", "nan", "inf"],
 )
@@ -162,7 +156,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ConfigError, match="at least one model"):
         speed_curves({})
     with pytest.raises(ConfigError, match=r"walkers: .*found a crowd model.*relaxation"):
-        speed_curves({"walkers": Crowd([Relaxation()])})
+        speed_curves({"walkers": Crowd([make_law("relaxation")])})
     for span in ((0.0, 5.0), (5.0, 5.0), (5.0, float("nan"))):
         with pytest.raises(ConfigError, match="span"):
             speed_curves(models, span=span)

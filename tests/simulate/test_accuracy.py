@@ -12,15 +12,7 @@ import torch
 
 from nnode.data.sequence import collate
 from nnode.errors import SimulationError
-from nnode.model import (
-    Crowd,
-    Linear,
-    Logarithmic,
-    NetworkSpeed,
-    Relaxation,
-    SocialForce,
-    Traffic,
-)
+from nnode.model import Crowd, Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver
 
 V0, LENGTH, GAP = 20.0, 5.0, 8.0
@@ -28,7 +20,7 @@ V0, LENGTH, GAP = 20.0, 5.0, 8.0
 
 def simulated_gap(platoon, method: str, dt: float, **tolerances: float) -> np.ndarray:  # type: ignore[no-untyped-def]
     batch = collate([platoon([GAP], samples=8)])
-    model = Traffic([Linear(V0, LENGTH)])
+    model = Traffic([make_law("lin", v0=V0, L=LENGTH)])
     x = TorchdiffeqSolver(method, dt=dt, **tolerances)(model, batch).x.detach().numpy()
     return x[:, 0, 1, 0] - x[:, 0, 0, 0]
 
@@ -75,10 +67,12 @@ def log(gap: float) -> float:
     return 25.0 * np.log(gap / 4.5)
 
 
-@pytest.mark.parametrize(("term", "law"), [(Linear, lin), (Logarithmic, log)])
+@pytest.mark.parametrize(("term", "law"), [("lin", lin), ("log", log)])
 def test_euler_in_traffic_is_the_plain_loop(platoon, term, law) -> None:  # type: ignore[no-untyped-def]
     item = platoon([12.0, 30.0, 9.0], samples=5)
-    found = TorchdiffeqSolver("euler", dt=0.01)(Traffic([term(25.0, 4.5)]), collate([item]))
+    found = TorchdiffeqSolver("euler", dt=0.01)(
+        Traffic([make_law(term, v0=25.0, L=4.5)]), collate([item])
+    )
     x = item.x[0, :, 0].copy()
     for k in range(5):
         np.testing.assert_allclose(found.x[k, 0, :, 0].detach(), x, rtol=1e-13)
@@ -89,7 +83,7 @@ def test_euler_in_traffic_is_the_plain_loop(platoon, term, law) -> None:  # type
 
 def test_euler_in_crowds_is_the_plain_loop(crowd) -> None:  # type: ignore[no-untyped-def]
     item = crowd(3, samples=4)
-    model = Crowd([Relaxation(0.5)])
+    model = Crowd([make_law("relaxation", tau=0.5)])
     found = TorchdiffeqSolver("euler", dt=0.05)(model, collate([item]))
     x, v = item.x[0].copy(), item.velocity()[0].copy()
     for k in range(4):
@@ -104,8 +98,14 @@ def test_euler_in_crowds_is_the_plain_loop(crowd) -> None:  # type: ignore[no-un
 
 def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
     for model, items in (
-        (Traffic([Linear(25.0, 4.5)]), [platoon([12.0, 30.0], samples=13, start=900.0)]),
-        (Crowd([Relaxation(), SocialForce(1.0, 30.0, 9.0)]), [crowd(4)]),
+        (
+            Traffic([make_law("lin", v0=25.0, L=4.5)]),
+            [platoon([12.0, 30.0], samples=13, start=900.0)],
+        ),
+        (
+            Crowd([make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]),
+            [crowd(4)],
+        ),
     ):
         double = TorchdiffeqSolver("euler", dt=0.01)(model, collate(items)).x
         single = TorchdiffeqSolver("euler", dt=0.01)(
@@ -117,7 +117,7 @@ def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[n
 
 
 def test_the_gradient_does_not_change_the_trajectory(platoon) -> None:  # type: ignore[no-untyped-def]
-    model, batch = Traffic([Linear(25.0, 4.5)]), collate([platoon([12.0, 30.0])])
+    model, batch = Traffic([make_law("lin", v0=25.0, L=4.5)]), collate([platoon([12.0, 30.0])])
     adjoint = TorchdiffeqSolver(gradient="adjoint", dt=0.02)(model, batch).x
     discrete = TorchdiffeqSolver(gradient="discrete", dt=0.02)(model, batch).x
     assert torch.equal(adjoint, discrete)
@@ -128,12 +128,12 @@ def test_a_blow_up_names_sequence_agent_and_time(platoon) -> None:  # type: igno
     crash.x[:, 1] = crash.x[:, 2]  # agent 1 stands where agent 2 does: its gap is 0
     batch = collate([platoon([20.0, 25.0], name="run/good"), crash])
     with pytest.raises(SimulationError, match=r"run/crash.*agent 1 at 0\.2 s"):
-        TorchdiffeqSolver(dt=0.02)(Traffic([Linear()]), batch)
+        TorchdiffeqSolver(dt=0.02)(Traffic([make_law("lin")]), batch)
 
 
 def runaway() -> Traffic:
     """Speed 1e40 m/s per metre of gap: single precision lasts only a few steps."""
-    term = NetworkSpeed(1, v0=0.0)
+    term = make_law("network_speed", hidden=1, v0=0.0)
     with torch.no_grad():
         for weight, value in zip(term.network.parameters(), (1.0, 0.0, -1e12, 0.0), strict=True):
             weight.fill_(value)

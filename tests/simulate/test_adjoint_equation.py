@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Sequence, collate
-from nnode.model import Linear, Traffic
+from nnode.model import Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver
 
 V0, LENGTH = 21.0, 4.5
@@ -74,7 +74,7 @@ def by_hand(item: Sequence) -> tuple[float, np.ndarray]:
 def test_autograd_solves_the_adjoint_equation(platoon, method, dt, gradient) -> None:  # type: ignore[no-untyped-def]
     item = platoon([9.0, 16.0, 12.0], samples=8, noise=1.0)
     expected_cost, expected = by_hand(item)
-    model, batch = Traffic([Linear(V0, LENGTH)]), collate([item])
+    model, batch = Traffic([make_law("lin", v0=V0, L=LENGTH)]), collate([item])
     solver = TorchdiffeqSolver(method, gradient, dt, rtol=1e-10, atol=1e-10)
     cost = sequence_costs(solver(model, batch), batch).sum()
     cost.backward()
@@ -103,7 +103,7 @@ def test_the_paper_s_cost_is_the_limit_of_ever_denser_samples(platoon) -> None: 
     for samples in (50, 100):
         time = np.linspace(0, t_end, samples + 1)
         item = Sequence(name="dense", recording="r", time=time, x=z(time).T[:, :, None])
-        model, batch = Traffic([Linear(V0, LENGTH)]), collate([item])
+        model, batch = Traffic([make_law("lin", v0=V0, L=LENGTH)]), collate([item])
         solver = TorchdiffeqSolver("rk4", "discrete", item.dt)
         sequence_costs(solver(model, batch), batch).sum().backward()
         found = np.array([model.terms[0].v0.grad.item(), model.terms[0].L.grad.item()])

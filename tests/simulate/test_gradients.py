@@ -15,16 +15,7 @@ import torch
 
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import (
-    Crowd,
-    Linear,
-    Logarithmic,
-    NetworkSpeed,
-    Relaxation,
-    SocialForce,
-    System,
-    Traffic,
-)
+from nnode.model import Crowd, Law, System, Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver
 
 HIDDEN, R, B, TAU = 4, 0.25, 0.1, 0.5
@@ -87,13 +78,15 @@ def complex_gradient(cost: Callable, u: np.ndarray) -> np.ndarray:
     return np.array([cost(u + 1j * h * e).imag / h for e in np.eye(len(u))])
 
 
-def network() -> NetworkSpeed:
-    return NetworkSpeed(HIDDEN, 16.0, generator=torch.Generator().manual_seed(4))
+def network() -> Law:
+    return make_law(
+        "network_speed", hidden=HIDDEN, v0=16.0, generator=torch.Generator().manual_seed(4)
+    )
 
 
 TRAFFIC = {
-    "lin": (lambda: Linear(21.0, 4.5), lin),
-    "log": (lambda: Logarithmic(21.0, 6.5), log),
+    "lin": (lambda: make_law("lin", v0=21.0, L=4.5), lin),
+    "log": (lambda: make_law("log", v0=21.0, L=6.5), log),
     "n4": (network, n4),
 }
 
@@ -125,7 +118,12 @@ def test_discrete_gradient_in_crowds(crowd) -> None:  # type: ignore[no-untyped-
     item = crowd(4, samples=4)
     shaken = item.x + 0.05 * np.cos(9 * np.arange(4))[:, None, None]
     item = replace(item, walls=None, x=shaken)
-    model = Crowd([Relaxation(TAU), SocialForce(1.5, 30.0, 9.0, r=R, B=B)])
+    model = Crowd(
+        [
+            make_law("relaxation", tau=TAU),
+            make_law("social_force", A=1.5, k=30.0, kappa=9.0, r=R, B=B),
+        ]
+    )
     expected = complex_gradient(lambda u: social_force_loop(item, u, 5), flat(model))
     found = gradient(model, collate([item]), "discrete", 0.04)
     assert abs(expected).min() > 0
@@ -142,7 +140,12 @@ def adjoint_deviation(model: System, batch: Batch, dt: float) -> float:
 @pytest.mark.parametrize("name", [*TRAFFIC, "sf"])
 def test_adjoint_gradient_deviates_at_first_order(platoon, crowd, name: str) -> None:  # type: ignore[no-untyped-def]
     if name == "sf":
-        model: System = Crowd([Relaxation(TAU), SocialForce(1.5, 30.0, 9.0, r=R, B=B)])
+        model: System = Crowd(
+            [
+                make_law("relaxation", tau=TAU),
+                make_law("social_force", A=1.5, k=30.0, kappa=9.0, r=R, B=B),
+            ]
+        )
         # at 0.35 m neighbours stay in contact all the time: no kink is crossed
         batch, number = collate([crowd(3, samples=3, apart=0.35)]), np.array([64, 128, 256])
     else:
@@ -158,7 +161,7 @@ def test_adjoint_gradient_deviates_at_first_order(platoon, crowd, name: str) -> 
 def test_gradient_in_single_precision(platoon) -> None:  # type: ignore[no-untyped-def]
     batch = collate([platoon([9.0, 16.0, 7.0], noise=1.0)])
     for kind in ("adjoint", "discrete"):
-        model = Traffic([Linear(21.0, 4.5)])
+        model = Traffic([make_law("lin", v0=21.0, L=4.5)])
         double = gradient(model, batch, kind, 0.02)
         single = gradient(model.to(torch.float32), batch.to(dtype=torch.float32), kind, 0.02)
         np.testing.assert_allclose(single, double, rtol=1e-3)

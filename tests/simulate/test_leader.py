@@ -8,7 +8,7 @@ import torch
 
 from nnode.calibrate.cost import sequence_costs, squared_error
 from nnode.data.sequence import Sequence, collate
-from nnode.model import Linear, NetworkSpeed, Traffic
+from nnode.model import Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver
 
 V0, LENGTH, DT, STEPS = 21.0, 4.0, 0.02, 10
@@ -32,7 +32,7 @@ def followers_loop(item: Sequence, v0: complex = V0, length: complex = LENGTH) -
 def test_the_record_leads(platoon, dtype: torch.dtype, tolerance: float) -> None:  # type: ignore[no-untyped-def]
     items = [platoon([12.0, 18.0], samples=14, noise=1.0), platoon([9.0], samples=4, noise=1.0)]
     batch = collate(items).to(dtype=dtype)
-    model = Traffic([Linear(V0, LENGTH)], leader="measured").to(dtype)
+    model = Traffic([make_law("lin", v0=V0, L=LENGTH)], leader="measured").to(dtype)
     x = TorchdiffeqSolver("euler", dt=DT)(model, batch).x.detach()
     for b, item in enumerate(items):
         k, n = item.n_samples, item.n_agents
@@ -45,7 +45,7 @@ def test_the_record_leads(platoon, dtype: torch.dtype, tolerance: float) -> None
 
 def test_the_leaders_error_is_none(platoon) -> None:  # type: ignore[no-untyped-def]
     batch = collate([platoon([12.0, 18.0]), platoon([12.0], samples=4)])
-    model = Traffic([Linear()], leader="measured")
+    model = Traffic([make_law("lin")], leader="measured")
     error = squared_error(TorchdiffeqSolver(dt=DT)(model, batch), batch)
     assert torch.all(error[:, 0, 2] == 0)
     assert torch.all(error[:, 1, 1] == 0)
@@ -54,7 +54,7 @@ def test_the_leaders_error_is_none(platoon) -> None:  # type: ignore[no-untyped-
 
 @pytest.mark.parametrize("gradient", ["adjoint", "discrete"])
 def test_a_speed_that_nobody_drives_at_has_no_gradient(platoon, gradient: str) -> None:  # type: ignore[no-untyped-def]
-    term = NetworkSpeed(2, generator=torch.Generator().manual_seed(0))
+    term = make_law("network_speed", hidden=2, generator=torch.Generator().manual_seed(0))
     model, batch = Traffic([term], leader="measured"), collate([platoon([12.0, 18.0])])
     sequence_costs(
         TorchdiffeqSolver(gradient=gradient, dt=DT)(model, batch), batch
@@ -66,7 +66,7 @@ def test_a_speed_that_nobody_drives_at_has_no_gradient(platoon, gradient: str) -
 
 def test_gradient_behind_the_record(platoon) -> None:  # type: ignore[no-untyped-def]
     item = platoon([12.0, 18.0, 9.0], samples=6, noise=1.0)
-    batch, term = collate([item]), Linear(V0, LENGTH)
+    batch, term = collate([item]), make_law("lin", v0=V0, L=LENGTH)
     solver = TorchdiffeqSolver("euler", "discrete", DT)
     sequence_costs(solver(Traffic([term], leader="measured"), batch), batch).sum().backward()
 

@@ -16,14 +16,10 @@ from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Linear, Relaxation, SocialForce, System, Traffic
+from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import add_effects, build_model
-from nnode.model.crowd import NetworkForce
 from nnode.model.effects import CATALOGUE
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
-from nnode.model.formula_law import law_from
-from nnode.model.traffic import Logarithmic, NetworkSpeed
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, Law, law_from
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from nnode.simulate.base import simulated_batch
 
@@ -52,11 +48,13 @@ def cars(shift: float = 0.0, number: int = 5) -> Sequence:
 
 
 def crowd(dtype: torch.dtype) -> System:
-    return Crowd([Relaxation(), SocialForce(2.0, 100.0, 10.0)]).to(dtype)
+    return Crowd([make_law("relaxation"), make_law("social_force", A=2.0, k=100.0, kappa=10.0)]).to(
+        dtype
+    )
 
 
 def lin(dtype: torch.dtype) -> System:
-    return Traffic([Linear(25.0, 5.0)]).to(dtype)
+    return Traffic([make_law("lin", v0=25.0, L=5.0)]).to(dtype)
 
 
 def idm(dtype: torch.dtype) -> System:
@@ -139,7 +137,7 @@ def test_a_leader_that_follows_its_measured_path_has_no_error_at_all() -> None:
         assert torch.equal(x[:, b, last], batch.x[:, b, last])
 
 
-@pytest.mark.parametrize("law", [Linear(), Logarithmic(), NetworkSpeed()])
+@pytest.mark.parametrize("law", [make_law("lin"), make_law("log"), make_law("network_speed")])
 def test_the_paper_s_lanes_name_no_places(law: object) -> None:
     assert not Traffic([law]).names_places  # type: ignore[list-item]
 
@@ -155,8 +153,10 @@ def test_laws_of_people_name_no_places(name: str) -> None:
 
 
 def test_the_paper_s_crowds_name_no_places() -> None:
-    assert not Crowd([Relaxation(), SocialForce(1.0, 30.0, 9.0)]).names_places
-    assert not Crowd([Relaxation(), NetworkForce()]).names_places
+    assert not Crowd(
+        [make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]
+    ).names_places
+    assert not Crowd([make_law("relaxation"), make_law("network_force")]).names_places
 
 
 PLACES = {"speed_zone", "slope", "obstacle", "attraction"}
@@ -179,23 +179,25 @@ def test_effects_of_places_name_places(kind: str, leader: str | None) -> None:
 
 
 def test_a_term_that_is_code_may_name_places() -> None:
-    class Windy(Relaxation):
+    class Windy(Law):
         def forward(self, state):  # type: ignore[no-untyped-def]
             return super().forward(state) + state.x * 1e-3
 
-    assert Crowd([Windy()]).names_places
+    assert Crowd([Windy("relaxation")]).names_places
 
 
 def test_a_zone_stays_where_it_is() -> None:
     def zoned(shift: float, dtype: torch.dtype) -> System:
-        model = Traffic([Linear(25.0, 5.0)], leader="measured")
+        model = Traffic([make_law("lin", v0=25.0, L=5.0)], leader="measured")
         zone = {"name": "speed_zone", "alpha": 0.5, "a": shift + 60.0, "b": shift + 160.0}
         add_effects(model, [zone])
         return model.to(dtype)
 
     plain, solver = CASES["lin"][1], TorchdiffeqSolver("euler", "discrete", 0.02)
     exact = solver(zoned(0.0, torch.float64), plain(0.0)).x.detach()
-    bare = solver(Traffic([Linear(25.0, 5.0)], leader="measured"), plain(0.0)).x.detach()
+    bare = solver(
+        Traffic([make_law("lin", v0=25.0, L=5.0)], leader="measured"), plain(0.0)
+    ).x.detach()
     assert (exact - bare).abs()[:, 0].max() > 1
     for shift, limit in ((0.0, 0.02), (4096.0, 0.2)):
         batch = single(plain(shift))

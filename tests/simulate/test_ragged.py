@@ -8,17 +8,7 @@ from torch import Tensor
 
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Sequence, collate
-from nnode.model import (
-    Crowd,
-    Linear,
-    Logarithmic,
-    NetworkForce,
-    NetworkSpeed,
-    Relaxation,
-    SocialForce,
-    System,
-    Traffic,
-)
+from nnode.model import Crowd, System, Traffic, make_law
 from nnode.simulate import TorchdiffeqSolver
 
 
@@ -27,14 +17,18 @@ def seeded() -> torch.Generator:
 
 
 TRAFFIC = {
-    "lin": lambda: Traffic([Linear(18.0, 4.0)]),
-    "log": lambda: Traffic([Logarithmic(18.0, 6.0)]),
-    "n4": lambda: Traffic([NetworkSpeed(4, 18.0, generator=seeded())]),
-    "lin_measured": lambda: Traffic([Linear(18.0, 4.0)], leader="measured"),
+    "lin": lambda: Traffic([make_law("lin", v0=18.0, L=4.0)]),
+    "log": lambda: Traffic([make_law("log", v0=18.0, L=6.0)]),
+    "n4": lambda: Traffic([make_law("network_speed", hidden=4, v0=18.0, generator=seeded())]),
+    "lin_measured": lambda: Traffic([make_law("lin", v0=18.0, L=4.0)], leader="measured"),
 }
 CROWD = {
-    "sf": lambda: Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1)]),
-    "nn": lambda: Crowd([Relaxation(), NetworkForce(4, generator=seeded())]),
+    "sf": lambda: Crowd(
+        [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1)]
+    ),
+    "nn": lambda: Crowd(
+        [make_law("relaxation"), make_law("network_force", hidden=4, generator=seeded())]
+    ),
 }
 
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.errors import CheckpointError, ConfigError
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.program import choices, own_choices
 
 GROUPS = ("model", "data", "optimizer", "solver")

@@ -34,7 +34,7 @@ from nnode.errors import ConfigError, NotFittedError
 from nnode.exchange.trajectories import simulated
 from nnode.model import System
 from nnode.model.build import add_effects
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulate import Solver
 
 #: Sequences that are simulated at once.

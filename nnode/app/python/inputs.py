@@ -26,8 +26,7 @@ from nnode.data.readers.columns import Table as DataTable
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS, PEDESTRIAN_LAWS
 from nnode.program import configuration
 
 #: Models by the names that ``conf/model`` gives them.

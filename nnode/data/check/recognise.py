@@ -74,7 +74,6 @@ def recognised(
         ConfigError: no such file; columns or units that may be two things; names both.
         DataError: no table of trajectories; names what is lacking.
     """
-    given = dict(given or {})
     if domain not in (None, "traffic", "crowd"):
         raise ConfigError(f"data.domain={domain}: expected traffic or crowd")
     memory = isinstance(source, pd.DataFrame)
@@ -84,7 +83,13 @@ def recognised(
         raw = read_raw(Path(source).expanduser())
     if raw.table is None:
         return _native(raw)
-    raw = in_seconds(raw)
+    return _of_table(in_seconds(raw), memory, domain, dict(given or {}))
+
+
+def _of_table(
+    raw: Raw, memory: bool, domain: Domain | None, given: Mapping[str, Any]
+) -> Recognised:
+    """How columns are read; ``memory`` says that the table comes from no file."""
     assert raw.table is not None
     exact = _exact(raw.table, given)
     if exact == "table" and raw.separator in (",", ""):

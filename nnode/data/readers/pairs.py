@@ -183,13 +183,11 @@ def _check(options: PairOptions) -> None:
             positive(name, getattr(options, name))
     if options.min_samples < 2:
         raise ConfigError(f"data.min_samples={options.min_samples}: expected at least 2")
-    known = (*_REQUIRED, *_METRES, *_SPEEDS, *_WORDS)
-    for key in options.constant:
-        if key not in _WORDS:
-            raise ConfigError(f"data.constant.{key} is unknown; expected {', '.join(_WORDS)}")
-    for key in options.columns:
-        if key not in known:
-            raise ConfigError(f"data.columns.{key} is unknown; expected {', '.join(known)}")
+    columns = (*_REQUIRED, *_METRES, *_SPEEDS, *_WORDS)
+    for option, known in (("constant", _WORDS), ("columns", columns)):
+        for key in getattr(options, option):
+            if key not in known:
+                raise ConfigError(f"data.{option}.{key} is unknown; expected {', '.join(known)}")
     try:
         groups = re.compile(options.pattern or "").groupindex
     except re.error as error:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from nnode.data.exits import destinations, exits_of, read_exits
+from nnode.data.exits import Exit, destinations, exits_of, read_exits
 from nnode.data.options import TableOptions
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import check_known, natural, one_of, table_path, wanted
@@ -62,16 +63,61 @@ def read_table(
             agent twice at one time, time steps that are no multiples of the usual one, or values
             that change within a sequence although they belong to an agent.
     """
-    crowd = _is_crowd(options)
     table = opened(source)
-    path = table.path
+    columns = _columns(table, options)
+    asked = wanted(options.recording)
+    if asked is not None:
+        check_known(asked, columns.recording)
+    segments = None if walls is None else _segments(walls)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, key in enumerate(zip(columns.recording, columns.sequence, strict=True)):
+        groups.setdefault(key, []).append(i)
+    return [
+        _sequence(table, columns, key, np.array(rows), options.max_hole, segments)
+        for key, rows in sorted(groups.items(), key=lambda item: [*map(natural, item[0])])
+        if asked is None or key[0] in asked
+    ]
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """What the rows of a table say, in SI units.
+
+    Attributes:
+        crowd: whether positions have two coordinates.
+        recording, sequence, agent: ``(R,)`` names.
+        time: ``(R,)`` s.
+        values: positions, destinations and lengths, m.
+        words: classes and groups.
+        exits: destinations of people, where the options give them.
+    """
+
+    crowd: bool
+    recording: np.ndarray
+    sequence: np.ndarray
+    agent: np.ndarray
+    time: np.ndarray
+    values: dict[str, np.ndarray]
+    words: dict[str, np.ndarray]
+    exits: list[Exit]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        return _axes(self.crowd)
+
+
+def _axes(crowd: bool) -> tuple[str, ...]:
+    return ("x", "y") if crowd else ("x",)
+
+
+def _columns(table: Table, options: TableOptions) -> _Columns:
+    crowd, path = _is_crowd(options), table.path
     names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
         raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
-    axes = ("x", "y") if crowd else ("x",)
-    goals = tuple(f"dest_{axis}" for axis in axes)
+    goals = tuple(f"dest_{axis}" for axis in _axes(crowd))
     if any(goal in names for goal in goals) and not all(goal in names for goal in goals):
         raise DataError(f"{path}: a destination needs the columns {' and '.join(goals)}")
     exits = read_exits(options.exits)
@@ -81,84 +127,80 @@ def read_table(
         )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
     time = table.times(names["time"], seconds_per_unit(options))[1]
-    values: dict[str, np.ndarray] = {axis: table.measured(names[axis]) * metres for axis in axes}
+    values = {axis: table.measured(names[axis]) * metres for axis in _axes(crowd)}
     values |= {name: table.numbers(names[name]) * metres for name in goals if name in names}
     if "length" in names:
         values["length"] = table.positive(names["length"]) * metres
     words: dict[str, np.ndarray] = {
         k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names
     }
-    recording = (
-        table.names(names["recording"])
-        if "recording" in names
-        else np.full(len(table), path.stem, dtype=object)
-    )
-    asked = wanted(options.recording)
-    if asked is not None:
-        check_known(asked, recording)
-    segments = None if walls is None else _segments(walls)
+    if "recording" in names:
+        recording = table.names(names["recording"])
+    else:
+        recording = np.full(len(table), path.stem, dtype=object)
+    return _Columns(crowd, recording, sequence, agent, time, values, words, exits)
 
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i, key in enumerate(zip(recording, sequence, strict=True)):
-        groups.setdefault(key, []).append(i)
-    found = []
-    for (run, number), rows in sorted(groups.items(), key=lambda item: [*map(natural, item[0])]):
-        if asked is not None and run not in asked:
-            continue
-        name = number if number.startswith(f"{run}/") else f"{run}/{number}"
-        index = np.array(rows)
-        grid, k = _grid(table, name, time, index, options.max_hole)
-        people, n = _people(agent[index])
-        if len(grid) * len(people) > MOST_CELLS:
-            raise DataError(
-                f"{path}: sequence {name} has {len(grid)} times and {len(people)} agents in "
-                f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
-                "shorter sequences"
-            )
-        at = np.full((len(grid), len(people)), -1)
-        for row, i, j in zip(index, k, n, strict=True):
-            if at[i, j] >= 0:
-                raise DataError(
-                    f"{path}, {table.row(row)}: agent {agent[row]} of sequence {name} stands "
-                    f"there a second time at {time[row]:g} s (first in {table.row(at[i, j])})"
-                )
-            at[i, j] = row
-        known = _known(at, [values[axis] for axis in axes])
-        if not crowd:
-            first = values["x"][_ends(known)[0]]
-            order = np.argsort(first, kind="stable")
-            at, known, people = at[:, order], known[:, order], [people[j] for j in order]
-        owner = np.array([column[column >= 0][0] for column in at.T])
-        for columns in (values, words):
-            for meaning, column in columns.items():
-                if meaning not in axes:
-                    _constant(table, meaning, column, at, owner)
-        x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
-        grid, x, filled = _filled(grid, x, options.max_hole, trim=not crowd)
-        length = values["length"][owner] if "length" in values else None
-        group = tuple(words["group"][owner]) if "group" in words else None
-        goal = None
-        if goals[0] in values:
-            goal = np.stack([values[goal][owner] for goal in goals], axis=-1)
-        elif exits:
-            start, end = (np.stack([values[a][i] for a in axes], -1) for i in _ends(known))
-            goal = destinations(exits_of(exits, start, end, people, group), start)
-        found.append(
-            Sequence(
-                name=name,
-                recording=run,
-                time=grid,
-                x=x,
-                agents=tuple(people),
-                length=None if length is None or np.isnan(length).all() else length,
-                kind=tuple(words["kind"][owner]) if "kind" in words else None,
-                group=group,
-                destination=goal,
-                walls=segments,
-                filled=filled,
-            )
+
+def _sequence(
+    table: Table,
+    columns: _Columns,
+    key: tuple[str, str],
+    index: np.ndarray,
+    max_hole: float,
+    segments: np.ndarray | None,
+) -> Sequence:
+    """One sequence of the rows ``index``; ``key`` names its recording and the sequence."""
+    run, number = key
+    name = number if number.startswith(f"{run}/") else f"{run}/{number}"
+    grid, k = _grid(table, name, columns.time, index, max_hole)
+    people, n = _people(columns.agent[index])
+    if len(grid) * len(people) > MOST_CELLS:
+        raise DataError(
+            f"{table.path}: sequence {name} has {len(grid)} times and {len(people)} agents in "
+            f"{len(index)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
+            "shorter sequences"
         )
-    return found
+    at = np.full((len(grid), len(people)), -1)
+    for row, i, j in zip(index, k, n, strict=True):
+        if at[i, j] >= 0:
+            raise DataError(
+                f"{table.path}, {table.row(row)}: agent {columns.agent[row]} of sequence {name} "
+                f"stands there a second time at {columns.time[row]:g} s (first in "
+                f"{table.row(at[i, j])})"
+            )
+        at[i, j] = row
+    values, words, axes = columns.values, columns.words, columns.axes
+    known = _known(at, [values[axis] for axis in axes])
+    if not columns.crowd:
+        order = np.argsort(values["x"][_ends(known)[0]], kind="stable")
+        at, known, people = at[:, order], known[:, order], [people[j] for j in order]
+    owner = np.array([column[column >= 0][0] for column in at.T])
+    for meaning, column in (*values.items(), *words.items()):
+        if meaning not in axes:
+            _constant(table, meaning, column, at, owner)
+    x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
+    grid, x, filled = _filled(grid, x, max_hole, trim=not columns.crowd)
+    length = values["length"][owner] if "length" in values else None
+    group = tuple(words["group"][owner]) if "group" in words else None
+    goal = None
+    if "dest_x" in values:
+        goal = np.stack([values[f"dest_{axis}"][owner] for axis in axes], axis=-1)
+    elif columns.exits:
+        start, end = (np.stack([values[a][i] for a in axes], -1) for i in _ends(known))
+        goal = destinations(exits_of(columns.exits, start, end, people, group), start)
+    return Sequence(
+        name=name,
+        recording=run,
+        time=grid,
+        x=x,
+        agents=tuple(people),
+        length=None if length is None or np.isnan(length).all() else length,
+        kind=tuple(words["kind"][owner]) if "kind" in words else None,
+        group=group,
+        destination=goal,
+        walls=segments,
+        filled=filled,
+    )
 
 
 def _known(at: np.ndarray, positions: list[np.ndarray]) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as Many
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,6 @@ from torch import Tensor
 from nnode.data.sequence import PADDING_GAP, Batch, Sequence, collate
 from nnode.discover.crowds.paths import Smoother
 from nnode.errors import DataError
-from nnode.model.crowd import SocialForce
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.simulate.alone import Surroundings
@@ -100,7 +100,7 @@ class Windows:
     def around(self, system: System) -> Surroundings:
         """What people walk among where ``system`` simulates them."""
         scene = system.scene(self.batch)
-        force = system.find(SocialForce)
+        force: Any = system.find_law("social_force")
         if force is not None and scene.wall.shape[1]:
             reach = force.r + CUT * force.B + STRAY
             scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)

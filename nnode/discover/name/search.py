@@ -217,14 +217,13 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
     best = _simplest(passing, screen)
     if best.score.p_value > alpha:
         best.score = replace(best.score, p_value=best.there * len(scores))
-    rivals = []
-    for other in candidates:
-        if other is best:
-            continue
-        test = _between(other, best, screen)
-        if test.p_value > apart_at(best, other) and not _contains(other, best):
-            rivals.append((other, test))
-    return Step(best, rivals)
+    tests = [(other, _between(other, best, screen)) for other in candidates if other is not best]
+    return Step(best, [(other, test) for other, test in tests if _rivals(best, other, test)])
+
+
+def _rivals(best: Candidate, other: Candidate, test: Comparison) -> bool:
+    """Whether a test does not tell another effect from the best one, and it is no larger one."""
+    return test.p_value > apart_at(best, other) and not _contains(other, best)
 
 
 def _sure(one: Candidate, screen: Screen, tried: int) -> bool:

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch, Domain
-from nnode.model.crowd_formula import contribution
-from nnode.model.formula import effect_increment
+from nnode.model.formula import contribution, effect_increment
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import Interval, State, Term

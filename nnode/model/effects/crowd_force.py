@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.model.crowd import InteractionForce
 from nnode.model.crowd_dynamics import CrowdRule
 from nnode.model.effects.base import CATALOGUE, Effect, Probe, Strength
 from nnode.model.effects.crowd_pairs import company
+from nnode.model.laws import InteractionForce
 from nnode.model.system import System
 from nnode.model.term import Interval, State
 

@@ -9,7 +9,6 @@ import numpy as np
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.model.crowd import Relaxation
 from nnode.model.crowd_dynamics import CrowdRule
 from nnode.model.effects.base import CATALOGUE, IndividualEffect, Probe, Setting, Strength
 from nnode.model.scene import Scene
@@ -40,7 +39,7 @@ class WalkerHeterogeneity(IndividualEffect):
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        return super().probes(batch, system) if system.find(Relaxation) is not None else []
+        return super().probes(batch, system) if system.find_law("relaxation") else []
 
     @classmethod
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
@@ -48,10 +47,10 @@ class WalkerHeterogeneity(IndividualEffect):
         return max(float(numbers[0]), -1.0)
 
     def forward(self, state: State) -> Tensor:
-        if state.system is None or state.system.find(Relaxation) is None:
+        if state.system is None or state.system.find_law("relaxation") is None:
             raise ValueError(
                 f"effect {self.name} changes the relaxation, but the model has none; add "
-                "Relaxation to its terms"
+                "make_law('relaxation') to its terms"
             )
         return super().forward(state)
 

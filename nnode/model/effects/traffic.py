@@ -21,10 +21,10 @@ from nnode.model.effects.base import (
     Strength,
 )
 from nnode.model.lane_dynamics import Rule
+from nnode.model.laws import Law
 from nnode.model.scene import Scene
 from nnode.model.system import System, Traffic
 from nnode.model.term import Interval, State
-from nnode.model.traffic import FollowTheLeader, LighthillWhithamRichards
 
 #: A zone begins and ends over this distance, m, and a period over this time, s: their edges
 #: can then be calibrated.
@@ -39,14 +39,14 @@ CELLS = 32
 SPEEDS = (0.3, 0.7)
 
 
-def law_in(system: System | None) -> FollowTheLeader:
+def law_in(system: System | None) -> Law:
     """A model's law of the gap.
 
     Raises:
         ConfigError: the model has none.
     """
-    found = None if system is None else system.find(FollowTheLeader)
-    if found is None:
+    found = None if system is None else system.find(Law)
+    if found is None or not found.of_gap:
         raise ConfigError(
             "an effect that modifies the law of the gap needs a model with one; derive the "
             "model's own term from FollowTheLeader, or leave the effect out"
@@ -56,7 +56,8 @@ def law_in(system: System | None) -> FollowTheLeader:
 
 def has_law(system: System) -> bool:
     """Whether a model has a law of the gap; without one, an effect on it cannot be looked for."""
-    return system.find(FollowTheLeader) is not None or system.order > 1
+    law = system.find(Law)
+    return law is not None and (law.of_gap or system.order > 1)
 
 
 def gaps(x: Tensor) -> Tensor:
@@ -384,5 +385,5 @@ class TimeGap(Effect):
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        known = system.find(LighthillWhithamRichards) is not None
+        known = system.find_law("lin", "log") is not None
         return super().probes(batch, system) if known else []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
-from nnode.model.crowd_formula import crowd_of
+from nnode.model.formula import crowd_of
 from nnode.model.system import System, Traffic
 from nnode.model.term import Term
 

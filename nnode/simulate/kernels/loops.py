@@ -11,29 +11,8 @@ from dataclasses import dataclass
 
 from nnode.model.differentiate import vjp
 from nnode.model.expression import Expr, const, symbol, symbols, topological
+from nnode.model.operations import OPERATIONS
 
-#: Text of every operation, of the texts of its arguments.
-OPERATIONS = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "neg": "-{0}",
-    "recip": "one / {0}",
-    "sqrt": "sqrt({0})",
-    "exp": "exp({0})",
-    "log": "log({0})",
-    # by the logistic function, which becomes vector instructions
-    "tanh": "two * logistic(two * {0}) - one",
-    "sin": "sin({0})",
-    "cos": "cos({0})",
-    "softplus": "torch_softplus({0})[0]",
-    "softplus_slope": "torch_softplus({0})[1]",
-    "logistic": "logistic({0})",
-    # what is no number stays none, whichever of both it is
-    "max": "({1} if ({1} > {0}) | ({1} != {1}) else {0})",
-    "min": "({1} if ({1} < {0}) | ({1} != {1}) else {0})",
-    "choose": "({1} if {0} > zero else {2})",
-}
 _PAIR = ("softplus", "softplus_slope")
 
 
@@ -83,7 +62,7 @@ class Loop:
         before, inside = self.lines(topological(outputs), varies, names)
         read = [n.value for n in topological(outputs) if n.op == "symbol" and varies[n]]
         text = f"\n\n@njit(**{self.options})\ndef {name}(room, lo, n, q, t, dt, drives, total):\n"
-        text += "    zero, one, two = real(0, dt), real(1, dt), real(2, dt)\n"
+        text += "    zero = real(0, dt)\n"
         text += self.given(outputs)
         text += _indented(before, 1)
         text += "".join(f"    sum_{label} = zero\n" for label in sums)
@@ -182,7 +161,7 @@ class Loop:
                     left = ", ".join(names[n] for n in pair)
                     lines.append(f"{left} = torch_softplus({own[0]})")
                     continue
-            lines.append(f"{names[node]} = {OPERATIONS[node.op].format(*own)}")
+            lines.append(f"{names[node]} = {OPERATIONS[node.op].code.format(*own)}")
         return before, inside
 
 

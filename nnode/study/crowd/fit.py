@@ -18,7 +18,7 @@ from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.least_squares import Minimum, least_squares, trajectory_residuals
 from nnode.data.sequence import Batch
 from nnode.model.build import build_model
-from nnode.model.crowd import NetworkForce
+from nnode.model.network import FeedForward
 from nnode.model.options import CrowdOptions, NetworkForceOptions, SocialForceOptions
 from nnode.model.system import System
 from nnode.plots.interaction import interaction
@@ -104,7 +104,7 @@ def calibrate(
 def silence(system: System) -> None:
     """Let people exert no force on each other, and keep it so in calibration."""
     force = interaction(system)
-    assert isinstance(force, NetworkForce)
+    assert isinstance(force.pair, FeedForward)
     force.pair.requires_grad_(False)
     with torch.no_grad():
         for weight in force.pair.layers[-1].parameters():

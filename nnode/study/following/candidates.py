@@ -11,7 +11,7 @@ import numpy as np
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.calibrate.gauss_newton.pooling import scattered
 from nnode.model.build import build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.system import System
 
 #: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.

@@ -13,7 +13,7 @@ from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.calibrate.gauss_newton.pooling import best_alone
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.build import build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulate.fused import FusedSolver
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import Candidate, decay, starts

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from nnode.data.sequence import Sequence, collate
-from nnode.model.formula import Law
+from nnode.model.laws import Law
 from nnode.model.system import System
 from nnode.simulate.fused import FusedSolver
 
@@ -54,7 +54,7 @@ def acceleration(
     }  # fmt: skip
     known = {name: torch.tensor(np.array(x, dtype=float)) for name, x in values.items()}
     # a remembered time gap has faded to the common one where driving is even
-    for state in law.lane(law.name).starts:
+    for state in law.dynamics().starts:
         known[state] = law.get_parameter("T").detach().expand(gap.shape)
     with torch.no_grad():
         return np.asarray(law.evaluated(known).expand(gap.shape).numpy())

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from nnode.model.build import build_model
-from nnode.model.field_crowd import PEDESTRIAN_LAWS, without_walls
+from nnode.model.laws import PEDESTRIAN_LAWS, without_walls
 from nnode.model.system import System
 
 _FORCE = without_walls(PEDESTRIAN_LAWS["esf"])

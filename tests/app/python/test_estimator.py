@@ -19,9 +19,8 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, NotFittedError
-from nnode.model import Linear, Traffic
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model import Traffic, make_law
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 from tests.app.conftest import Script
 from tests.app.following import TRUE, pairs, table
 
@@ -137,7 +136,7 @@ def test_the_score_is_the_error_that_an_evaluation_tells(
 def test_a_fit_leaves_its_arguments_and_torch_as_they_were(tidy: pd.DataFrame) -> None:
     before, threads = tidy.copy(), torch.get_num_threads()
     torch.set_num_threads(2)
-    model = Traffic([Linear(v0=30.0, L=5.0)], leader="measured").double()
+    model = Traffic([make_law("lin", v0=30.0, L=5.0)], leader="measured").double()
     calibrator = nnode.Calibrator(model, epochs=2)
     assert calibrator.fit(tidy) is calibrator
     assert torch.get_num_threads() == 2

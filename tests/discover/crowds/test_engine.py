@@ -17,14 +17,12 @@ from nnode.discover.locate.curves import columns_of
 from nnode.discover.residuals.engine import row_of, runs_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
-from nnode.model import Crowd, Relaxation, SocialForce
-from nnode.model.crowd_formula import CrowdBase
+from nnode.model import Crowd, make_law
 from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.effects.crowd_motion import Drift
 from nnode.model.effects.crowd_pairs import Alignment, PairRepulsion
 from nnode.model.extend import extended
-from nnode.model.field_crowd import PEDESTRIAN_LAWS, without_walls
-from nnode.model.formula_law import FormulaForce
+from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law, without_walls
 from nnode.model.term import State
 from nnode.simulate.alone import PersonAlone
 from tests.discover import walkers
@@ -32,30 +30,24 @@ from tests.discover import walkers
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
 
 
-class Same(SocialForce):
+class Same(InteractionForce):
     """A force that is the same, but code of its own."""
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
         return super().pair_force(dx, dv)
 
 
-class Coded(CrowdBase):
+class Coded(Law):
     """A formula that is evaluated as code."""
 
-    name = "coded"
-
-    def __init__(self, name: str, **law: Any) -> None:
-        super().__init__()
-        self.own = FormulaForce(name, **law)
-
     def forward(self, state: State) -> Tensor:
-        found: Tensor = self.own(state)
-        return found
+        return super().forward(state)
 
 
-def model(force: type[SocialForce] = SocialForce, **options: float | bool) -> Crowd:
-    law = force(walkers.A, 0.0, 0.0, B=walkers.B, **options)
-    return Crowd([Relaxation(walkers.TAU), law])
+def model(force: type[InteractionForce] = InteractionForce, **options: float | bool) -> Crowd:
+    values: Any = {"A": walkers.A, "k": 0.0, "kappa": 0.0, "B": walkers.B, **options}
+    law = force(entry="social_force", **values)
+    return Crowd([make_law("relaxation", tau=walkers.TAU), law])
 
 
 def paths(windows: Windows, system: Crowd, rows: Tensor, *, compiled: bool) -> Tensor:
@@ -89,9 +81,9 @@ def test_compiled_paths_are_those_of_the_model(
     windows = Windows(plain)
     rows = torch.tensor([[15.0, 0.0, 0.0], [25.0, 200.0, 30.0]], dtype=torch.float64)
     found = []
-    for force in (SocialForce, Same):
+    for force in (InteractionForce, Same):
         system = model(force, opposing_wall_friction=opposing, walls=walls, r=0.45)
-        found.append(paths(windows, system, rows, compiled=force is SocialForce))
+        found.append(paths(windows, system, rows, compiled=force is not Same))
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)
     assert float((found[0][:, 0] - found[0][:, 1])[..., :2].abs().max()) > 0.05
 
@@ -100,9 +92,9 @@ def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
     windows = Windows(plain)
     found = []
     for law in (PEDESTRIAN_LAWS["esf"], without_walls(PEDESTRIAN_LAWS["esf"])):
-        for kind in (FormulaForce, Coded):
-            system = Crowd([kind("esf", **law)], desired="direction").double()
-            compiled = kind is FormulaForce
+        for kind in (Law, Coded):
+            system = Crowd([kind(law, "esf")], desired="direction").double()
+            compiled = kind is Law
             found.append(paths(windows, system, row_of(system)[None], compiled=compiled))
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)
     assert float((found[0] - found[2]).abs().max()) > 0.01
@@ -114,9 +106,11 @@ def test_effects_of_a_compiled_law_are_those_of_one_that_is_code(
 ) -> None:
     windows = Windows(plain)
     found = []
-    for force in (SocialForce, Same):
+    for force in (InteractionForce, Same):
         system, _ = extended(model(force), effect)
-        found.append(paths(windows, system, row_of(system)[None], compiled=force is SocialForce))
+        found.append(
+            paths(windows, system, row_of(system)[None], compiled=force is InteractionForce)
+        )
     bare = paths(windows, model(), ROW[None], compiled=True)
     assert float((found[1] - bare).square().mean().sqrt()) > 0.02
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)

@@ -15,7 +15,7 @@ from nnode.discover.crowds.indirect_inference import unbiased
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.errors import SimulationError
-from nnode.model import Crowd, Relaxation, SocialForce
+from nnode.model import Crowd, make_law
 from nnode.model.effects.crowd_motion import PreferredSpeed
 from tests.discover import walkers
 
@@ -41,8 +41,10 @@ def calibrated(
 ) -> tuple[Fit, list[Sequence], CrowdEngine]:
     extra = hurried(seed, sequences)
     data = walkers.crowd(extra, seed=seed, sequences=sequences, noise=noise)
-    law = SocialForce(walkers.A, 0.0, 0.0, B=walkers.B)
-    system = Crowd([Relaxation(walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)])
+    law = make_law("social_force", A=walkers.A, k=0.0, kappa=0.0, B=walkers.B)
+    system = Crowd(
+        [make_law("relaxation", tau=walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)]
+    )
     engine = CrowdEngine(data)
     engine.settle(system, row_of(system))
     return refine(engine, system), data, engine

@@ -7,14 +7,14 @@ import pytest
 from nnode.app.python.inputs import model_options
 from nnode.discover.able import not_offered
 from nnode.discover.compare.laws import with_effects
-from nnode.model import Crowd, Relaxation, build_model
+from nnode.model import Crowd, build_model, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import effects_of
 
 
 @pytest.mark.parametrize(("desired", "why"), [("last", ""), ("direction", "preferred speed")])
 def test_one_preferred_speed_for_all_where_nobody_has_one(desired: str, why: str) -> None:
-    model = Crowd([Relaxation(preferred=desired != "last")], desired=desired)
+    model = Crowd([make_law("relaxation", preferred=desired != "last")], desired=desired)
     found = not_offered(CATALOGUE.effects["preferred_speed"], model)
     assert bool(found) == bool(why)
     assert why in found

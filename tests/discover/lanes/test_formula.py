@@ -19,12 +19,11 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System
-from nnode.model.arrays import numpy_function
+from nnode.model.arrays import computed, numpy_function
 from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.traffic import DriverHeterogeneity
 from nnode.model.parse import parse
-from nnode.model.tensors import computed
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 from tests.model.test_tensors import FORMULAS
 

@@ -16,9 +16,8 @@ from nnode.discover.report.deviation import (
     simulate,
     smooth_velocity,
 )
-from nnode.model import Crowd, Relaxation, Traffic
+from nnode.model import Crowd, Traffic, make_law
 from nnode.model.build import add_effects, build_model
-from nnode.model.traffic import Linear
 
 
 def platoon(speed: float, leader: float, n: int = 41) -> Sequence:
@@ -30,7 +29,7 @@ def platoon(speed: float, leader: float, n: int = 41) -> Sequence:
 
 def test_the_deviation_of_a_law_in_equilibrium_is_its_error() -> None:
     # W = 20 (1 - 8/40) = 16 m/s, and the gap of 40 m stays: measured are 18 m/s
-    system = Traffic([Linear(20.0, 8.0)], leader="measured")
+    system = Traffic([make_law("lin", v0=20.0, L=8.0)], leader="measured")
     found = deviation(system, [platoon(18.0, 18.0)])
     # simulated, the car falls back and speeds up again
     gap = solve_ivp(lambda t, g: 18 - 20 * (1 - 8 / g), (0, 2), [40.0], rtol=1e-10)
@@ -42,7 +41,7 @@ def test_the_deviation_of_a_law_in_equilibrium_is_its_error() -> None:
 
 
 def test_a_leader_that_is_simulated_counts() -> None:
-    system = Traffic([Linear(20.0, 8.0)], leader="constant")
+    system = Traffic([make_law("lin", v0=20.0, L=8.0)], leader="constant")
     found = deviation(system, [platoon(16.0, 17.0)])
     leaders = np.isnan(found.beside[:, 0])
     assert leaders.sum() == 7
@@ -51,7 +50,7 @@ def test_a_leader_that_is_simulated_counts() -> None:
 
 
 def test_numbers_of_agents_act_in_every_piece() -> None:
-    system = Traffic([Linear(20.0, 8.0)], leader="measured")
+    system = Traffic([make_law("lin", v0=20.0, L=8.0)], leader="measured")
     add_effects(system, [{"name": "driver_heterogeneity", "people": {"r/1": [0.125, 0.0]}}])
     # 1.125 times 16 m/s is what was measured
     found = deviation(system, [platoon(18.0, 18.0)])
@@ -69,7 +68,7 @@ def person(acceleration: tuple[float, float], n: int = 31) -> Sequence:
 
 def test_a_push_that_the_model_lacks_is_found_in_a_crowd() -> None:
     # tau is so long that the relaxation does nothing; what is left is the push itself
-    found = deviation(Crowd([Relaxation(1e9)]), [person((0.2, -0.3))])
+    found = deviation(Crowd([make_law("relaxation", tau=1e9)]), [person((0.2, -0.3))])
     assert found.value == pytest.approx(np.tile([0.2, -0.3], (len(found.time), 1)), abs=1e-6)
     assert np.isnan(found.beside).all()  # nobody else is there
 
@@ -99,7 +98,7 @@ def test_own_frame_keeps_lengths() -> None:
 
 
 def test_a_simulation_that_blows_up_spoils_no_other() -> None:
-    system = Traffic([Linear(20.0, 8.0)], leader="measured")
+    system = Traffic([make_law("lin", v0=20.0, L=8.0)], leader="measured")
     good, bad = platoon(16.0, 16.0), platoon(16.0, 16.0)
     x = bad.x.copy()
     x[0, 0] = x[0, 1]  # no gap at the start: the law has a pole there

@@ -27,7 +27,7 @@ CASES, ALPHA = 20, 0.05
 class Truck(VehicleClass):
     """No size of it is taken for none: its p-values are those of the flips alone."""
 
-    strengths: ClassVar = {"phi": replace(VehicleClass.strengths["phi"], usual=None)}
+    strengths: ClassVar = {"phi": replace(VehicleClass.strengths["phi"], min_effect_size=None)}
 
 
 def test_clusters_keep_the_level_where_windows_do_not() -> None:

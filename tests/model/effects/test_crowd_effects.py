@@ -13,7 +13,7 @@ from torch.func import functional_call, vmap
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Relaxation, Scene, SocialForce, State
+from nnode.model import Crowd, Scene, State, make_law
 from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 
@@ -60,7 +60,9 @@ NUMBERS = {item.name: np.linspace(-1.2, 0.9, item.n_agents).tolist() for item in
 
 
 def system(name: str) -> Crowd:
-    model = Crowd([Relaxation(0.5), SocialForce(A, K, KAPPA, r=R, B=B)])
+    model = Crowd(
+        [make_law("relaxation", tau=0.5), make_law("social_force", A=A, k=K, kappa=KAPPA, r=R, B=B)]
+    )
     add_effects(model, [{"name": name, **VALUES[name]}])
     effect = model.terms[-1]
     if CATALOGUE.effects[name].individual:
@@ -311,7 +313,7 @@ def test_probes_build_effects_that_show(name: str) -> None:
 
 def test_effects_that_cannot_act_have_no_probes() -> None:
     alone = collate([people(1, 3)])
-    model = Crowd([Relaxation(0.5)])
+    model = Crowd([make_law("relaxation", tau=0.5)])
     empty = {name for name in VALUES if not CATALOGUE.effects[name].probes(alone, model)}
     assert empty == {
         "pair_repulsion",
@@ -327,7 +329,7 @@ def test_effects_that_cannot_act_have_no_probes() -> None:
 
 
 def test_an_effect_on_a_force_that_is_not_there() -> None:
-    model = Crowd([Relaxation(0.5)])
+    model = Crowd([make_law("relaxation", tau=0.5)])
     add_effects(model, [{"name": "field_of_view", "lambda_": 0.5}])
     with pytest.raises(ValueError, match="social_force or network_force"):
         model(torch.tensor(0.0), torch.cat([BATCH.x[0], BATCH.v[0]], -1), Scene.of(BATCH))

@@ -14,7 +14,7 @@ from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulate import TorchdiffeqSolver
 from tests.model.following import DT, accelerations, behind, model, numbers
 

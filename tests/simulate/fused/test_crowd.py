@@ -13,11 +13,10 @@ from torch import Tensor
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError, SimulationError
-from nnode.model import Crowd, Linear, NetworkForce, Relaxation, SocialForce, System, Traffic
+from nnode.model import Crowd, InteractionForce, Law, System, Traffic, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.model.network import FeedForward
-from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory
-from nnode.simulate.fused import engine
+from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, fused
 from nnode.simulate.kernels.crowds import runs as compiled
 from nnode.simulate.kernels.crowds.rows import SIZE
 from nnode.simulate.kernels.crowds.source import CrowdSource
@@ -27,20 +26,37 @@ from tests.simulate.fused.test_fallback import Sway
 DT = 0.05
 
 
-def network(hidden: int = 4, **options: object) -> NetworkForce:
-    return NetworkForce(hidden, generator=torch.Generator().manual_seed(3), **options)  # type: ignore[arg-type]
+def network(hidden: int = 4, **options: object) -> Law:
+    return make_law(
+        "network_force", hidden=hidden, generator=torch.Generator().manual_seed(3), **options
+    )  # type: ignore[arg-type]
 
 
 MODELS = {
-    "sf": lambda: [Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1)],
-    "sf_opposing": lambda: [
-        SocialForce(2.0, 30.0, 9.0, B=0.1, r=0.3, mass=2.0, opposing_wall_friction=True),
-        Relaxation(0.7),
+    "sf": lambda: [
+        make_law("relaxation"),
+        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1),
     ],
-    "sf_open": lambda: [Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1, walls=False)],
-    "nn": lambda: [Relaxation(), network()],
-    "nn_open": lambda: [network(3, mass=2.0, walls=False), Relaxation()],
-    "nn_self": lambda: [Relaxation(), network(self_interaction=True)],
+    "sf_opposing": lambda: [
+        make_law(
+            "social_force",
+            A=2.0,
+            k=30.0,
+            kappa=9.0,
+            B=0.1,
+            r=0.3,
+            mass=2.0,
+            opposing_wall_friction=True,
+        ),
+        make_law("relaxation", tau=0.7),
+    ],
+    "sf_open": lambda: [
+        make_law("relaxation"),
+        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1, walls=False),
+    ],
+    "nn": lambda: [make_law("relaxation"), network()],
+    "nn_open": lambda: [network(3, mass=2.0, walls=False), make_law("relaxation")],
+    "nn_self": lambda: [make_law("relaxation"), network(self_interaction=True)],
 }
 #: Every model but those of which another one tells as much; each is compiled for seconds.
 COMPILED = [
@@ -56,7 +72,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     def refuse(*args: object) -> None:
         raise AssertionError("the fallback was called")
 
-    monkeypatch.setattr(engine, "TorchdiffeqSolver", refuse)
+    monkeypatch.setattr(fused, "TorchdiffeqSolver", refuse)
 
 
 @pytest.fixture
@@ -162,7 +178,7 @@ def test_saturated_neurons(people: list[Sequence]) -> None:
     model = Crowd(MODELS["nn"]())
     with torch.no_grad():
         for term in model.terms:
-            if isinstance(term, NetworkForce):
+            if isinstance(term, Law) and term.entry == "network_force":
                 term.pair.layers[0].bias[:2] = torch.tensor([25.0, -40.0])
                 term.wall.layers[0].weight.mul_(30.0)
     check(model, single(people), FusedSolver(DT))
@@ -231,7 +247,9 @@ def test_backward_twice(people: list[Sequence]) -> None:
 
 def test_a_blow_up_is_reported(crowd) -> None:  # type: ignore[no-untyped-def]
     items = [crowd(1, name="alone"), crowd(3, name="crushed", apart=0.1)]
-    model = Crowd([Relaxation(), SocialForce(1e300, 0.0, 0.0, B=1e-4)])
+    model = Crowd(
+        [make_law("relaxation"), make_law("social_force", A=1e300, k=0.0, kappa=0.0, B=1e-4)]
+    )
     with pytest.raises(SimulationError, match="crushed blew up"):
         FusedSolver(DT)(model, collate(items))
 
@@ -248,19 +266,19 @@ def test_one_compilation_for_all_shapes(people: list[Sequence], crowd) -> None: 
 
 
 def test_what_is_covered(people: list[Sequence]) -> None:
-    class Weaker(SocialForce):
+    class Weaker(InteractionForce):
         def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
             return 0.5 * super().pair_force(dx, dv)
 
     batch = collate(people)
     assert compiled.supports(Crowd(MODELS["sf"]()), batch)
     assert compiled.supports(Crowd(MODELS["nn"]()))
-    assert not compiled.supports(Traffic([Linear()]))
-    assert not compiled.supports(Crowd([Relaxation()]))
-    assert not compiled.supports(Crowd([Relaxation(), Weaker(1.0, 1.0, 1.0)]))
+    assert not compiled.supports(Traffic([make_law("lin")]))
+    assert not compiled.supports(Crowd([make_law("relaxation")]))
+    assert not compiled.supports(Crowd([make_law("relaxation"), Weaker(entry="social_force")]))
     assert not compiled.supports(Crowd([*MODELS["sf"](), Sway()]))
     deep = Crowd(MODELS["nn"]())
-    next(t for t in deep.terms if isinstance(t, NetworkForce)).pair = FeedForward((4, 3, 3, 2))
+    deep.find_law("network_force").pair = FeedForward((4, 3, 3, 2))
     assert compiled.supports(deep)
     alone = Crowd(MODELS["sf"]())
     alone.neighbours = "measured"

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Linear, Logarithmic, NetworkSpeed, Relaxation, SocialForce, Traffic
+from nnode.model import Crowd, Traffic, make_law
 from nnode.simulate import FusedSolver
 from nnode.simulate.kernels.lanes import runs as lanes
 from tests.simulate.fused.compare import difference, single
@@ -16,11 +16,15 @@ from tests.simulate.fused.test_fallback import Sway
 DT = 0.02
 
 MODELS = {
-    "lin": lambda: Traffic([Linear(18.0, 4.0)]),
-    "log": lambda: Traffic([Logarithmic(18.0, 6.0)], leader="measured"),
-    "n4": lambda: Traffic([NetworkSpeed(4, 18.0, generator=torch.Generator().manual_seed(3))]),
-    "fallback": lambda: Traffic([Linear(18.0, 4.0), Sway()]),
-    "crowd": lambda: Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1)]),
+    "lin": lambda: Traffic([make_law("lin", v0=18.0, L=4.0)]),
+    "log": lambda: Traffic([make_law("log", v0=18.0, L=6.0)], leader="measured"),
+    "n4": lambda: Traffic(
+        [make_law("network_speed", hidden=4, v0=18.0, generator=torch.Generator().manual_seed(3))]
+    ),
+    "fallback": lambda: Traffic([make_law("lin", v0=18.0, L=4.0), Sway()]),
+    "crowd": lambda: Crowd(
+        [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1)]
+    ),
 }
 
 
@@ -68,7 +72,7 @@ def test_every_run_is_its_own(name, threads, ragged, crowd) -> None:  # type: ig
 
 
 def test_missing_parameters_are_the_own_ones(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([Linear(18.0, 4.0)])
+    batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0)])
     lengths = torch.tensor([3.0, 4.0], dtype=torch.float64)
     found = FusedSolver(DT).ensemble(model, {"terms.0.L": lengths}, batch).x
     torch.testing.assert_close(found[:, 1], FusedSolver(DT)(model, batch).x, rtol=0, atol=0)
@@ -76,7 +80,7 @@ def test_missing_parameters_are_the_own_ones(ragged) -> None:  # type: ignore[no
 
 
 def test_a_run_that_blows_up_stays_alone(platoon) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single([platoon([10.0, 6.0])]), Traffic([Linear(18.0, 4.0)])
+    batch, model = single([platoon([10.0, 6.0])]), Traffic([make_law("lin", v0=18.0, L=4.0)])
     v0 = torch.tensor([18.0, float("nan")], dtype=torch.float64, requires_grad=True)
     x = FusedSolver(DT).ensemble(model, {"terms.0.v0": v0}, batch).x
     assert x[:, 0].isfinite().all()
@@ -87,7 +91,7 @@ def test_a_run_that_blows_up_stays_alone(platoon) -> None:  # type: ignore[no-un
 
 
 def test_refusals(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model, solver = single(ragged), Traffic([Linear()]), FusedSolver(DT)
+    batch, model, solver = single(ragged), Traffic([make_law("lin")]), FusedSolver(DT)
     with pytest.raises(ConfigError, match=r"\['terms\.0\.M'\].*terms\.0\.v0, terms\.0\.L"):
         solver.ensemble(model, {"terms.0.M": torch.ones(2)}, batch)
     with pytest.raises(ConfigError, match="found none"):

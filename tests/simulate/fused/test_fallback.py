@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nnode.model import Crowd, Linear, NetworkSpeed, Relaxation, SocialForce, System, Traffic
+from nnode.model import Crowd, Law, System, Traffic, make_law
 from nnode.model.term import State, Term
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.simulate.fused.compare import difference, gradient, single
@@ -34,15 +34,17 @@ class Sway(Term):
         return self.c * torch.tanh(0.05 * (mean - state.x)) * (1 + state.t) * real
 
 
-def network() -> NetworkSpeed:
-    return NetworkSpeed(3, 18.0, generator=torch.Generator().manual_seed(3))
+def network() -> Law:
+    return make_law("network_speed", hidden=3, v0=18.0, generator=torch.Generator().manual_seed(3))
 
 
 MODELS = {
-    "sway": lambda: Traffic([Linear(18.0, 4.0), Sway()]),
-    "two_laws": lambda: Traffic([Linear(18.0, 4.0), network()]),
+    "sway": lambda: Traffic([make_law("lin", v0=18.0, L=4.0), Sway()]),
+    "two_laws": lambda: Traffic([make_law("lin", v0=18.0, L=4.0), network()]),
     "measured": lambda: Traffic([network(), Sway()], leader="measured"),
-    "crowd": lambda: Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1), Sway()]),
+    "crowd": lambda: Crowd(
+        [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1), Sway()]
+    ),
 }
 
 
@@ -64,7 +66,7 @@ def test_states_and_gradient(name, ragged, crowd) -> None:  # type: ignore[no-un
 
 
 def test_frozen_parameters(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([Linear(18.0, 4.0), Sway()])
+    batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0), Sway()])
     model.terms[0].requires_grad_(False)
     _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
     _, own = gradient(model, FusedSolver(DT), batch)
@@ -72,7 +74,7 @@ def test_frozen_parameters(ragged) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_changed_parameters_are_refused(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([Linear(18.0, 4.0), Sway()])
+    batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0), Sway()])
     cost = FusedSolver(DT)(model, batch).x.sum()
     with torch.no_grad():
         model.terms[1].c += 1.0
@@ -81,7 +83,7 @@ def test_changed_parameters_are_refused(ragged) -> None:  # type: ignore[no-unty
 
 
 def test_models_are_not_touched(ragged) -> None:  # type: ignore[no-untyped-def]
-    model: System = Traffic([Linear(18.0, 4.0), Sway()])
+    model: System = Traffic([make_law("lin", v0=18.0, L=4.0), Sway()])
     stacked = {"terms.1.c": torch.tensor([0.1, 0.2], dtype=torch.float64)}
     FusedSolver(DT).ensemble(model, stacked, single(ragged))
     assert model.terms[1].c.item() == 0.4
@@ -117,10 +119,13 @@ def test_it_is_said_once_in_a_run_and_why(name, ragged, crowd, caplog) -> None: 
 def test_compiled_models_and_the_baseline_without_forces_say_nothing(ragged, crowd, caplog) -> None:  # type: ignore[no-untyped-def]
     solver = FusedSolver()
     with caplog.at_level(logging.INFO):
-        solver(Traffic([Linear(18.0, 4.0)]), single(ragged))
+        solver(Traffic([make_law("lin", v0=18.0, L=4.0)]), single(ragged))
         solver(
-            Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0, B=0.1)]), single([crowd(3, samples=4)])
+            Crowd(
+                [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1)]
+            ),
+            single([crowd(3, samples=4)]),
         )
-        solver(Crowd([Relaxation()]), single([crowd(3, samples=4)]))
+        solver(Crowd([make_law("relaxation")]), single([crowd(3, samples=4)]))
     assert not caplog.records
     assert solver.uncompiled == ""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Linear, NetworkForce, Relaxation, SocialForce, Traffic
+from nnode.model import Crowd, InteractionForce, Traffic, make_law
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from nnode.simulate.kernels.crowds import cells as neighbours
 from nnode.simulate.kernels.crowds import runs as crowds
@@ -124,7 +124,9 @@ def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
 @pytest.mark.parametrize("cutoff_error", [1e-3, 1e-6, 1e-10])
 def test_the_bound_holds(cutoff_error: float) -> None:
     A, mass, n = 3.0, 2.0, 300
-    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, mass=mass)])
+    model = Crowd(
+        [make_law("relaxation"), make_law("social_force", A=A, k=40.0, kappa=5.0, mass=mass)]
+    )
     # wall points would be averaged over their own number: one bound at a time
     for walls in (False, True):
         batch = hall(n, walls=2 * walls)
@@ -144,7 +146,12 @@ def test_the_bound_holds(cutoff_error: float) -> None:
 def test_the_bound_of_a_given_distance(cutoff: float) -> None:
     A, decay, mass = 3.0, 0.1, 2.0
     batch = hall(40, walls=0)  # small crowds have a cutoff where one is given
-    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0, B=decay, mass=mass)])
+    model = Crowd(
+        [
+            make_law("relaxation"),
+            make_law("social_force", A=A, k=40.0, kappa=5.0, B=decay, mass=mass),
+        ]
+    )
     with torch.no_grad():
         v = FusedSolver(batch.dt, cutoff=cutoff, cutoff_error=0)(model, batch).v
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
@@ -157,7 +164,7 @@ def test_the_bound_of_a_given_distance(cutoff: float) -> None:
 @pytest.mark.thorough  # compiled for
 def test_no_error_is_everybody() -> None:
     batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0)])
+    model = Crowd([make_law("relaxation"), make_law("social_force", A=3.0, k=40.0, kappa=5.0)])
     with torch.no_grad():
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).x
         for error, same in ((0.0, True), (1e-3, False)):
@@ -186,20 +193,20 @@ def test_bad_cutoffs_are_refused_before_any_work(options: dict[str, float], mess
 def test_models_that_cannot_have_a_cutoff() -> None:
     batch, solver = hall(12), FusedSolver(cutoff=1.0)
 
-    class Weaker(SocialForce):
+    class Weaker(InteractionForce):
         """Not compiled."""
 
         def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
             return 0.5 * super().pair_force(dx, dv)
 
     with pytest.raises(ConfigError, match=r"solver\.cutoff=1 m works for crowds.*set it to null"):
-        solver(Crowd([Relaxation(), Weaker(1.0, 1.0, 1.0)]), batch)
+        solver(Crowd([make_law("relaxation"), Weaker(entry="social_force")]), batch)
     x = np.array([0.0, 12.0]) + np.arange(3.0)[:, None]
     cars = collate([Sequence(name="c", recording="r", time=0.2 * np.arange(3), x=x[..., None])])
     with pytest.raises(ConfigError, match=r"solver\.cutoff=1 m works for crowds"):
-        solver(Traffic([Linear()]), cars)
+        solver(Traffic([make_law("lin")]), cars)
     # the baseline without forces needs none
-    alone = Crowd([Relaxation()])
+    alone = Crowd([make_law("relaxation")])
     with torch.no_grad():
         assert torch.equal(solver(alone, batch).x, FusedSolver()(alone, batch).x)
 
@@ -208,7 +215,7 @@ def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
     # the force on one person, not divided by the number of people
     A, n = 3.0, 2000
     batch = hall(n, walls=0)
-    model = Crowd([Relaxation(), SocialForce(A, 40.0, 5.0)])
+    model = Crowd([make_law("relaxation"), make_law("social_force", A=A, k=40.0, kappa=5.0)])
     with torch.no_grad():
         law = crowds.supports(model, batch)
         assert law is not None
@@ -231,7 +238,9 @@ def test_the_formula_of_the_bound() -> None:
 @pytest.mark.parametrize("walls", [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_lists_give_the_gradient(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0, walls=walls)])
+    model = Crowd(
+        [make_law("relaxation"), make_law("social_force", A=3.0, k=40.0, kappa=5.0, walls=walls)]
+    )
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     for threads in (1, 2):
         found, own = gradient(model, FusedSolver(0.02, threads), batch)
@@ -248,7 +257,9 @@ def test_lists_give_the_gradient(walls: bool) -> None:
 @pytest.mark.parametrize("walls", [False, True])
 def test_lists_in_single_precision(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd([Relaxation(), SocialForce(3.0, 40.0, 5.0, walls=walls)])
+    model = Crowd(
+        [make_law("relaxation"), make_law("social_force", A=3.0, k=40.0, kappa=5.0, walls=walls)]
+    )
     _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     single = gradient(model.to(torch.float32), FusedSolver(0.02), batch.to(dtype=torch.float32))
     assert difference(single[1], wanted) < 1e-4
@@ -256,7 +267,12 @@ def test_lists_in_single_precision(walls: bool) -> None:
 
 def networks(oneself: bool) -> Crowd:
     draw = torch.Generator().manual_seed(2)
-    return Crowd([Relaxation(), NetworkForce(self_interaction=oneself, generator=draw)])
+    return Crowd(
+        [
+            make_law("relaxation"),
+            make_law("network_force", self_interaction=oneself, generator=draw),
+        ]
+    )
 
 
 @pytest.mark.parametrize("oneself", [False, True])
@@ -283,10 +299,10 @@ SCALE = """
 import resource
 import torch
 from tests.simulate.fused.test_neighbours import hall
-from nnode.model import Crowd, Relaxation, SocialForce
+from nnode.model import Crowd, make_law
 from nnode.simulate.kernels.crowds import runs as crowds
 torch.set_num_threads(1)
-model = Crowd([Relaxation(), SocialForce(2.0, 30.0, 9.0)])
+model = Crowd([make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0)])
 law = crowds.supports(model)
 crowds.simulate(model, law, hall(10_000, samples=26), 1)[0].square().sum().backward()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

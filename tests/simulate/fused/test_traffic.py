@@ -9,22 +9,23 @@ import torch
 
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, SimulationError
-from nnode.model import Linear, Logarithmic, NetworkSpeed, Traffic
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from nnode.simulate.fused import engine
+from nnode.model import Law, Traffic, make_law
+from nnode.simulate import FusedSolver, TorchdiffeqSolver, fused
 from nnode.simulate.kernels import lanes
 from tests.simulate.fused.compare import difference, gradient, single
 
 DT = 0.01
 
 
-def network(hidden: int) -> NetworkSpeed:
-    return NetworkSpeed(hidden, 18.0, generator=torch.Generator().manual_seed(3))
+def network(hidden: int) -> Law:
+    return make_law(
+        "network_speed", hidden=hidden, v0=18.0, generator=torch.Generator().manual_seed(3)
+    )
 
 
 LAWS = {
-    "lin": lambda: Linear(18.0, 4.0),
-    "log": lambda: Logarithmic(18.0, 6.0),
+    "lin": lambda: make_law("lin", v0=18.0, L=4.0),
+    "log": lambda: make_law("log", v0=18.0, L=6.0),
     "n4": partial(network, 4),
 }
 
@@ -36,7 +37,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     def refuse(*args: object) -> None:
         raise AssertionError("the fallback was called")
 
-    monkeypatch.setattr(engine, "TorchdiffeqSolver", refuse)
+    monkeypatch.setattr(fused, "TorchdiffeqSolver", refuse)
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
@@ -91,7 +92,7 @@ def test_directional_derivative(ragged) -> None:  # type: ignore[no-untyped-def]
 def test_small_gaps_of_the_logarithm(platoon) -> None:  # type: ignore[no-untyped-def]
     # the law is held constant below its smallest gap
     batch = single([platoon([1e-4, 5.0, -2.0], samples=3)])
-    model = Traffic([Logarithmic(3.0, 4.0)])
+    model = Traffic([make_law("log", v0=3.0, L=4.0)])
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
     found, own = gradient(model, FusedSolver(DT), batch)
     torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-9)
@@ -127,7 +128,7 @@ def test_without_gradient_nothing_is_stored(equal) -> None:  # type: ignore[no-u
 
 def test_long_rows_and_many_blocks(platoon) -> None:  # type: ignore[no-untyped-def]
     batch = single([platoon([15.0] * 30, samples=3, name=f"{i}") for i in range(50)])
-    model = Traffic([Linear(18.0, 4.0)])
+    model = Traffic([make_law("lin", v0=18.0, L=4.0)])
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
     found, own = gradient(model, FusedSolver(DT, 2), batch)
     torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-9)
@@ -137,16 +138,16 @@ def test_long_rows_and_many_blocks(platoon) -> None:  # type: ignore[no-untyped-
 def test_a_blow_up_is_reported(platoon) -> None:  # type: ignore[no-untyped-def]
     batch = collate([platoon([10.0]), platoon([10.0, 0.0], name="touching")])
     with pytest.raises(SimulationError, match=r"touching blew up: agent 1 at 0\.2 s"):
-        FusedSolver(DT)(Traffic([Linear()]), batch)
+        FusedSolver(DT)(Traffic([make_law("lin")]), batch)
 
 
 def test_refusals(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ConfigError, match="threads=0"):
         FusedSolver(threads=0)
     with pytest.raises(ConfigError, match="does not divide"):
-        FusedSolver(0.03)(Traffic([Linear()]), collate([platoon([10.0])]))
+        FusedSolver(0.03)(Traffic([make_law("lin")]), collate([platoon([10.0])]))
     with pytest.raises(DataError, match="2"):
-        FusedSolver(DT)(Traffic([Linear()]), collate([crowd(2)]))
+        FusedSolver(DT)(Traffic([make_law("lin")]), collate([crowd(2)]))
 
 
 @pytest.mark.thorough
@@ -160,11 +161,11 @@ def test_other_networks(hidden: int, ragged) -> None:  # type: ignore[no-untyped
 
 
 def test_code_of_one_s_own_is_not_taken_for_the_formula(platoon) -> None:  # type: ignore[no-untyped-def]
-    class Slower(Linear):
+    class Slower(Law):
         def speed(self, gap: torch.Tensor) -> torch.Tensor:
             return super().speed(gap) / 2
 
     batch = collate([platoon([10.0])])
-    assert lanes.supports(Traffic([Linear()]), batch)
-    assert not lanes.supports(Traffic([Slower()]), batch)
-    assert not lanes.supports(Traffic([Linear(), Linear()]), batch)
+    assert lanes.supports(Traffic([make_law("lin")]), batch)
+    assert not lanes.supports(Traffic([Slower("lin")]), batch)
+    assert not lanes.supports(Traffic([make_law("lin"), make_law("lin")]), batch)

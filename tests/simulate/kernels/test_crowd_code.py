@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Relaxation, SocialForce
-from nnode.model.crowd_formula import crowd_of
+from nnode.model import Crowd, make_law
+from nnode.model.formula import crowd_of
 from nnode.simulate.kernels import source
 from nnode.simulate.kernels.crowds import runs as crowds
 from nnode.simulate.kernels.crowds import templates as crowd_templates
@@ -22,10 +22,10 @@ SCRIPT = """
 import json
 import numpy as np
 from nnode.data.sequence import Sequence, collate
-from nnode.model import Crowd, Relaxation, SocialForce
+from nnode.model import Crowd, make_law
 x = np.arange(12.0).reshape(1, 6, 2) + 0.1 * np.arange(3)[:, None, None]
 batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x)])
-model = Crowd([Relaxation(), SocialForce(1.0, 1.0, 1.0)])
+model = Crowd([make_law("relaxation"), make_law("social_force")])
 from nnode.simulate import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
 from nnode.simulate.kernels.crowds.runs import compiled, supports
@@ -66,17 +66,22 @@ def test_everything_that_is_compiled_in_counts() -> None:
 
 
 def test_one_law_of_other_bodies_is_one_module() -> None:
-    one, other = SocialForce(1.0, 2.0, 3.0), SocialForce(4.0, 5.0, 6.0, r=0.3, B=0.2, mass=70.0)
+    one, other = (
+        make_law("social_force", A=1.0, k=2.0, kappa=3.0),
+        make_law("social_force", A=4.0, k=5.0, kappa=6.0, r=0.3, B=0.2, mass=70.0),
+    )
     texts = set()
     for force in (one, other):
-        law = crowd_of([Relaxation(0.1 * len(texts) + 0.4), force])
+        law = crowd_of([make_law("relaxation", tau=0.1 * len(texts) + 0.4), force])
         assert law is not None
         texts.add(CrowdSource(law).text())
     assert len(texts) == 1
 
 
 def test_its_source_is_shown() -> None:
-    text = source(Crowd([Relaxation(), SocialForce(1.0, 2.0, 3.0)]))
+    text = source(
+        Crowd([make_law("relaxation"), make_law("social_force", A=1.0, k=2.0, kappa=3.0)])
+    )
     assert "social_force.pair_x = sum over others of" in text
     assert "def backward(" in text
 
@@ -84,7 +89,7 @@ def test_its_source_is_shown() -> None:
 def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
-    law = crowd_of([SocialForce(1.0, 2.0, 3.0)])
+    law = crowd_of([make_law("social_force", A=1.0, k=2.0, kappa=3.0)])
     assert law is not None
     with pytest.raises(ConfigError, match="NNODE_CACHE"):
         crowds.compiled.__wrapped__(CrowdSource(law))

@@ -12,7 +12,7 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
-from nnode.model.field_crowd import PEDESTRIAN_LAWS
+from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 
 DT = 0.02

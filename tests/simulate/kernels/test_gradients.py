@@ -16,7 +16,7 @@ from torch import Tensor
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Traffic, build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS
 from nnode.simulate import TorchdiffeqSolver, Trajectory
 from nnode.simulate.kernels import lanes

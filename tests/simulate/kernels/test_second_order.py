@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from nnode.errors import ConfigError
-from nnode.model import Linear, Traffic, build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model import Traffic, build_model, make_law
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from nnode.simulate.kernels import lanes
 from tests.simulate.fused.compare import difference, gradient, single
@@ -98,7 +98,7 @@ def test_a_platoon_keeps_the_gap_of_equilibrium() -> None:
 
 
 def test_one_line_is_the_law_that_the_package_has(ragged: Any) -> None:
-    batch, own, known = single(ragged), build_model(OWN), Traffic([Linear(18.0, 4.0)])
+    batch, own, known = single(ragged), build_model(OWN), Traffic([make_law("lin", v0=18.0, L=4.0)])
     found, slope = gradient(own, FusedSolver(DT), batch)
     exact, wanted = gradient(known, FusedSolver(DT), batch)
     torch.testing.assert_close(found.x, exact.x, rtol=1e-14, atol=1e-12)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, build_model
+from nnode.model.arrays import computed
 from nnode.model.effects.following import ReactionDelay
-from nnode.model.field import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.steps import METHODS
 from nnode.model.tangent import with_tangents
-from nnode.model.tensors import computed
 from nnode.simulate import Solver, TorchdiffeqSolver
 from nnode.simulate.kernels import lanes
 from tests.model.following import DT, driven, model, set_

@@ -12,7 +12,6 @@ import pytest
 from nnode.data.options import JuelichOptions, Velocity
 from nnode.data.prepare import prepare
 from nnode.data.sequence import collate
-from nnode.model import NetworkForce
 from nnode.pages.page import TableBlock, Text
 from nnode.study.crowd import conventions
 from nnode.study.crowd.conventions import EVERY, Convention, Tracks, key
@@ -106,7 +105,7 @@ def test_a_scan_begins_at_every_frame_that_it_is_told(recording: str) -> None:
 
 
 def test_networks_with_the_person_himself_are_calibrated(recording: str) -> None:
-    term = new_system("nn_self").find(NetworkForce)
+    term = new_system("nn_self").find_law("network_force")
     assert term is not None
     assert term.self_interaction
     batch = Tracks.of(recording).cut(Convention(), 3)

@@ -10,8 +10,7 @@ from nnode.calibrate.cost import Convention
 from nnode.calibrate.gauss_newton.method import TangentCost
 from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
-from nnode.model.field import CAR_FOLLOWING_LAWS
-from nnode.model.formula_law import law_from
+from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.simulate.fused import FusedSolver
 from nnode.study.following import data, fit, inference, leaders, printed
 from nnode.study.following.candidates import EVERY, decay, key, starts

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nnode.model.build import build_model
-from nnode.model.field import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.system import System
 from nnode.study.following import stability
 from nnode.study.following.candidates import EVERY

@@ -21,7 +21,7 @@ from nnode.model.crowd_dynamics import OTHERS, POINTS, SEEN, WALLS, CrowdDynamic
 from nnode.model.expression import Expr, symbols, topological
 from nnode.model.names import check_symbols
 from nnode.model.text import plain
-from nnode.simulate.kernels import functions, polynomials
+from nnode.simulate.kernels import functions
 from nnode.simulate.kernels.cache import digest, keep
 from nnode.simulate.kernels.loops import Loop
 
@@ -35,7 +35,9 @@ from math import cos, sin, sqrt
 import numpy as np
 from numba import njit
 
-from nnode.simulate.kernels.functions import exp, log, logistic, real, torch_softplus
+from nnode.simulate.kernels.functions import (
+    exp, log, logistic, real, recip, softplus, softplus_slope, tanh, torch_softplus, where,
+)
 
 # sums may be reordered: they are over a handful of neighbours
 OPTIONS = dict(error_model="numpy", fastmath={{"contract", "nsz", "reassoc"}})
@@ -135,7 +137,7 @@ class WalkSource:
         )
         used = symbols(outputs)
         text = f"\n\n@njit(**OPTIONS)\ndef {name}({', '.join(takes)}, have, q):\n"
-        text += "    dt = zero = 0.0\n    one, two = 1.0, 2.0\n" + loop.given(outputs)
+        text += "    dt = zero = 0.0\n" + loop.given(outputs)
         for i, field in enumerate(FIELDS):
             text += f"    {field} = have[{i}]\n" if field in used else ""
         text += "".join(f"    {line}\n" for line in lines)
@@ -154,4 +156,4 @@ def compiled(source: WalkSource) -> ModuleType:
         ConfigError: the cache folder cannot be written.
     """
     text = source.text().encode()
-    return keep(f"nnode_walk_{digest(text, [functions, polynomials])}", text)
+    return keep(f"nnode_walk_{digest(text, [functions])}", text)

@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from nnode.model.crowd_dynamics import OTHERS, POINTS, SMALLEST, CrowdDynamics
-from nnode.model.expression import UNARY, Expr, apply, const, substitute, symbol, symbols
+from nnode.model.expression import Expr, apply, const, substitute, symbol, symbols
+from nnode.model.operations import FUNCTIONS
 
 #: What a difference is made of: the receiver's part and the source's, of which one may be missing.
 _PARTS = {
@@ -55,7 +56,7 @@ def split(
         found = law.sums[over]
         outer = {name: _weights(summand, same) for name, summand in found.items()}
         inner = list(dict.fromkeys(g for _, weights in outer.values() for g in weights))
-        if not inner or inner[0].op not in UNARY or len({g.op for g in inner}) > 1:
+        if not inner or FUNCTIONS.get(inner[0].op) != 1 or len({g.op for g in inner}) > 1:
             continue
         numbers = [_weights(g.args[0], same) for g in inner]
         if not all(s.op == "symbol" and s.value in parts for _, w in numbers for s in w):

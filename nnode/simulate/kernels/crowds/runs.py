@@ -14,14 +14,14 @@ from torch.autograd.function import once_differentiable
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.model.crowd import InteractionForce, NetworkForce, SocialForce
 from nnode.model.crowd_dynamics import OTHERS, SMALLEST, WALLS, CrowdDynamics
-from nnode.model.crowd_formula import crowd_of, people_of, settings_of, walls_of
-from nnode.model.formula import own_values, values_of
+from nnode.model.crowd_formula import people_of, settings_of, walls_of
+from nnode.model.formula import crowd_of, own_values, values_of
+from nnode.model.laws import InteractionForce
 from nnode.model.scene import Scene
 from nnode.model.system import Crowd, System
 from nnode.model.term import Term
-from nnode.simulate.kernels import functions, polynomials
+from nnode.simulate.kernels import functions
 from nnode.simulate.kernels.cache import digest, keep
 from nnode.simulate.kernels.crowds import cells, least
 from nnode.simulate.kernels.crowds import rows as crowd_rows
@@ -34,7 +34,7 @@ from nnode.simulate.kernels.threads import run_all
 #: crowds, and so most recordings, are exact to rounding instead.
 LISTS_FROM = 200
 #: Compiled into every module besides its own text.
-_COMPILED_IN = (crowd_rows, least, cells, functions, polynomials)
+_COMPILED_IN = (crowd_rows, least, cells, functions)
 
 
 @cache
@@ -63,7 +63,7 @@ def supports(system: System, batch: Batch | None = None) -> CrowdDynamics | None
     law = crowd_of(terms)
     if law is None or not (law.sums[OTHERS] or law.sums[SMALLEST]):
         return None  # nobody meets anybody: cheap in PyTorch
-    force = system.find(NetworkForce)
+    force = system.find(InteractionForce)
     # only the sums of the force are over oneself as well
     alone = len(law.sums[OTHERS]) == 2 or force is None or not force.self_interaction
     return law if alone else None
@@ -239,7 +239,7 @@ def simulate(
     jobs, size = _layout(order, counts, steps * (4 + len(source.kept)), width, threads)
     number = y0.new_tensor
     force = system.find(InteractionForce)
-    alone = not (isinstance(force, NetworkForce) and force.self_interaction)
+    alone = force is None or not force.self_interaction
     plan = _Plan(
         module=compiled(source),
         jobs=jobs,
@@ -290,7 +290,7 @@ def _distances(
     system: System, law: CrowdDynamics, cutoff: float | None, cutoff_error: float, people: int
 ) -> tuple[float, ...]:
     """Cutoffs of pairs and of wall points, m; none where everybody meets everybody."""
-    social = system.find(SocialForce)
+    social: Any = system.find_law("social_force")
     check_cutoff(cutoff, cutoff_error, 2 * social.r if social else 0.0)
     if cutoff is not None:
         if law.sums[SMALLEST]:

@@ -20,7 +20,10 @@ from nnode.simulate.kernels.crowds.rows import (
     increase, keep, keep_back, less, load, meeting, periods, pieces, repeat, scattered, seats,
     space, store, subtract, weigh, weigh_less,
 )
-from nnode.simulate.kernels.functions import INLINE, add, exp, log, logistic, real, torch_softplus
+from nnode.simulate.kernels.functions import (
+    INLINE, add, exp, log, logistic, real, recip, softplus, softplus_slope, tanh, torch_softplus,
+    where,
+)
 
 ROWS = {rows}
 # unsigned: a signed index may be negative, and would be tested for it in every load
@@ -125,7 +128,7 @@ NEURONS = """
 
 @njit(**LOOP)
 def values_{over}(room, other, there, n, dt):
-    zero, one, two = real(0, dt), real(1, dt), real(2, dt)
+    zero = real(0, dt)
     for j in range(np.uint64(n)):
         z = room[j] - other[j]
 {value}
@@ -134,7 +137,7 @@ def values_{over}(room, other, there, n, dt):
 
 @njit(**LOOP)
 def slopes_{over}(room, other, there, back, n, dt):
-    zero, one, two = real(0, dt), real(1, dt), real(2, dt)
+    zero = real(0, dt)
     for j in range(np.uint64(n)):
         z = room[j] - other[j]
 {slope}

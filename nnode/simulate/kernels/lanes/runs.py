@@ -20,7 +20,7 @@ from nnode.model.steps import STAGES, stepped
 from nnode.model.system import System, Traffic, initial_with
 from nnode.model.tangent import with_tangents
 from nnode.model.term import Term
-from nnode.simulate.kernels import functions, polynomials
+from nnode.simulate.kernels import functions
 from nnode.simulate.kernels.cache import digest, keep
 from nnode.simulate.kernels.lanes import rows as lane_rows
 from nnode.simulate.kernels.lanes.source import LaneSource
@@ -37,7 +37,7 @@ _BEHIND = 2 * lane_rows.CHUNK
 #: Distances of rows; not powers of two: rows would compete for the same lines of the cache.
 _STRIDES = (1424, 5200, 20800, 83200)
 #: Compiled into every module besides its own text.
-_COMPILED_IN = (lane_rows, functions, polynomials)
+_COMPILED_IN = (lane_rows, functions)
 
 
 @cache

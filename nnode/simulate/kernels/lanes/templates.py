@@ -13,7 +13,10 @@ from numba import njit
 from nnode.simulate.kernels.lanes.rows import (
     collect, copy, lead_places, masks, padded, place, spread, take,
 )
-from nnode.simulate.kernels.functions import INLINE, add, exp, log, logistic, real, torch_softplus
+from nnode.simulate.kernels.functions import (
+    INLINE, add, exp, log, logistic, real, recip, softplus, softplus_slope, tanh, torch_softplus,
+    where,
+)
 
 SCALAR = dict(error_model="numpy", fastmath={{"contract", "nsz"}})
 S = np.uint64({stride})

@@ -1,0 +1,742 @@
+"""Laws: entries of formulas and parameters. The package's own are files in ``laws/``; a user's own
+come from ``model.law``."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from importlib.resources import files
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from nnode.errors import ConfigError
+from nnode.model.crowd_formula import rates_of, settings_of
+from nnode.model.expression import Expr, call, const, substitute, symbol, symbols
+from nnode.model.names import check_names
+from nnode.model.network import FeedForward
+from nnode.model.parse import parse
+from nnode.model.steps import METHODS
+from nnode.model.tensors import Code, computed
+from nnode.model.term import Interval, State, Term
+from nnode.model.terms import (
+    LARGEST,
+    OTHERS,
+    POINTS,
+    REDUCED,
+    SMALLEST,
+    CrowdDynamics,
+    LaneDynamics,
+    Rule,
+    add_term,
+    own_values,
+    values_of,
+)
+from nnode.model.units import in_si
+
+#: Quantities of a lane that are 0 where everybody drives at one speed, as far as a law may name
+#: them.
+_AT_REST = ("dv", "t", "clock", "x", "x_1", "x_2", "v_2", "length_1", "gap_1", "dx_1", "v", "v_1")
+#: The step that a map from step to step is shown with, s.
+_STEP = 0.1
+#: No vehicle is faster, m/s.
+FASTEST = 100.0
+#: What the description of a user's own law may say, of a lane and of a crowd.
+_COMMON = ("parameters", "constants", "where")
+_KEYS = (*_COMMON, "delayed", "remembered", "states", "step", "rate", "source")
+_CROWD_KEYS = (*_COMMON, "rate", "source", *REDUCED)
+#: Entries that are mappings.
+_MAPPINGS = (*_COMMON, "delayed", "states", *REDUCED)
+#: A network that is added to a law, by its order: inputs are brought to the size of one, SI units.
+_ADDED = {1: "NN(gap/20)", 2: "NN(gap/20, v/10, dv/2)"}
+_PARAMETER = {"value", "low", "high", "unit"}
+
+
+@cache
+def entries() -> dict[str, dict[str, Any]]:
+    """The package's laws by name, in the order of their ranks, as their files describe them.
+
+    Beside the entries of a user's own law: ``about``, one line; ``formula`` as it is printed;
+    ``model``, the entries that make a model of this name, each with options of its own; absent:
+    the law is given as ``model.law``. ``settings``, quantities that options give; ``networks``,
+    submodule to the functions in formulas that are its outputs; ``hidden``, neurons of their
+    hidden layer; ``force``, ``drive``, see :class:`nnode.model.terms.Rule`; ``variants``, option to
+    the entries that it changes where it is true. A parameter whose value is a list starts uniform
+    between both.
+    """
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    found = {
+        file.name.removesuffix(".yaml"): yaml.load(file.read_text("utf-8"), loader)
+        for file in files("nnode.model.laws").iterdir()
+        if file.name.endswith(".yaml")
+    }
+    return dict(sorted(found.items(), key=lambda item: (item[1].get("rank", 100), item[0])))
+
+
+def _described(keys: Sequence[str], states: set[str]) -> dict[str, dict[str, Any]]:
+    return {
+        name: {key: value for key, value in entry.items() if key in keys}
+        for name, entry in entries().items()
+        if "model" not in entry and states & set(entry["rate"])
+    }
+
+
+#: Name of a law to its description as ``model.law``.
+CAR_FOLLOWING_LAWS = _described(_KEYS, {"v"})
+PEDESTRIAN_LAWS = _described(_CROWD_KEYS, {"vx", "y"})
+#: Neurons of the hidden layer of those that are networks.
+NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
+
+
+def without_walls(description: Mapping[str, Any]) -> dict[str, Any]:
+    """A law of people whose walls nobody feels."""
+    unit = "0" if "x" in description["rate"] else "0 m/s²"
+    zero = dict.fromkeys(description.get("walls", {}), unit)
+    kept = {key: value for key, value in description.items() if key != "walls"}
+    return {**kept, "constants": {**description.get("constants", {}), **zero}}
+
+
+class Law(Term):
+    """A term that effects change: a law of vehicles or people, described by an entry.
+
+    A subclass may be code: it overrides ``speed`` (of a lane, first order) or ``forward``.
+
+    Args:
+        entry: name of the package's entry, or a description: ``parameters`` and ``rate`` at least.
+            Parameters are quantities with a unit, ``30 m/s``, or mappings of ``value``, ``low``
+            and ``high``. ``rate`` is ``{x: formula}``, m/s, or ``{v: formula}``, m/s², of a lane;
+            ``{vx: formula, vy: formula}``, m/s², or ``{x: formula, y: formula}``, m/s, of a crowd;
+            what they may name stands in :mod:`nnode.model.terms`.
+        name: of the term; by default the entry's.
+        hidden: neurons of the hidden layer of networks. Where formulas do not call NN, a network,
+            NN(gap/20, v/10, dv/2) is added to the rate, in SI units, and starts at 0. None: as the
+            entry says, or no network.
+        box: weights stay in [-box, box]; None leaves them free.
+        generator: of start values that are drawn.
+        options: start values of parameters and values of settings, in SI units and by their names
+            (None: as the entry says), ``L_min`` for the low end of ``L``, and variants.
+
+    Attributes:
+        order: 1: its rate is a speed; 2: an acceleration.
+        step: its own method of stepping, see :mod:`nnode.model.steps`; None: that of its order.
+            ``rk4`` is ballistic beside an effect that remembers step by step.
+        rule: what it does; None: its ``forward`` is code.
+        formulas: what its entry says.
+
+    A leader that drives by itself keeps the speed v0 in a law of first order, which must have
+    such a parameter then, and its first speed in one of second order.
+
+    Raises:
+        ConfigError: what is missing, cannot be read, or has the wrong unit.
+        ValueError: a setting that is not positive.
+    """
+
+    order = 2
+    step: str | None = None
+    formulas: Rule
+
+    def __init__(
+        self,
+        entry: str | Mapping[str, Any],
+        name: str = "",
+        *,
+        hidden: int | None = None,
+        box: float | None = None,
+        generator: torch.Generator | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        self.entry = entry if isinstance(entry, str) else ""
+        found = dict(entries()[entry] if isinstance(entry, str) else entry)
+        for option, changes in found.pop("variants", {}).items():
+            setattr(self, option, bool(options.pop(option, False)))
+            if getattr(self, option):
+                found |= {key: {**found[key], **value} for key, value in changes.items()}
+        self.name = str(name or self.entry)  # type: ignore[misc]
+        self.source = str(found.get("source", getattr(type(self), "source", "")))  # type: ignore[misc]
+        check_names("model.name", [self.name])
+        self.networks: dict[str, list[str]] = found.get("networks", {"network": ["NN"]})
+        self.network: FeedForward | None = None
+        self.formulas = _rule(found)
+        self.domain = "crowd" if self.formulas.of_crowd else "traffic"
+        if self.domain == "traffic":
+            self.order, self.step = 1 if "x" in found["rate"] else 2, found.get("step")
+        else:
+            self.order = self.formulas.order
+        self.memory = (  # type: ignore[misc]
+            len(self.formulas.states) + len(self.formulas.delayed) * self.formulas.remembered
+        )
+        if self.step is not None and self.step not in METHODS:
+            raise ConfigError(
+                f"model.law.step={self.step} is unknown, expected {', '.join(METHODS)}"
+            )
+        self._declare(found["parameters"], options, generator)
+        for setting, quantity in found.get("settings", {}).items():
+            value = options.pop(setting, None)
+            if value is not None and not value > 0:
+                raise ValueError(f"{setting}={value} must be positive")
+            setattr(self, setting, in_si(quantity)[0] if value is None else value)
+        if options:
+            raise ValueError(f"the law {self.name} has no option {', '.join(options)}")
+        self._connect(found.get("hidden") if hidden is None else hidden, generator)
+        if box is not None:
+            for module in self.networks:
+                self.bound_all(f"{module}.", Interval(-box, box))
+        text = self.formulas.rate if self.domain == "traffic" else ", ".join(self.formulas.rate)
+        self.formula = found.get("formula", getattr(type(self), "formula", text))  # type: ignore[misc]
+        self._coded()
+        self._key = repr(self.rule)
+        self.dynamics()  # says what is wrong with the formulas
+
+    def _declare(
+        self, parameters: Mapping[str, Any], options: dict[str, Any], draws: torch.Generator | None
+    ) -> None:
+        """Declare the parameters; takes their options."""
+        check_names("model.law.parameters", parameters)
+        given = {name: options.pop(name, None) for name in parameters}
+        for name, quantity in parameters.items():
+            if hasattr(self, name):
+                raise ConfigError(f"model.law.parameters: {name} cannot be the name of a parameter")
+            entry = dict(quantity) if isinstance(quantity, Mapping) else {"value": quantity}
+            if not {"value"} <= set(entry) <= _PARAMETER:
+                raise ConfigError(
+                    f"model.law.parameters.{name}={quantity}: expected a quantity such as 30 m/s, "
+                    "or {value: 30 m/s, low: 0 m/s, high: 60 m/s}"
+                )
+            unit, drawn = entry.pop("unit", None), None
+            if self.entry and isinstance(entry["value"], list):
+                low, high = (in_si(str(end))[0] for end in entry["value"])
+                share = torch.rand((), generator=draws, dtype=torch.float64)
+                drawn, entry["value"] = float(low + (high - low) * share), entry["value"][0]
+            found = {key: in_si(str(value)) for key, value in entry.items()}
+            units = {own for _, own in found.values()}
+            if len(units) > 1:
+                raise ConfigError(
+                    f"model.law.parameters.{name} has the units {', '.join(sorted(units))}; value, "
+                    "low and high need the same kind of unit"
+                )
+            bounds = {key: value for key, (value, _) in found.items() if key != "value"}
+            if "low" in bounds and options.get(f"{name}_min") is not None:
+                bounds["low"] = float(options.pop(f"{name}_min"))
+            start = found["value"][0] if drawn is None else drawn
+            self.declare(
+                name, start if given[name] is None else given[name], unit=unit or units.pop(),
+                bounds=Interval(**bounds) if bounds else None,
+            )  # fmt: skip
+
+    def _connect(self, hidden: int | None, generator: torch.Generator | None) -> None:
+        """Make the networks, of as many inputs as the formulas give them."""
+        inputs: dict[str, set[int]] = {name: set() for name in self.networks}
+
+        def count(module: str, *values: Expr) -> Expr:
+            inputs[module].add(len(values))
+            return const(0)
+
+        functions = {f: partial(count, m) for m, names in self.networks.items() for f in names}
+        calls = re.compile(rf"\b({'|'.join(functions)})\s*\(")
+        added = not any(calls.search(text) for text in self.formulas.texts)
+        if hidden is None:
+            if not added and self.domain == "traffic":
+                raise ConfigError(
+                    f"model.law of {self.name} calls NN, a network: say how many neurons its "
+                    "hidden layer has, as model.network=4"
+                )
+            self.networks = {}
+            return
+        if added:
+            rate = f"{self.formulas.rate} + {_ADDED[self.order]}"
+            self.formulas = replace(self.formulas, rate=rate)
+        for text in self.formulas.texts:
+            if calls.search(text):
+                parse(text, None, {**dict.fromkeys(self.formulas.where, const(0)), **functions})
+        for module, found in inputs.items():
+            if len(found) != 1:
+                raise ConfigError(
+                    f"model.law of {self.name}: {self.networks[module][0]} is called with "
+                    f"{sorted(found) or 'no'} inputs, expected the same number everywhere"
+                )
+            sizes = (found.pop(), int(hidden), len(self.networks[module]))
+            setattr(self, module, FeedForward(sizes, generator))
+        if added:
+            assert self.network is not None
+            with torch.no_grad():
+                for weight in self.network.layers[-1].parameters():
+                    weight.zero_()
+
+    def _coded(self) -> None:
+        """Say by ``rule`` what the class says: formulas, or calls of its own code."""
+        self.rule = self.formulas
+        self._methods: dict[str, Callable[..., Expr]] = {}
+        if type(self).speed is not Law.speed and self.domain == "traffic" and self.order == 1:
+            self._methods["speed"] = partial(call, "speed")
+            self.rule = replace(self.formulas, rate="speed(gap)")
+        if type(self).forward not in (Law.forward, InteractionForce.forward):
+            self.rule = None
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        sizes = [getattr(self, module).sizes for module in self.networks]
+        return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
+
+    @property
+    def of_gap(self) -> bool:
+        """Whether it is a speed that depends on the gap alone."""
+        if self.domain != "traffic" or self.order != 1 or self.memory:
+            return False
+        return _names_gap_alone(self.dynamics(called=True))
+
+    def names(self, parameter: str) -> bool:
+        """Whether the rate of a vehicle names a parameter."""
+        return f"{self.name}__{parameter}" in symbols([self.dynamics(called=True).law])
+
+    def code(self) -> dict[str, Code]:
+        """What calls in its formulas stand for, by name."""
+        found: dict[str, Code] = {"speed": self.speed, "0": _first, "1": _second}
+        return {**found, **{m: partial(_joined, getattr(self, m)) for m in self.networks}}
+
+    def written(
+        self, model: Any, owner: str, place: int, rule: Rule | None = None, called: bool = False
+    ) -> Any:
+        """A model with this term.
+
+        Args:
+            model: its formulas so far.
+            owner: name of the term in the model; symbols begin with it.
+            place: of the term in the model.
+            rule: in place of its own.
+            called: whether networks stay functions; otherwise they are written out, neuron by
+                neuron.
+        """
+        rule = rule or self.rule or self.formulas
+        parameters, owned, units = parameters_of(self, owner, place)
+        functions = dict(self._methods)
+        for module, names in self.networks.items():
+            if called:
+                functions |= {name: partial(_output, module, k) for k, name in enumerate(names)}
+                continue
+            network, label, path = (
+                getattr(self, module),
+                f"{owner}__{module}",
+                f"terms.{place}.{module}.",
+            )
+            functions |= {
+                name: partial(_neurons, network, label, path, k) for k, name in enumerate(names)
+            }
+            if any(re.search(rf"\b{name}\s*\(", t) for name in names for t in rule.texts):
+                _, weights = network.written([const(0)] * network.sizes[0], label, path)
+                owned |= weights
+                units |= dict.fromkeys(weights, "*")
+        return add_term(model, owner, rule, parameters, owned, units, place, functions)
+
+    def dynamics(self, called: bool = False) -> Any:
+        """Its formulas alone, as its entry says them; of a crowd flat."""
+        key = (*self.shape, called)
+        if key not in _KNOWN:
+            empty = CrowdDynamics() if self.domain == "crowd" else LaneDynamics(order=self.order)
+            found = self.written(empty, self.name, 0, self.formulas, called)
+            _KNOWN[key] = found.flat() if self.domain == "crowd" else found
+        return _KNOWN[key]
+
+    def computed(self, formulas: Sequence[Expr], values: Mapping[str, Tensor]) -> list[Tensor]:
+        """Formulas of its parameters, settings, networks and of other quantities."""
+        law = self.dynamics(called=True)
+        own = dict(zip(law.owned, values_of(law, own_values([self], law)), strict=True))
+        like = next(iter(values.values()))
+        own |= {k: like.new_tensor(value) for k, value in settings_of([self], law).items()}
+        return computed(formulas, {**own, **values}, code=self.code())
+
+    def evaluated(self, values: Mapping[str, Tensor]) -> Tensor:
+        """The rate of a vehicle, of values of the quantities in it."""
+        return self.computed([_law_alone(self.dynamics(called=True))], values)[0]
+
+    def speed(self, gap: Tensor) -> Tensor:
+        """Speed, m/s, at a gap, m, elementwise, where everybody drives at one speed; of a law of
+        second order the least such speed of an acceleration that is not negative at rest, up to
+        100 m/s."""
+        if self.of_gap:
+            return self.evaluated({"gap": gap}).expand_as(gap)
+        zero = torch.zeros_like(gap)
+        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
+        lane = self.dynamics(called=True).flat()
+
+        def says(v: Tensor) -> Tensor:
+            """The formula where everybody has driven at v for long."""
+            values = {**known, "v": v, "v_1": v, "dx_1": v, **dict.fromkeys(lane.starts, zero)}
+            begun = self.computed(list(lane.starts.values()), values)
+            values |= dict(zip(lane.starts, begun, strict=True))
+            return self.evaluated(values).expand_as(gap)
+
+        if self.order == 1:
+            return says(zero)
+        low, high = zero, torch.full_like(gap, FASTEST)
+        for _ in range(60):
+            half = (low + high) / 2
+            faster = says(half) > 0
+            low, high = torch.where(faster, half, low), torch.where(faster, high, half)
+        return torch.where(says(zero) > 0, low, zero)
+
+    def forward(self, state: State) -> Tensor:
+        """By its formulas."""
+        if self.domain == "crowd":
+            return rates_of([self], self.dynamics(called=True), state, self.code())
+        if not self.of_gap:
+            raise ConfigError(
+                f"the law {self.name} is a formula and cannot be mixed with terms that are code"
+            )
+        x, scene = state.x[..., 0], state.scene
+        speed = self.speed(x[:, 1:] - x[:, :-1])
+        ahead = torch.cat([speed, speed.new_zeros(len(speed), 1)], 1)
+        v0 = getattr(self, "v0", 0.0)  # without it leaders drive as measured
+        return torch.where(scene.follower, ahead, v0 * scene.leader)[..., None]
+
+    def alone(self) -> Law:
+        """The same law of people where nobody meets anybody, nor a wall."""
+        law, found = self.dynamics(), copy.copy(self)
+        value = {SMALLEST: "nobody", LARGEST: "-nobody"}
+        bare: dict[str, Any] = {
+            over: {
+                n: (law.units[f"{self.name}__{n}"], value.get(over, "0"))
+                for n in getattr(self.formulas, over)
+            }
+            for over in REDUCED
+        }
+        found.rule = found.formulas = replace(self.formulas, **bare)
+        found._key = repr(found.rule)
+        return found
+
+
+#: Laws' shapes to their formulas.
+_KNOWN: dict[tuple[Any, ...], Any] = {}
+
+
+@cache
+def _law_alone(lane: LaneDynamics) -> Expr:
+    """A law's rate, with fixed quantities as numbers."""
+    assert lane.law is not None
+    return substitute(lane.law, lane.fixed)
+
+
+@cache
+def _names_gap_alone(lane: LaneDynamics) -> bool:
+    return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
+
+
+#: Methods of a force that formulas can call, with the functions that are their outputs.
+_CODED = {
+    "pair_force": ["pair_force_x", "pair_force_y"],
+    "wall_force": ["wall_force_x", "wall_force_y"],
+}
+
+
+def velocity(state: State) -> Tensor:
+    """``(B, N, 2)`` m/s.
+
+    Raises:
+        ValueError: the model is of first order.
+    """
+    if state.v is None:
+        raise ValueError("a term of a second-order model needs velocities")
+    return state.v
+
+
+def _first(out: Tensor) -> Tensor:
+    return out[..., 0]
+
+
+def _second(out: Tensor) -> Tensor:
+    return out[..., 1]
+
+
+def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
+    """A network, layer by layer."""
+    out: Tensor = network(torch.stack(torch.broadcast_tensors(*inputs), -1))
+    return out
+
+
+def _output(name: str, number: int, *inputs: Expr) -> Expr:
+    """One output of code."""
+    return call(str(number), call(name, *inputs))
+
+
+def _neurons(network: FeedForward, label: str, path: str, number: int, *inputs: Expr) -> Expr:
+    """One output of a network that is written out."""
+    return network.written(list(inputs), label, path)[0][number]
+
+
+class FollowTheLeader(Law):
+    """Base of laws of a lane that are code: a subclass defines ``name`` and ``speed``.
+
+    dx_i/dt = W(x_{i+1} - x_i) for followers, dx_N/dt = v0.
+
+    Args:
+        v0: m/s, the speed of the leading vehicle.
+    """
+
+    v0: Tensor
+
+    def __init__(self, v0: float) -> None:
+        entry = {"parameters": {"v0": "30 m/s"}, "rate": {"x": "speed(gap)"}}
+        super().__init__(entry, type(self).name, v0=v0)
+
+    def speed(self, gap: Tensor) -> Tensor:
+        """W: gap in m to speed in m/s, elementwise."""
+        raise NotImplementedError  # pragma: no cover - every law defines its own
+
+
+class InteractionForce(Law):
+    """Forces between people and from walls, averaged as in the paper.
+
+    (1/m) mean over the N people of the pair force + (1/m) mean over the P wall points of the
+    wall force. A person exerts no force on himself unless the entry says so, but counts in N.
+    Forces are those of the entry; a subclass may define ``pair_force`` and ``wall_force`` in their
+    place.
+
+    Args:
+        mass: m, kg.
+        walls: False leaves the walls out.
+        entry: name of the package's entry or a description; None: both forces are code.
+        options: of :class:`Law`.
+
+    Attributes:
+        self_interaction: whether the mean over people contains j = i as well.
+    """
+
+    mass: float
+
+    def __init__(
+        self,
+        mass: float = 1.0,
+        walls: bool = True,
+        *,
+        entry: str | Mapping[str, Any] | None = None,
+        self_interaction: bool = False,
+        **options: Any,
+    ) -> None:
+        self.walls, self.self_interaction = walls, self_interaction
+        name = "" if isinstance(entry, str) else type(self).name
+        super().__init__(entry or _FORCE, name, mass=mass, **options)
+
+    def _coded(self) -> None:
+        if not self.walls:
+            bare = dict.fromkeys(self.formulas.points, ("N", "0"))
+            self.formulas = replace(self.formulas, points=bare)
+        super()._coded()
+        if self.rule is None:
+            return
+        for over, method, inputs in (
+            (OTHERS, "pair_force", "dx, dy, dvx, dvy"),
+            (POINTS, "wall_force", "dx, dy, vx, vy, normal_x, normal_y"),
+        ):
+            own = getattr(type(self), method) is not getattr(InteractionForce, method)
+            if own and (over == OTHERS or self.walls):
+                names = zip(getattr(self.rule, over), _CODED[method], strict=True)
+                sums: Any = {name: ("N", f"{f}({inputs})") for name, f in names}
+                self.rule = replace(self.rule, **{over: sums})
+                self._methods |= {
+                    name: partial(_output, method, k) for k, name in enumerate(_CODED[method])
+                }
+
+    def code(self) -> dict[str, Code]:
+        def pair(dx: Tensor, dy: Tensor, dvx: Tensor, dvy: Tensor) -> Tensor:
+            return self.pair_force(torch.stack([dx, dy], -1), torch.stack([dvx, dvy], -1))
+
+        return {**super().code(), "pair_force": pair}
+
+    def _force(self, over: str, **seen: Tensor) -> Tensor:
+        """``(..., 2)`` N: the entry's summands over the others or over wall points."""
+        sums = self.dynamics(called=True).sums[over]
+        if not sums:
+            raise NotImplementedError(f"{type(self).__name__} has no force from {over}")
+        parts = {
+            key: value[..., c] for name, value in seen.items() for c, key in enumerate(_AXES[name])
+        }
+        return torch.stack(self.computed([*sums.values()], parts), -1)
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        """Force on i from j, ``(..., 2)`` N, of x_i - x_j (m) and v_i - v_j (m/s)."""
+        return self._force(OTHERS, dx=dx, dv=dv)
+
+    def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
+        """Force on i from a wall point, ``(..., 2)`` N, of x_i - x_w (m), v_i (m/s) and the
+        wall's unit normal."""
+        return self._force(POINTS, dx=dx, v=v, normal=normal)
+
+    def pairs(self, state: State) -> Tensor:
+        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third),
+        0 where they are one."""
+        x, v, scene = state.x, velocity(state), state.scene
+        other, speed = state.others
+        dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
+        apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
+        acts = (scene.agent[:, None, :] & apart)[..., None]
+        return self.pair_force(dx, dv) * (acts / (self.mass * scene.count[..., None]))
+
+    def components(self, state: State) -> dict[str, Tensor]:
+        """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
+        x, v, scene = state.x, velocity(state), state.scene
+        parts = {"pair": self.pairs(state).sum(2)}
+        if self.walls and scene.wall.shape[1]:
+            wall, normal, real = scene.walls_of_each()
+            dx = x[:, :, None] - wall
+            force = self.wall_force(dx, v[:, :, None].expand_as(dx), normal.expand_as(dx))
+            parts["wall"] = (force * real[..., None]).sum(2) / (self.mass * scene.wall_count)
+        if self.self_interaction:
+            here = torch.zeros_like(x[:1, :1])
+            own = self.pair_force(here, here) / (self.mass * scene.count)
+            parts["pair"] = parts["pair"] + own
+        return parts
+
+    def forward(self, state: State) -> Tensor:
+        return sum(self.components(state).values(), torch.zeros_like(state.x))
+
+
+#: Components of what a force sees.
+_AXES = {
+    "dx": ("dx", "dy"), "dv": ("dvx", "dvy"), "v": ("vx", "vy"), "normal": ("normal_x", "normal_y")
+}  # fmt: skip
+#: A force between people that is code.
+_FORCE: dict[str, Any] = {
+    "parameters": {},
+    "settings": {"mass": "1 kg"},
+    "others": {"pair_x": "no_force", "pair_y": "no_force"},
+    "points": {"wall_x": "no_force", "wall_y": "no_force"},
+    "constants": {"no_force": "0 N"},
+    "rate": {
+        "vx": "pair_x/(mass*people) + wall_x/(mass*points)",
+        "vy": "pair_y/(mass*people) + wall_y/(mass*points)",
+    },
+    "force": ["pair_x", "pair_y"],
+}
+
+
+def takes_options(entry: Mapping[str, Any]) -> list[str]:
+    """The options of the laws of an entry; see :class:`Law` for what they do."""
+    parameters = entry["parameters"]
+    found = [*parameters, *(f"{name}_min" for name in parameters), *entry.get("settings", ())]
+    found += [*entry.get("variants", ()), "generator"]
+    found += ["hidden", "box"] if "networks" in entry else []
+    found += ["walls"] if "points" in entry else []
+    return found + (["self_interaction"] if "networks" in entry and "force" in entry else [])
+
+
+def make_law(entry: str, **options: Any) -> Law:
+    """One of the package's laws, such as ``make_law("lin", v0=20.0, L=7.0)``; see :class:`Law`."""
+    if "force" in entries()[entry]:
+        return InteractionForce(entry=entry, **options)
+    return Law(entry, **options)
+
+
+def law_from(
+    name: str,
+    description: Any,
+    *,
+    network: int | None = None,
+    box: float | None = None,
+    generator: torch.Generator | None = None,
+) -> Law:
+    """A law from its description in a configuration or a checkpoint.
+
+    Args:
+        name: of the law.
+        network: neurons of the hidden layer of NN, a network; None: there is none.
+        box: weights stay in [-box, box]; None leaves them free.
+        generator: of the first weights.
+
+    Raises:
+        ConfigError: an entry that is missing or unknown, or a formula that cannot be used.
+    """
+    if not isinstance(description, Mapping) or not {"parameters", "rate"} <= set(description):
+        raise ConfigError(
+            "model.law needs parameters and rate, as in {parameters: {v0: 30 m/s, L: 5 m}, "
+            "rate: {x: v0*(1 - L/gap)}}"
+        )
+    check_names("model.name", [name])
+    rate = description["rate"]
+    people = isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
+    keys = _CROWD_KEYS if people else _KEYS
+    unknown = sorted(set(map(str, description)) - set(keys))
+    if unknown:
+        raise ConfigError(
+            f"model.law has the unknown entries {', '.join(unknown)}; there are {', '.join(keys)}"
+        )
+    for key in _MAPPINGS:
+        if not isinstance(description.get(key) or {}, Mapping):
+            raise ConfigError(f"model.law.{key} must be a mapping of names, as {{v0: 30 m/s}}")
+        check_names(f"model.law.{key}", description.get(key) or {})
+    found = {str(key): value for key, value in description.items()}
+    if people:
+        return Law(found, name)
+    return Law(found, name, hidden=network, box=box, generator=generator)
+
+
+def _rule(entry: Mapping[str, Any]) -> Rule:
+    """The formulas of an entry.
+
+    Raises:
+        ConfigError: a rate that is neither of a lane nor of a crowd, or an entry of another form.
+    """
+    rate = entry["rate"]
+    states = set(rate) if isinstance(rate, Mapping) else set()
+    parts: dict[str, Any] = {
+        "where": {str(k): str(v) for k, v in (entry.get("where") or {}).items()},
+        "constants": {str(k): in_si(str(v)) for k, v in (entry.get("constants") or {}).items()},
+        "settings": {k: in_si(str(v))[1] for k, v in entry.get("settings", {}).items()},
+    }
+    if states in ({"x"}, {"v"}):
+        leader = "v0" if "v0" in entry["parameters"] else "measured"
+        return Rule(
+            rate=str(next(iter(rate.values()))),
+            leader="v" if states == {"v"} else leader,
+            states=_threes("states", "[unit, rate, start]", entry),
+            delayed=_threes("delayed", "[formula, unit, delay]", entry),
+            remembered=int(entry.get("remembered", 0)),
+            **parts,
+        )
+    if states not in ({"vx", "vy"}, {"x", "y"}):
+        if states & {"vx", "vy", "y"}:
+            raise ConfigError(
+                f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
+                "components of a person's acceleration; or x and y: of his velocity"
+            )
+        raise ConfigError(
+            f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
+            "or v: a formula of an acceleration (second order); or vx and vy, of a crowd, or "
+            "x and y, of a crowd of first order"
+        )
+    for over in REDUCED:
+        parts[over] = {str(k): ("", str(v)) for k, v in (entry.get(over) or {}).items()}
+    first, second = ("x", "y") if states == {"x", "y"} else ("vx", "vy")
+    return Rule(
+        rate=(str(rate[first]), str(rate[second])),
+        order=1 if first == "x" else 2,
+        force=tuple(entry["force"]) if "force" in entry else None,
+        drive=entry.get("drive", False),
+        **parts,
+    )
+
+
+def _threes(key: str, wanted: str, entry: Mapping[str, Any]) -> dict[str, tuple[str, str, str]]:
+    """The entries of ``states`` or ``delayed``."""
+    found = {}
+    for name, given in (entry.get(key) or {}).items():
+        if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 3:
+            raise ConfigError(f"model.law.{key}.{name}={given} must be {wanted}")
+        first, second, third = map(str, given)
+        found[str(name)] = first, second, third
+    return found
+
+
+def parameters_of(
+    term: Term, owner: str, place: int
+) -> tuple[dict[str, Expr], dict[str, Any], dict[str, str]]:
+    """Of a term's scalar parameters: symbols by name, where they are, and their units."""
+    names = term.scalars
+    parameters: dict[str, Expr] = {name: symbol(f"{owner}__{name}") for name in names}
+    owned = {f"{owner}__{name}": (f"terms.{place}.{name}", 0, None) for name in names}
+    units = {f"{owner}__{name}": term.units.get(name, "*") for name in names}
+    return parameters, owned, units
