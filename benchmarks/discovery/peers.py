@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
-import torch
 from omegaconf import OmegaConf
 
 from benchmarks.truths.regression import PEERS, Library
+from nnode.calibrate.parameters import ParameterVector
 from nnode.config import SCHEMAS
 from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
@@ -22,7 +22,7 @@ from nnode.discover.inputs import read_inputs
 from nnode.discover.judge.confirm import engine_of
 from nnode.discover.name.search import settled
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.residuals.engine import Engine, fill, row_of, square_of
+from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.score import Trace, traces
 from nnode.errors import SimulationError
@@ -90,7 +90,7 @@ def peers_on_table(
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
     whole = engine_of(domain, [sequences[i] for i in sealed], whole=True)
-    whole.settle(fit.system, row_of(fit.system))
+    whole.settle(fit.system, ParameterVector(fit.system).row)
     before, floor = square_of(whole, fit.system), whole.noise_floor()
     split = {"sealed": [sequences[i].name for i in sealed]}
     reports = {}
@@ -124,7 +124,7 @@ def _with(fit: Fit, columns: list[Column], values: np.ndarray, theta: np.ndarray
         rest = fit.residual + values @ theta
         row = fit.row.copy()
         row[fit.free] -= np.linalg.lstsq(fit.tangents, rest, rcond=None)[0]
-        system = fill(system, torch.from_numpy(row))
+        system = ParameterVector(system).fill_(row)
         system.project_()
     traces_by_id = {id(columns[j].trace): columns[j].trace for j in np.flatnonzero(theta)}
     for key, trace in traces_by_id.items():

@@ -8,16 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from nnode.calibrate.ensemble import EnsembleCost
-from nnode.calibrate.least_squares import (
-    Minimum,
-    Residuals,
-    least_squares,
-    trajectory_residuals,
-)
-from nnode.data.sequence import Sequence, collate
+from nnode.calibrate.least_squares import Minimum
+from nnode.calibrate.problem import ResidualProblem, pooled
+from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Traffic
 from nnode.model.laws import law_from
 from nnode.model.system import System
@@ -31,8 +25,6 @@ NORMAL = 1.96
 WIDE = 0.1
 #: Estimates that are correlated by more than this are hard to tell apart.
 TIED = 0.95
-#: Differences of parameters for the curvature, relative.
-DIFFERENCE = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +42,7 @@ class Recovered:
         forward, worst: root mean square and largest difference of a coordinate, m, with the typed
             parameters.
         path: root mean square with those found.
-        simulations: how many the search took.
+        simulations: how many with derivatives the search took.
     """
 
     names: tuple[str, ...]
@@ -105,40 +97,40 @@ def recover(
     """
     batch = collate(sequences)
     system = _system(law, typed, batch.x.shape[-1])
-    cost = EnsembleCost(system, batch, FusedSolver(dt=dt, method=method))
-    names = tuple(name.rpartition(".")[2] for name in cost.names)
-    truth = cost.row(system).numpy()
-    metres = _in_metres(cost)
-    exact = metres(truth)
-    assert exact is not None, "the typed parameters cannot be simulated"
-    moves = torch.from_numpy(_moving(cost))
+    solver = FusedSolver(dt=dt, method=method)
+    problem = ResidualProblem(system, batch, solver)
+    names = tuple(name.rpartition(".")[2] for name in problem.names)
+    truth = problem.vector.row.numpy()
+    moves = _moving(system, batch)
+    exact = _metres(problem, truth)[0][moves]
     turns, one = (-1.0) ** np.arange(len(truth)), np.ones(len(truth))
     # a limit on speed or acceleration that is nowhere reached changes nothing: of these starts
     # some lie below each
     starts = [truth * (1 + AWAY * way) for way in (turns, -turns, one, -one)]
-    ends = [_best(cost, metres, start) for start in starts]
-    first, best = min(enumerate(ends), key=lambda end: end[1].cost)
-    noise = torch.from_numpy(error * np.random.default_rng(seed).standard_normal(len(exact)))
-
-    def noisy(row: np.ndarray) -> Tensor | None:
-        found = metres(row)
-        return None if found is None else found + torch.where(moves, noise, 0.0)
-
-    again = _best(cost, noisy, starts[first])
+    ends = [_best(problem, start) for start in starts]
+    first, best = min(enumerate(ends), key=lambda end: float(end[1].cost))
+    noise, later = np.zeros(batch.x.shape), batch.valid.numpy().copy()
+    later[0] = False
+    noise[later] = np.random.default_rng(seed).standard_normal((later.sum(), batch.x.shape[-1]))
+    noise *= error * moves.reshape(noise.shape)
+    measured = replace(batch, x=batch.x - torch.from_numpy(noise))
+    noisy = ResidualProblem(system, measured, solver)
+    again = _best(noisy, starts[first])
     count = int(moves.sum())
-    unit, tied = _spread(_slopes(metres, again.row), names)
+    left, slopes = _metres(noisy, again.row)
+    unit, tied = _spread(slopes[moves], names)
     return Recovered(
         names=names,
         typed=truth,
         found=best.row,
         measured=again.row,
-        half=NORMAL * np.sqrt(again.cost / (count - len(truth))) * unit,
+        half=NORMAL * np.sqrt((left**2).sum() / (count - len(truth))) * unit,
         error=error,
         tied=tied,
-        forward=float((exact.square().sum() / count) ** 0.5),
-        worst=float(exact.abs().max()),
-        path=float(np.sqrt(best.cost / count)),
-        simulations=sum(end.evaluations for end in ends),
+        forward=float(np.sqrt((exact**2).sum() / count)),
+        worst=float(np.abs(exact).max()),
+        path=float(np.sqrt((_metres(problem, best.row)[0] ** 2).sum() / count)),
+        simulations=sum(end.steps for end in ends),
     )
 
 
@@ -154,49 +146,25 @@ def _system(law: Mapping[str, Any], typed: Mapping[str, float], dim: int) -> Sys
     return system
 
 
-def _in_metres(cost: EnsembleCost) -> Residuals:
-    """Residuals that are differences of coordinates, m."""
-    weighted, scale = trajectory_residuals(cost), (2 * len(cost.batch) / cost.batch.dt) ** 0.5
-
-    def residuals(row: np.ndarray) -> Tensor | None:
-        found = weighted(row)
-        return None if found is None else found * scale
-
-    return residuals
+def _metres(problem: ResidualProblem, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(M,)`` differences of coordinates, m, and their ``(M, K)`` derivatives."""
+    _, away, slope = problem.linearised(row)
+    return away.numpy().ravel(), slope.flatten(1).T.numpy()
 
 
-def _moving(cost: EnsembleCost) -> np.ndarray:
-    """``(M,)`` which residuals are of agents that the model moves: not of measured leaders."""
-    agent = cost.batch.agent.clone()
-    if cost.system.domain == "traffic":
-        agent[torch.arange(len(agent)), agent.sum(1) - 1] = False
-    seen = cost.batch.valid[1:]
-    moves = agent.expand(seen.shape)[seen]
-    return moves.repeat_interleave(cost.batch.x.shape[-1]).numpy()
+def _moving(system: System, batch: Batch) -> np.ndarray:
+    """``(M,)`` which of them are of agents that the model moves, after the first sample."""
+    given = system.given(batch)
+    moves = batch.valid.clone() if given is None else batch.valid & ~given
+    moves[0] = False
+    return moves[..., None].expand(batch.x.shape).flatten().numpy()
 
 
-def _best(cost: EnsembleCost, residuals: Residuals, start: np.ndarray) -> Minimum:
+def _best(problem: ResidualProblem, start: np.ndarray) -> Minimum:
     """Where the search ends; it begins once more at its end, as it ends at a share of its cost."""
-    box = cost.low.numpy(), cost.high.numpy()
-    first = least_squares(residuals, start, *box, steps=60, tolerance=1e-9)
-    second = least_squares(residuals, first.row, *box, steps=10, tolerance=1e-9)
-    return replace(second, evaluations=first.evaluations + second.evaluations)
-
-
-def _slopes(metres: Residuals, row: np.ndarray) -> np.ndarray:
-    """``(M, K)`` derivatives of the coordinates, by central differences."""
-    columns = []
-    for j, value in enumerate(row):
-        sides = []
-        step = DIFFERENCE * max(abs(value), 1e-3)
-        for sign in (1, -1):
-            other = row.copy()
-            other[j] += sign * step
-            found = metres(other)
-            assert found is not None, "the neighbourhood of the minimum cannot be simulated"
-            sides.append(found.numpy())
-        columns.append((sides[0] - sides[1]) / (2 * step))
-    return np.stack(columns, 1)
+    first = pooled(problem, start, steps=60, tolerance=1e-9)
+    second = pooled(problem, first.row, steps=10, tolerance=1e-9)
+    return replace(second, steps=first.steps + second.steps)
 
 
 def _spread(

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from scipy.optimize import differential_evolution
 
-from nnode.calibrate.gauss_newton.method import TangentCost, pooled
+from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.files import write_json
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import EVERY
@@ -38,12 +38,12 @@ def timed(call: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
     return found, {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
 
 
-def within_published(law: str, folder: str) -> TangentCost:
+def within_published(law: str, folder: str) -> ResidualProblem:
     """The cost on the training pairs with the published bounds; it starts in their middle."""
     cost = costs_of(EVERY[law], data.batch(folder))
     bounds = printed.BOUNDS[law]
     for i, name in enumerate(cost.names):
-        cost.low[i], cost.high[i] = bounds[name.split("__", 1)[1]]
+        cost.low[i], cost.high[i] = bounds[name.split(".", 1)[1]]
     cost.start = (cost.low + cost.high) / 2
     return cost
 

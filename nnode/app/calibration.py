@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from nnode.app.training import straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.calibrate.evaluate import sensitivity
-from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
@@ -33,7 +33,7 @@ from nnode.plots import force_figure
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from nnode.calibrate.gauss_newton.pooling import Own
+    from nnode.calibrate.pooling import Own
 
 log = logging.getLogger(__name__)
 
@@ -353,22 +353,25 @@ def _by_tangents(
     if not isinstance(trainer.optimizer, GaussNewton):
         return {}, None, speeds
     # compiled code takes a second to import
-    from nnode.calibrate.gauss_newton.intervals import intervals
-    from nnode.calibrate.gauss_newton.pooling import own_parameters
-    from nnode.calibrate.gauss_newton.start_speeds import cost_of
+    from nnode.calibrate.intervals import intervals
+    from nnode.calibrate.pooling import own_parameters
+    from nnode.calibrate.problem import ResidualProblem
     from nnode.simulate.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
-    make = partial(cost_of, options.start_speeds, solver=trainer.solver, convention=options.cost)
+    make = partial(
+        ResidualProblem, solver=trainer.solver, convention=options.cost,
+        start_speeds=options.start_speeds,
+    )  # fmt: skip
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))
     double = copy.deepcopy(model).double()
-    cost = make(double, batch)
-    row = cost.row(double)
-    found, own = intervals(cost, row, clusters(store.index)[indices]), None
+    problem = make(double, batch)
+    row = problem.vector.row.numpy()
+    found, own = intervals(problem, row, clusters(store.index)[indices]), None
     if options.start_speeds is StartSpeeds.fitted:
-        by_name = cost.starts(row)
+        by_name = problem.start_speeds(row)
         first = {s.name: s.velocity()[0, :, 0] for s in (store[i] for i in indices)}
         away = np.concatenate([(np.array(v) - first[n])[:-1] for n, v in by_name.items()])
         change = float(np.sqrt(np.mean(away**2)))

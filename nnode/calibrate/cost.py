@@ -106,12 +106,17 @@ def net_gaps(x: Tensor, batch: Batch) -> Tensor:
 def errors(
     x: Tensor, v: Tensor | None, batch: Batch, convention: Convention
 ) -> tuple[Tensor, Tensor]:
-    """``([R,] B, N - 1)`` errors of followers at the samples, and which of them count, before an
-    axis of samples; 0 where they do not.
+    """What is squared, and which of it counts; 0 where it does not.
 
     Args:
-        x, v: ``(K, [R,] B, N)`` simulated, m and m/s.
+        x, v: ``(K, [R,] B, N D)`` simulated, m and m/s.
+
+    Returns:
+        ``(K, [R,] B, N D)`` errors of coordinates, or ``(K, [R,] B, N - 1)`` of followers.
     """
+    if convention in _OF_PLACES:
+        seen = batch.valid.repeat_interleave(batch.x.shape[-1], -1)
+        return torch.where(seen, x - batch.x.flatten(-2), 0.0), seen
     if batch.x.shape[-1] != 1:
         raise ConfigError(
             f"trainer.cost={convention.value} is one of vehicles that follow another; take "

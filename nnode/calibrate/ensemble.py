@@ -8,59 +8,45 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import sequence_costs
-from nnode.calibrate.problem import Problem
+from nnode.calibrate.cost import Convention, sequence_costs
+from nnode.calibrate.parameters import ParameterVector
+from nnode.data.sequence import Batch
 from nnode.model.system import System
-from nnode.model.term import Interval
+from nnode.simulate.fused import FusedSolver
 
 
-class EnsembleCost(Problem):
+class EnsembleCost:
     """Cost of R runs of a model on one batch, each run with parameters of its own.
 
     A run is a row of K numbers: all parameters that are calibrated, one after the other.
     Rows are in float64 whatever the precision of the simulation.
 
+    Args:
+        system: the model; it is not changed. Parameters that need no gradient stay its own.
+        batch: the sequences, in the precision of the system.
+        solver: its step, method and threads.
+        convention: what is minimised.
+
     Attributes:
-        names: parameters by their names in ``system.named_parameters()``.
-        low, high: ``(K,)`` admissible set, from the model's terms; infinite where it is open.
+        vector: the parameters that are calibrated.
+        low, high: ``(K,)`` the admissible set.
     """
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.names = list(self._own)
-        self._sizes = [p.numel() for p in self._own.values()]
-        limits = self.system.bounds()
-        free = Interval()
-        low = [limits.get(name, free).low for name in self.names]
-        high = [limits.get(name, free).high for name in self.names]
-        sizes = torch.tensor(self._sizes)
-        self.low = torch.tensor(low, dtype=torch.float64).repeat_interleave(sizes)
-        self.high = torch.tensor(high, dtype=torch.float64).repeat_interleave(sizes)
-
-    def row(self, system: System) -> Tensor:
-        """``(K,)`` the parameters of another system of the same model."""
-        own = dict(system.named_parameters())
-        return torch.cat([own[name].detach().double().flatten() for name in self.names])
-
-    def parameters(self, rows: Tensor) -> dict[str, Tensor]:
-        """Rows ``(R, K)`` as parameters by name, each with a leading axis of R."""
-        return {
-            name: part.reshape(-1, *self._own[name].shape).to(self._own[name].dtype)
-            for name, part in zip(self.names, rows.split(self._sizes, 1), strict=True)
-        }
-
-    @torch.no_grad()
-    def fill_(self, system: System, row: Tensor) -> System:
-        """Write one row ``(K,)`` into a system of the same model."""
-        own = dict(system.named_parameters())
-        for name, value in self.parameters(row[None]).items():
-            own[name].copy_(value[0])
-        return system
+    def __init__(
+        self,
+        system: System,
+        batch: Batch,
+        solver: FusedSolver,
+        convention: Convention = Convention.integral,
+    ) -> None:
+        self.system, self.batch, self.solver = system, batch, solver
+        self.convention, self.vector = convention, ParameterVector(system)
+        self.low, self.high = (torch.from_numpy(end) for end in self.vector.bounds)
 
     def costs(self, rows: Tensor) -> Tensor:
         """``(R, B)`` cost of every sequence, inf where a simulation blows up; no gradient."""
         with torch.no_grad():
-            found = self._costs(self.parameters(rows)).double()
+            found = self._costs(self.vector.runs(rows)).double()
         return torch.where(torch.isfinite(found), found, math.inf)
 
     def __call__(self, rows: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -69,7 +55,7 @@ class EnsembleCost(Problem):
         Args:
             weights: ``(R, B)`` or ``(B,)`` weight of every sequence; None takes the mean.
         """
-        stacked = _leaves(self.parameters(rows))
+        stacked = _leaves(self.vector.runs(rows))
         each = self._costs(stacked)
         if weights is None:
             cost = each.mean(1)
@@ -92,7 +78,7 @@ class EnsembleCost(Problem):
         places = weights.nonzero().flatten()
         batch = self.batch.select(places.tolist())
         part = EnsembleCost(self.system, batch, self.solver, self.convention)
-        each = part._costs(stacked := _leaves(self.parameters(row[None])))
+        each = part._costs(stacked := _leaves(self.vector.runs(row[None])))
         total = (each * weights[places].to(each)).sum()
         return torch.cat([g.flatten() for g in torch.autograd.grad(total, list(stacked.values()))])
 

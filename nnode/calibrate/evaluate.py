@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs, squared_error
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.model import Crowd, Law, System, Traffic
 from nnode.model.laws import law_from
-from nnode.model.term import Interval
 from nnode.simulate.base import Solver, Trajectory
 
 #: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
@@ -138,17 +138,13 @@ def sensitivity(
         SimulationError: the model cannot be simulated.
     """
     cost = sequence_costs(solver(system, batch), batch, convention).mean()
-    own = {name: p for name, p in system.named_parameters() if p.requires_grad}
-    slopes = torch.autograd.grad(cost, list(own.values()), allow_unused=True)
-    free, most = Interval(), 0.0
-    for (name, p), slope in zip(own.items(), slopes, strict=True):
-        if slope is None:
-            continue
-        bound = system.bounds().get(name, free)
-        pressed = ((p <= bound.low) & (slope > 0)) | ((p >= bound.high) & (slope < 0))
-        share = (p * slope / cost).masked_fill(pressed, 0.0).abs()
-        most = max(most, float(share.detach().max()))
-    return most
+    vector = ParameterVector(system)
+    own = list(vector.parameters.values())
+    slopes = torch.autograd.grad(cost, own, allow_unused=True, materialize_grads=True)
+    slope, row = torch.cat([g.flatten() for g in slopes]).double(), vector.row
+    low, high = (torch.from_numpy(end) for end in vector.bounds)
+    pressed = ((row <= low) & (slope > 0)) | ((row >= high) & (slope < 0))
+    return float((row * slope / cost.detach()).masked_fill(pressed, 0.0).abs().max())
 
 
 def _times(batch: Batch) -> Tensor:

@@ -1,197 +1,154 @@
-"""Levenberg and Marquardt's method for simulated trajectories, within a box.
+"""Damped least squares (Levenberg and Marquardt) within a box, many problems side by side.
 
-The cost of a trajectory is a sum of squares, so that the derivatives of the simulated positions
-give its curvature as well. For tens of parameters this takes far fewer simulations than methods
-that learn the curvature from gradients, and it does not care about the parameters' units.
+A step is a descent and a search. The descent minimises the quadratic model of the cost, damped in
+proportion to the curvature of each parameter, within the box. The search raises the damping until
+a step lowers the cost, or tries several dampings side by side.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from nnode.calibrate.ensemble import EnsembleCost
-from nnode.errors import SimulationError
+#: Damping: at the start, its factors after a step that was taken or refused, its least, its end.
+DAMPING, EASE, STIFFEN, LEAST, STUCK = 1e-3, 0.2, 4.0, 1e-9, 1e8
+#: Share of the cost below which a fall is rounding.
+ROUNDING = 1e-14
+#: With a cost that is asked for, a search ends when a step gains less than this share of what is
+#: missing.
+HOPE = 0.1
 
-#: ``(K,)`` parameters to ``(M,)`` residuals, or None where the simulation blows up.
-Residuals = Callable[[np.ndarray], Tensor | None]
 
-#: Damping: at the start, its factors after a step that was taken or refused, and its end.
-DAMPING, EASE, STIFFEN, STUCK = 1e-3, 0.2, 4.0, 1e8
-#: Steps at most with corrected derivatives before they are computed anew.
-CORRECTIONS = 4
-#: A step with corrected derivatives that lowers the cost by less than this share is the last
-#: before they are computed anew.
-WORTH = 1e-3
-#: Share of the first cost that is rounding.
-NOTHING = 1e-13
-#: Difference of a parameter, relative to its size, by precision; and the least size that counts.
-DIFFERENCE = {torch.float32: 1e-3, torch.float64: 1e-6}
+@dataclass(frozen=True)
+class Quadratic:
+    """Costs of B problems and their derivatives by P parameters.
+
+    Attributes:
+        cost: ``(B,)``; inf where a simulation blows up.
+        gradient: ``(B, P)``.
+        hessian: ``(B, P, P)`` Gauss and Newton's.
+    """
+
+    cost: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+    def profiled(self, number: int) -> Quadratic:
+        """The costs as functions of the first parameters, all others at their best values.
+
+        The curvature is the Schur complement. Parameters that nothing depends on are left out.
+
+        Source: Golub & Pereyra 2003, variable projection.
+        """
+        bend = self.hessian
+        inverse = np.linalg.pinv(bend[:, number:, number:], rcond=1e-10, hermitian=True)
+        across = bend[:, :number, number:] @ inverse
+        return Quadratic(
+            self.cost,
+            self.gradient[:, :number] - np.einsum("bpk,bk->bp", across, self.gradient[:, number:]),
+            bend[:, :number, :number] - across @ bend[:, number:, :number],
+        )
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a minimisation ended.
+    """Where B minimisations ended; of a single one, the first axes may be left out.
 
     Attributes:
-        row: ``(K,)`` parameters.
-        cost: sum of squared residuals.
-        evaluations: simulations.
-        steps: accepted steps.
+        row: ``(B, P)`` parameters.
+        cost: ``(B,)``, penalty included.
+        before: ``(B,)`` costs at the start.
+        steps: computations of derivatives.
+        damping: ``(B,)`` of the next step.
     """
 
     row: np.ndarray
-    cost: float
-    evaluations: int
+    cost: np.ndarray
+    before: np.ndarray
     steps: int
-
-
-def trajectory_residuals(cost: EnsembleCost, weights: np.ndarray | None = None) -> Residuals:
-    """Residuals whose sum of squares is the weighted cost of a batch.
-
-    Args:
-        cost: the model, its sequences and its solver.
-        weights: ``(B,)`` weight of every sequence, of sum 1; None takes the mean.
-    """
-    batch = cost.batch
-    share = np.full(len(batch), 1 / len(batch)) if weights is None else weights
-    factor = torch.from_numpy(share).to(batch.x) * (batch.dt / 2)
-    seen = batch.valid[1:]
-    factor = factor.sqrt()[None, :, None].expand(seen.shape)[seen][:, None]
-    measured = batch.x[1:][seen]
-
-    def residuals(row: np.ndarray) -> Tensor | None:
-        system = cost.fill_(cost.system, torch.from_numpy(row))
-        try:
-            with torch.no_grad():
-                away = cost.solver(system, batch).x[1:][seen] - measured
-        except SimulationError:
-            return None
-        return (away * factor).flatten().to(batch.dtype)  # it decides the size of differences
-
-    return residuals
+    damping: np.ndarray
 
 
 def least_squares(
-    residuals: Residuals,
+    quadratic: Callable[[np.ndarray], Quadratic],
+    costs: Callable[[np.ndarray], np.ndarray],
     start: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
     *,
-    steps: int = 30,
-    tolerance: float = 1e-6,
-    least: float = 0.1,
+    steps: int = 100,
+    tolerance: float = 1e-10,
+    damping: float = DAMPING,
+    penalty: tuple[np.ndarray, np.ndarray] | None = None,
+    dampings: Sequence[float] = (),
+    hopeless: float = 0.0,
 ) -> Minimum:
-    """Minimise the sum of squared residuals within a box.
+    """Minimise B sums of squares of P parameters each.
 
-    Derivatives are forward differences, corrected by Broyden's formula for as long as this
-    pays. Parameters at a bound that the gradient presses against are held fixed; damping is
-    relative to the curvature of each parameter.
+    Derivatives are computed anew as soon as any problem has moved.
 
     Args:
-        start: ``(K,)``; moved into the box.
-        low, high: ``(K,)`` the box.
-        steps: computations of all derivatives at most.
-        tolerance: ends when the cost falls by less than this share from one computation of the
-            derivatives to the next.
-        least: parameters smaller than this are varied as if they had this size.
-
-    Raises:
-        SimulationError: the start itself cannot be simulated.
+        quadratic: of parameters ``(B, P)``.
+        costs: of T trials ``(T, B, P)``, ``(T, B)``; inf where a simulation blows up.
+        start: ``(B, P)``; moved into the box.
+        low, high: ``(P,)`` or ``(B, P)`` the box.
+        steps: computations of derivatives at most.
+        tolerance: a problem ends when a step lowers its cost by less than this share.
+        damping: of the first step, relative to each parameter's curvature.
+        penalty: centre and weights ``(P,)`` of a sum of squares that is added.
+        dampings: all of them are tried at each step, instead of one that is adapted. A problem
+            ends where none lowers its cost. For a single problem.
+        hopeless: a problem also ends when its cost has nearly stopped to fall and is still above
+            this one; 0 switches that off.
 
     Source:
-        Nocedal & Wright, Numerical Optimization, 2nd ed., sections 10.3 and 11.1.
+        Nocedal & Wright, Numerical Optimization, 2nd ed., sections 10.3 and 16.7.
     """
-    row = np.clip(start, low, high)
-    now = residuals(row)
-    if now is None:
-        raise SimulationError("the start of a least-squares calibration cannot be simulated")
-    cost, number, damping, taken = _square(now), 1, DAMPING, 0
-    nothing = NOTHING * cost
-    for _ in range(steps):
-        columns = _derivatives(residuals, row, now, high, least)
-        number += len(row)
-        before = cost
-        for correction in range(1 + CORRECTIONS):
-            gradient, curvature = _normal(columns, now)
-            found, value = None, math.inf
-            while damping < STUCK:
-                trial = box_step(row, gradient, curvature, damping, low, high)
-                found = residuals(trial)
-                number += 1
-                value = math.inf if found is None else _square(found)
-                # corrected derivatives may be wrong: rather compute them anew than stiffen
-                if value < cost or correction:
-                    break
-                damping *= STIFFEN
-            if found is None or value >= cost:
-                break
-            _correct(columns, trial - row, found - now)
-            worth = cost - value > WORTH * cost
-            row, now, cost = trial, found, value
-            taken, damping = taken + 1, max(damping * EASE, 1e-9)
-            if not worth or cost <= nothing:
-                break
-        if before - cost < tolerance * before or cost <= nothing:
-            break
-        damping = min(damping, 1.0)
-    return Minimum(row, cost, number, taken)
+    rows = np.clip(start, low, high)
+    low, high = (np.broadcast_to(end, rows.shape) for end in (low, high))
+    centre, weight = (rows[0], np.zeros(rows.shape[1])) if penalty is None else penalty
+    each = np.arange(len(rows))
+    damp, going = np.full(len(rows), damping), np.ones(len(rows), dtype=bool)
+    before, taken = np.empty(0), 0
 
+    def tied(at: np.ndarray) -> np.ndarray:
+        found: np.ndarray = (at - centre) ** 2 @ weight
+        return found
 
-def _normal(columns: Tensor, now: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Half the gradient of the sum of squares, and Gauss and Newton's half of its Hessian."""
-    both = (columns @ torch.cat([columns, now[None]]).T).double().numpy()
-    return both[:, -1], both[:, :-1]
-
-
-def _correct(columns: Tensor, step: np.ndarray, change: Tensor) -> None:
-    """Broyden's correction: the derivatives now explain the change of the last step."""
-    along = torch.from_numpy(step).to(columns)
-    columns += torch.outer(along / along.square().sum(), change - along @ columns)
-
-
-def _square(values: Tensor) -> float:
-    return float(values.square().sum(dtype=torch.float64))
-
-
-def _derivatives(
-    residuals: Residuals, row: np.ndarray, now: Tensor, high: np.ndarray, least: float
-) -> Tensor:
-    """``(K, M)`` derivatives of the residuals, by forward differences."""
-    columns = now.new_zeros(len(row), len(now))
-    for j, value in enumerate(row):
-        away = DIFFERENCE[now.dtype] * max(abs(value), least)
-        away = -away if value + away > high[j] else away
-        other = row.copy()
-        other[j] += away
-        found = residuals(other)
-        if found is not None:  # a parameter that cannot be varied is left alone in this step
-            columns[j] = (found - now) / away
-    return columns
-
-
-def damped_step(
-    cost: Callable[[np.ndarray], float], now: float, row: np.ndarray, gradient: np.ndarray,
-    curvature: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray,
-) -> tuple[np.ndarray, float, float]:  # fmt: skip
-    """The first step from ``row`` that lowers the cost from ``now``, with more and more damping.
-
-    Returns:
-        where it ends and the cost there, and the next step's damping; ``row``, ``now`` and the
-        last damping where no step lowers it.
-    """
-    while damping < STUCK:
-        trial = box_step(row, gradient, curvature, damping, low, high)
-        value = cost(trial)
-        if value < now:
-            return trial, value, max(damping * EASE, 1e-9)
-        damping *= STIFFEN
-    return row, now, damping
+    while going.any() and taken < steps:
+        model = quadratic(rows)
+        now = model.cost + tied(rows)
+        before = now if not taken else before
+        taken += 1
+        gradient = model.gradient + 2 * weight * (rows - centre)
+        hessian = model.hessian + 2 * np.diag(weight)
+        moved = np.zeros(len(rows), dtype=bool)
+        while going.any() and not moved.any():
+            tried = np.outer(dampings, np.ones(len(rows))) if dampings else damp[None]
+            trials = np.repeat(rows[None], len(tried), 0)
+            for b in np.flatnonzero(going):
+                for trial, own in zip(trials, tried[:, b], strict=True):
+                    trial[b] = box_step(rows[b], gradient[b], hessian[b], own, low[b], high[b])
+            values = costs(trials) + tied(trials)
+            best = np.argmin(values, 0)
+            value = values[best, each]
+            moved = going & (value < now)
+            gain = np.where(moved, now - value, 0.0)
+            rows = np.where(moved[:, None], trials[best, each], rows)
+            enough = gain > max(tolerance, ROUNDING) * np.abs(now)
+            if hopeless > 0:
+                enough &= (value <= hopeless) | (gain >= HOPE * (value - hopeless))
+            now = np.where(moved, value, now)
+            damp = np.where(moved, np.maximum(damp * EASE, LEAST), damp * STIFFEN)
+            if dampings:
+                going &= moved & enough
+                # the best one comes first: its simulation is the one that derivatives are taken of
+                dampings = (*dampings[best[0] :], *dampings[: best[0]])
+            else:
+                going &= np.where(moved, enough, damp < STUCK)
+    return Minimum(rows, now, before, taken, damp)
 
 
 def box_step(

@@ -42,7 +42,7 @@ class Monitor(str, Enum):
 class Pooling(str, Enum):
     """Whether all sequences share their parameters.
 
-    See :mod:`nnode.calibrate.gauss_newton.pooling`.
+    See :mod:`nnode.calibrate.pooling`.
 
     ``pooled``: they do. ``alone``: each has its own. ``shrunk``: each has its own, drawn towards
     those of all as far as this predicts better.

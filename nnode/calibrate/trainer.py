@@ -26,7 +26,7 @@ from nnode.calibrate.evaluate import evaluate
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.calibrate.logbook import Logbook
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
-from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.options import Monitor, TrainerOptions
 from nnode.calibrate.progress import Reporter
 from nnode.data.dataset import EpochSampler

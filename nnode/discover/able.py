@@ -8,11 +8,10 @@ from nnode.errors import ConfigError
 from nnode.model.build import add_effects
 from nnode.model.crowd_dynamics import SMALLEST
 from nnode.model.effects import Effect, IndividualEffect
-from nnode.model.effects.crowd_force import ForceEffect
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of
 from nnode.model.formula import crowd_of
-from nnode.model.laws import InteractionForce, Law
+from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
 
 
@@ -38,7 +37,7 @@ def not_offered(effect: type[Effect], system: System) -> str:
             f"with desired={system.desired} everybody has a preferred speed already, measured in "
             "the seconds before: one for all would mend its errors and be no effect"
         )
-    if issubclass(effect, ForceEffect) and system.find(InteractionForce) is None:
+    if effect.acts_on == "force" and not effect.finds(system.terms):
         return "the law has no force between people of its own that it could change"
     if system.domain != "traffic" or system.order == 1:
         return ""
@@ -55,8 +54,9 @@ def check_model(system: System) -> None:
     Raises:
         ConfigError: names the term and what to do.
     """
-    law = crowd_of([t for t in system.terms if isinstance(t, Law)])
-    if system.domain == "crowd" and law is not None and (law.order == 1 or law.sums[SMALLEST]):
+    crowd = system.domain == "crowd"
+    law = crowd_of([t for t in system.terms if isinstance(t, Law)]) if crowd else None
+    if law is not None and (law.order == 1 or law.sums[SMALLEST]):
         what = "of first order" if law.order == 1 else "with smallest values over others"
         raise ConfigError(
             f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "
@@ -69,12 +69,6 @@ def check_model(system: System) -> None:
             "the model remembers something step by step, and the diagnosis of lanes takes other "
             "steps; it can be trained and evaluated, but not diagnosed"
         )
-    for term in system.terms if system.domain == "crowd" else ():
-        if term.memory:
-            raise ConfigError(
-                f"the diagnosis of crowds cannot simulate the model's term {term.name}: it has a "
-                "memory; diagnose the model without it"
-            )
     names = [effect.name for effect in effects_of(system)]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -93,7 +87,7 @@ _MOTION = {"traffic": "lanes", "crowd": "crowds"}
 
 
 def _reason(effect: type[Effect]) -> str:
-    if effect.memory and (effect.domain == "crowd" or effect.individual):
+    if effect.individual and effect.remembers():
         return "it has a memory"
     if effect.individual != issubclass(effect, IndividualEffect):
         return "its class says individual, but is no IndividualEffect"

@@ -61,7 +61,13 @@ def _row(effect: type[Effect]) -> str:
     ranges = [f"{name}: {_range(given)}" for name, given in parameters.items()]
     if effect.individual:
         ranges.append("one value per agent")
-    cells = (f"`{effect.name}`", what, effect.formula, "; ".join(ranges), effect.source)
+    cells = (
+        f"`{effect.name}`",
+        what,
+        "; ".join(effect.formula_lines()),
+        "; ".join(ranges),
+        effect.source,
+    )
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 

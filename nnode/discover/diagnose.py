@@ -191,14 +191,17 @@ def _diagnosed(
     gap, each, simulated = sealed.gap(extended, own)
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
+    order = final.system.order
     effects_found = [
         *(named(engine, final, s, sealed.tried[s.chosen.name].p_value) for s in found.steps),
-        *(named_agents(one, agent.confirmed) for one, agent in both if agent.named),
+        *(named_agents(one, agent.confirmed, order) for one, agent in both if agent.named),
     ]
     others = [pair for pair in both if pair[1].found and not pair[1].named]
     leads_found = [
-        *leads, *imitations, *(named_agents(one, agent.confirmed) for one, agent in others),
-    ]  # fmt: skip
+        *leads,
+        *imitations,
+        *(named_agents(one, agent.confirmed, order) for one, agent in others),
+    ]
     diagnosis = Diagnosis(
         verdict=_verdict(
             found, left, removed, bool(own), bool(leads_found), enough, bool(imitations)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from nnode.model import System
 from nnode.model.laws import law_from
@@ -34,8 +34,8 @@ class Counterpart:
 def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
     """A line for each effect that is not ``counted``, of the terms from number ``first`` on."""
     return [
-        f"effect {term.name}: {term.formula}"
-        for term in list(system.terms)[first:]
+        f"effect {term.name}: {term.formula_for(system.order)}"
+        for term in cast(list[Term], list(system.terms))[first:]
         if term.name not in counted
     ]
 

@@ -8,16 +8,14 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-import torch
 
-from nnode.data.sequence import PADDING_GAP
 from nnode.errors import ConfigError, SimulationError
 from nnode.model import System, Traffic
 from nnode.model.arrays import numpy_function
 from nnode.model.effects.base import IndividualEffect
-from nnode.model.effects.traffic import VehicleClass
+from nnode.model.effects.lane import VehicleClass
 from nnode.model.expression import Expr, symbol, symbols, topological
-from nnode.model.formula import begins, own_values, values_of
+from nnode.model.formula import own_values, values_of
 from nnode.model.lane_dynamics import LaneDynamics
 from nnode.model.steps import stepped
 from nnode.model.term import Term
@@ -109,8 +107,9 @@ class Drivers:
 
     @property
     def looks_twice(self) -> bool:
-        """Whether the second vehicle ahead matters."""
-        return any(j == 2 for _, j in self.lane.ahead)
+        """Whether the second vehicle ahead matters, at the start at least."""
+        at_start = symbols(self.lane.starts.values())
+        return "x_2" in at_start or any(j == 2 for _, j in self.lane.ahead)
 
     def enter(self, kinds: Sequence[Collection[str]]) -> None:
         """Add drivers behind those that there are.
@@ -192,30 +191,10 @@ class Drivers:
         self._begun = given["start"]
         starts = self.lane.starts
         begun = numpy_function(tuple(starts.values()), _GAPS)(given, given["gaps"])
-        others = iter(self._remembered(seen, given))
-        for state in self._added:
-            own = begun[list(starts).index(state)] if state in starts else next(others)
+        for state, own in zip(starts, begun, strict=True):
             self._states[state] = np.where(new, own, self._states[state])
             given[state] = self._states[state]
         self._fresh = np.zeros(len(self), bool)
-
-    def _remembered(self, seen: Seen, given: Mapping[str, Any]) -> list[np.ndarray]:
-        """``(n,)`` each: starts that terms tell by code, from places and speeds of a vehicle,
-        the one ahead, and where that one is driven as well the next one."""
-        order = self.lane.order
-        code = [t for t in self._terms if t.memory and not begins(t, order)]
-        if not code:
-            return []
-        nobody = 2 * PADDING_GAP
-        ahead = np.where(seen.gap <= self._far, seen.gap, nobody)
-        lead = given["lead"]
-        next_one = np.where(lead >= 0, ahead[lead], nobody)
-        x = np.stack([0 * ahead, ahead, ahead + next_one], 1)
-        v = np.stack([given["v"], given["v_1"], given["v_1"]], 1)
-        places, speeds = torch.from_numpy(x)[..., None], torch.from_numpy(v)[..., None]
-        with torch.no_grad():
-            told = torch.cat([t.remember(places, speeds, self._system) for t in code], -1)
-        return [column.numpy() for column in told[:, 0].unbind(-1)]
 
     def _check_empty(self, lane: LaneDynamics) -> None:
         """Refuse a law that does not come to an end as the gap grows.

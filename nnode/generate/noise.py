@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,16 +18,16 @@ from nnode.exchange.drivers import drawn
 from nnode.generate.people import sample_people, takes_paces
 from nnode.model import Crowd, Traffic
 from nnode.model.effects.base import IndividualEffect
-from nnode.model.effects.crowd_individual import GaitSway
-from nnode.model.effects.traffic import DriverHeterogeneity
-from nnode.model.lane_dynamics import Rule
+from nnode.model.effects.crowd import GaitSway
+from nnode.model.effects.lane import DriverHeterogeneity
+from nnode.model.formula import effect_increment
 from nnode.model.laws import law_from
 from nnode.model.steps import STAGES
 from nnode.model.system import System
 from nnode.model.term import State, Term
+from nnode.model.terms import Rule
 from nnode.simulate.base import Trajectory, check_finite, substeps
-from nnode.simulate.ode import whole_steps
-from nnode.simulate.rates import Rates
+from nnode.simulate.ode import Rates, whole_steps
 
 
 @dataclass(frozen=True)
@@ -63,31 +64,20 @@ class Push(Term):
     not make it drive backwards.
     """
 
-    tau: Tensor
     name = "noise"
-    formula = "W + push, d push = -push/tau dt + sigma sqrt(2/tau) dB"
-    rule = Rule(rate="max(W + push, min(W, 0*W))", states={"push": ("m/s", "-push/tau")})
-    # whoever stands stays: steps end at a speed of 0 at the least
-    second = Rule(rate="W + push", states={"push": ("m/s^2", "-push/tau")})
+    rules: ClassVar[dict[int, Rule]] = {
+        1: Rule(rate="max(W + push, min(W, 0*W))", states={"push": ("m/s", "-push/tau", "0*W")}),
+        # whoever stands stays: steps end at a speed of 0 at the least
+        2: Rule(rate="W + push", states={"push": ("m/s^2", "-push/tau", "0*W")}),
+    }
     source = "Uhlenbeck & Ornstein 1930; in car following: Treiber, Kesting & Helbing 2006"
-    memory = 1
 
     def __init__(self, tau: float) -> None:
         super().__init__()
         self.declare("tau", tau, unit="s")
 
     def forward(self, state: State) -> Tensor:
-        assert state.memory is not None
-        assert state.rate is not None
-        most = torch.maximum(state.rate + state.memory, state.rate.clamp(max=0.0))
-        return torch.where(state.scene.follower[..., None], most - state.rate, 0.0)
-
-    def memory_rate(self, state: State) -> Tensor:
-        assert state.memory is not None
-        return -state.memory / self.tau
-
-    def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
-        return torch.zeros_like(x)
+        return effect_increment(self, state)
 
 
 def constant_speed(domain: str = "traffic") -> System:

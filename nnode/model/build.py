@@ -14,7 +14,6 @@ from nnode.errors import ConfigError
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
 from nnode.model.effects.own import VARIABLE, load_own
-from nnode.model.formula import rule_of
 from nnode.model.laws import Law, entries, law_from, make_law, takes_options
 from nnode.model.system import Crowd, System, Traffic
 
@@ -129,7 +128,7 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
     for effect in sorted(added, key=lambda effect: effect.rank):
         _check_order(model, effect)
         model.terms.append(effect)
-        if effect.second is not None and model.order > 1:
+        if model.domain == "traffic" and model.order > 1:
             try:
                 model.lane  # noqa: B018 - says what the law does not have
             except ConfigError as error:
@@ -156,15 +155,15 @@ def _check_order(model: System, effect: Effect) -> None:
     """Refuse an effect that is not known for speeds, or for accelerations."""
     if model.domain != "traffic":
         return
-    second = effect.second is not None
-    if model.order > 1 and not second:
-        known = [e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None]
+    if model.order in effect.rules or not (effect.rules or model.order > 1):
+        return
+    if model.order > 1:
+        known = [e.name for e in CATALOGUE.of("traffic", every=True) if 2 in e.rules]
         raise ConfigError(
             f"model.effects: {effect.name} changes a speed, and this law says an acceleration; "
             f"for those there are {', '.join(known)}"
         )
-    if model.order == 1 and second and rule_of(effect) is None:
-        raise ConfigError(
-            f"model.effects: {effect.name} changes an acceleration, and this law says a speed; "
-            "take a law of second order, such as model=idm"
-        )
+    raise ConfigError(
+        f"model.effects: {effect.name} changes an acceleration, and this law says a speed; "
+        "take a law of second order, such as model=idm"
+    )

@@ -28,9 +28,6 @@ def _weighted(weight: Expr, slope: Expr) -> Expr:
     if slope.op == "choose" and slope.args[1].op == slope.args[2].op == "const":
         condition, b, c = slope.args
         return apply("choose", condition, weight * b, weight * c)
-    if slope.op == "sub" and slope.args[1].op == "choose" and slope.args[0].is_number(1):
-        condition, b, c = slope.args[1].args
-        return apply("choose", condition, weight * (1 - b), weight * (1 - c))
     return weight * slope
 
 

@@ -84,16 +84,16 @@ class Expr:
         return power(self, as_expr(exponent))
 
     def __radd__(self, other: float) -> Expr:
-        return as_expr(other) + self
+        return const(other) + self
 
     def __rsub__(self, other: float) -> Expr:
-        return as_expr(other) - self
+        return const(other) - self
 
     def __rmul__(self, other: float) -> Expr:
-        return as_expr(other) * self
+        return const(other) * self
 
     def __rtruediv__(self, other: float) -> Expr:
-        return as_expr(other) / self
+        return const(other) / self
 
     def is_number(self, value: float | None = None) -> bool:
         """Whether this is a number, or that number."""

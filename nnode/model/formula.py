@@ -6,11 +6,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from nnode.errors import ConfigError
 from nnode.model.crowd_formula import rates_of as crowd_rates
 from nnode.model.expression import const, symbol
 from nnode.model.laws import Law, parameters_of
@@ -21,35 +22,6 @@ from nnode.model.tensors import LaneRates
 from nnode.model.term import State, Term
 from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, own_values, values_of
 
-
-def rule_of(term: Term) -> Any:
-    """What a term says of itself, a rule of its domain; None where its class, or one between it
-    and the one that says so, is code of its own."""
-    if "rule" in vars(term):
-        return term.rule
-    for kind in type(term).__mro__:
-        if "rule" in vars(kind):
-            return vars(kind)["rule"]
-        if _CODE & set(vars(kind)):
-            return None
-    return None
-
-
-def _effect_rule(term: Term, order: int) -> Any:
-    """What an effect does to a law of an order."""
-    return rule_of(term) if order == 1 else term.second
-
-
-def begins(term: Term, order: int) -> bool:
-    """Whether the start of a term's states is a formula."""
-    rule = rule_of(term) if isinstance(term, Law) else _effect_rule(term, order)
-    return bool(rule) and bool(rule.delayed or any(len(s) > 2 for s in rule.states.values()))
-
-
-#: What computes a term.
-_CODE = {"forward", "memory_rate"}
-
-
 #: What terms say of their formulas to the formula of all.
 _KNOWN: dict[tuple[Any, ...], Any] = {}
 
@@ -59,7 +31,7 @@ def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
     if not terms or not isinstance(terms[0], Law) or terms[0].rule is None:
         return None
     order = terms[0].order
-    if any(isinstance(e, Law) or _effect_rule(e, order) is None for e in terms[1:]):
+    if any(isinstance(e, Law) or e.rule_for(order) is None for e in terms[1:]):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _KNOWN:
@@ -73,7 +45,7 @@ def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
 
 def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
     """The formula of a crowd with these terms; None where one is code without a formula."""
-    if any(rule_of(term) is None or term.memory for term in terms):
+    if any(term.rule_for(2) is None for term in terms):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _KNOWN:
@@ -96,7 +68,7 @@ def with_term(model: Any, term: Term, owner: str, place: int, called: bool = Fal
     """
     if isinstance(term, Law):
         return term.written(model, owner, place, called=called)
-    rule = term.rule if isinstance(model, CrowdDynamics) else _effect_rule(term, model.order)
+    rule = term.rule_for(2 if isinstance(model, CrowdDynamics) else model.order)
     if rule is None:
         raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
     return add_term(model, owner, rule, *parameters_of(term, owner, place), place)
@@ -153,25 +125,38 @@ def rates_of(
     return _rates(stepped(lane, scene.method))(y, values, scene.follower, scene.leader, lead, code)
 
 
+def effect_alone(law: Term, term: Term) -> LaneDynamics:
+    """The formula of one effect beside a law, where other terms are code: ``before`` is the sum of
+    the terms before it.
+
+    Raises:
+        ConfigError: the effect changes a law of the gap, and the model has none.
+    """
+    key = ("increment", law.shape, term.shape)
+    if key not in _KNOWN:
+        alone, before = LaneDynamics(order=1), symbol("before")
+        if isinstance(law, Law) and law.rule is not None:
+            alone = with_term(LaneDynamics(order=law.order), law, law.name, 0)
+        elif "law(" in str(term.rule_for(1)):
+            raise ConfigError(
+                f"effect {term.name} modifies the law of the gap and needs a model with one; "
+                "derive the model's own term from FollowTheLeader, or leave the effect out"
+            )
+        units = {**alone.units, "before": "m/s"}
+        alone = replace(alone, rates={"x": before}, leader=before, units=units)
+        _KNOWN[key] = with_term(alone, term, term.name, 1).flat()
+    found: LaneDynamics = _KNOWN[key]
+    return found
+
+
 def effect_increment(term: Term, state: State) -> Tensor:
     """``(B, N, 1 + M)`` what one effect changes of the sum of the terms before it, and the rates
     of its states: for models with other terms that are code."""
-    assert state.system is not None
     before = torch.zeros_like(state.x) if state.rate is None else state.rate
-    law = state.system.terms[0]
-    if rule_of(term) is None:
-        raise NotImplementedError(f"{type(term).__name__} defines neither a rule nor forward")
-    key = ("increment", law.shape, term.shape)
-    if key not in _KNOWN:
-        alone, before_it = LaneDynamics(order=1), symbol("before")
-        if isinstance(law, Law) and law.rule is not None:
-            alone = with_term(LaneDynamics(order=law.order), law, law.name, 0)
-        units = {**alone.units, "before": "m/s"}
-        alone = replace(alone, rates={"x": before_it}, leader=before_it, units=units)
-        _KNOWN[key] = with_term(alone, term, term.name, 1).flat()
+    law = state.terms[0]
     y = state.x if state.memory is None else torch.cat([state.x, state.memory], -1)
-    more = {"before": before[..., 0]}
-    found = rates_of([cast(Term, law), term], _KNOWN[key], y, state.t, state.scene, False, more)
+    more, lane = {"before": before[..., 0]}, effect_alone(law, term)
+    found = rates_of([law, term], lane, y, state.t, state.scene, False, more)
     followers = state.scene.follower | state.scene.leader
     change = torch.where(followers, found[..., 0] - before[..., 0], 0.0)
     return torch.cat([change[..., None], found[..., 1:]], -1)
@@ -199,8 +184,7 @@ def added_to(laws: Sequence[Term], effects: Sequence[Term], called: bool = False
 
 def contribution(term: Term, state: State) -> Tensor:
     """``(B, N, 2)`` m/s²: what one effect adds to the accelerations, by its rule."""
-    around = [] if state.system is None else list(state.system.terms)
-    laws = [t for t in around if isinstance(t, Law)]
+    laws = [t for t in state.terms if isinstance(t, Law)]
     code = {name: call for law in laws for name, call in law.code().items()}
     return crowd_rates([*laws, term], added_to(laws, [term], called=True), state, code)
 
@@ -209,7 +193,7 @@ def starts_of(
     terms: Sequence[Term], lane: LaneDynamics, x: Tensor, v: Tensor, scene: Scene,
     parameters: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """``(B, N)`` values at the start of a lane's added states, of those whose start is a formula.
+    """``(B, N)`` values at the start of a lane's added states.
 
     Args:
         x, v: ``(B, N, 1)`` measured at the start.
@@ -217,23 +201,24 @@ def starts_of(
     """
     if not lane.starts:
         return {}
-    start = [x, v][: lane.order]
-    y = torch.cat([*start, x.new_zeros(*x.shape[:2], len(lane.rates) - lane.order)], -1)
+    rates = _starts(lane)
+    y = torch.cat([x, v, x.new_zeros(*x.shape[:2], len(lane.starts))], -1)
     values = dict(parameters or {})
     if parameters is None:
         values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
-    values |= inputs_of(terms, lane, scene)
+    values |= inputs_of(terms, rates.lane, scene)
     values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
     values["dt"] = y.new_tensor(scene.step)
-    found = _starts(lane)(y, values, scene.follower, scene.leader, None)
-    return {name: found[..., i] for i, name in enumerate(lane.rates) if name in lane.starts}
+    code = terms[0].code() if isinstance(terms[0], Law) else None
+    found = rates(y, values, scene.follower, scene.leader, None, code)
+    return {name: found[..., i] for i, name in enumerate(lane.starts, start=2)}
 
 
 @cache
 def _starts(lane: LaneDynamics) -> LaneRates:
-    zero = const(0)
-    rates = {state: lane.starts.get(state, zero) for state in lane.rates}
-    return LaneRates(replace(lane, rates=rates, leads={}))
+    """Starts in the place of rates; positions and speeds are measured."""
+    rates = {"x": const(0), "v": const(0), **lane.starts}
+    return LaneRates(replace(lane, rates=rates, leader=const(0), leads={}, chained={}))
 
 
 @cache

@@ -11,29 +11,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.special import expit
 from torch.nn.functional import softplus
 
-#: How tightly a notation binds.
-SUM, PRODUCT, SIGN, POWER, ATOM = 1, 2, 3, 4, 5
-
-
-class Notation(NamedTuple):
-    """How an operation is written.
-
-    Attributes:
-        text: with a field for every argument.
-        level: how tightly it binds.
-        least: of every argument, how tightly it must bind to stand without brackets.
-    """
-
-    text: str
-    level: int
-    least: tuple[int, ...]
+#: A text with a field for every argument, and how tightly it binds: 1 a sum, 2 a product, 3 a sign,
+#: 4 a power, 5 what never needs brackets. An argument that binds less tightly than the number in
+#: its field stands in brackets.
+Notation = tuple[str, int]
 
 
 @dataclass(frozen=True)
@@ -41,48 +29,42 @@ class Operation:
     """An operation of one to three arguments.
 
     Attributes:
-        name: of the operation; public ones are called by it in formulas.
+        name: of the operation; formulas of users call it by this name.
         code: Python code of the value, with a field for every argument.
         slope: Python code of the derivatives by the arguments a, b, c, where f is the value.
+        number: the function of this name that ``code`` calls, for Python's numbers; it raises an
+            error where it is not defined.
+        array: that function for NumPy.
+        tensor: that function for PyTorch.
         alike: arguments that have one unit, which is that of the value.
         powers: exponents of the arguments' units in the value's. Without ``alike`` and ``powers``
             arguments and value are numbers without unit.
-        plain: the notation that is read again; None for ``name(...)``.
-        latex: the notation on pages; None for ``name(...)``.
-        public: whether a user's formula may call it.
-        number: the function that ``code`` names, for Python's numbers; an error if undefined.
-        array: that function for NumPy.
-        tensor: that function for PyTorch.
+        plain: the notation that is read again; None for ``name(...)``, as users call it.
+        latex: the notation on pages; None for the plain one.
+        internal: whether formulas of users may not call it.
     """
 
     name: str
     code: str
     slope: str
+    number: Callable[..., float] | None = None
+    array: Callable[..., Any] | None = None
+    tensor: Callable[..., torch.Tensor] | None = None
     alike: tuple[int, ...] = ()
     powers: tuple[float, ...] = ()
     plain: Notation | None = None
     latex: Notation | None = None
-    public: bool = False
-    number: Callable[..., float] | None = None
-    array: Callable[..., Any] | None = None
-    tensor: Callable[..., torch.Tensor] | None = None
+    internal: bool = False
 
     @property
     def arguments(self) -> int:
         return sum(field in self.code for field in ("{0}", "{1}", "{2}"))
 
 
-def _function(
-    name: str,
-    slope: str,
-    number: Callable[..., float],
-    array: Callable[..., Any],
-    tensor: Callable[..., torch.Tensor],
-    **other: Any,
-) -> Operation:
-    """A function of one argument, which every library has."""
-    row = {"public": True, "number": number, "array": array, "tensor": tensor, **other}
-    return Operation(name, name + "({0})", slope, **row)
+def _everywhere(name: str, slope: str, **other: Any) -> Operation:
+    """A function that has one name in all libraries."""
+    functions = (getattr(library, name) for library in (math, np, torch))
+    return Operation(name, name + "({0})", slope, *functions, **other)
 
 
 def _logistic(a: float) -> float:
@@ -90,7 +72,8 @@ def _logistic(a: float) -> float:
 
 
 #: Operations by name. The softplus is PyTorch's: a itself beyond 20. What is no number stays none
-#: in ``max`` and ``min``; where both arguments are equal, the slope is that of the first.
+#: in ``max`` and ``min``; where both arguments are equal, the slope is that of the first. A sum
+#: that is added stays in brackets, so that it is read as it was written.
 OPERATIONS = {
     row.name: row
     for row in (
@@ -99,101 +82,79 @@ OPERATIONS = {
             "{0} + {1}",
             "1, 1",
             alike=(0, 1),
-            # a sum that is added stays in brackets, so that it is read as it was written
-            plain=Notation("{0} + {1}", SUM, (SUM, SUM + 1)),
-            latex=Notation("{0} + {1}", SUM, (SUM, SUM)),
+            plain=("{0:1} + {1:2}", 1),
+            latex=("{0:1} + {1:1}", 1),
         ),
-        Operation(
-            "sub",
-            "{0} - {1}",
-            "1, -1",
-            alike=(0, 1),
-            plain=Notation("{0} - {1}", SUM, (SUM, SUM + 1)),
-            latex=Notation("{0} - {1}", SUM, (SUM, SUM + 1)),
-        ),
+        Operation("sub", "{0} - {1}", "1, -1", alike=(0, 1), plain=("{0:1} - {1:2}", 1)),
         Operation(
             "mul",
             "{0} * {1}",
             "b, a",
             powers=(1, 1),
-            plain=Notation("{0}*{1}", PRODUCT, (PRODUCT, PRODUCT + 1)),
-            latex=Notation("{0}\\,{1}", PRODUCT, (PRODUCT, PRODUCT)),
+            plain=("{0:2}*{1:3}", 2),
+            latex=("{0:2}\\,{1:2}", 2),
         ),
+        Operation("neg", "-{0}", "-1", powers=(1,), plain=("-{0:2}", 3)),
         Operation(
-            "neg",
-            "-{0}",
-            "-1",
-            powers=(1,),
-            plain=Notation("-{0}", SIGN, (PRODUCT,)),
-            latex=Notation("-{0}", SIGN, (PRODUCT,)),
-        ),
-        _function(
             "recip",
+            "recip({0})",
             "-(f * f)",
             lambda a: 1 / a,
             partial(np.divide, 1.0),
             torch.reciprocal,
             powers=(-1,),
-            plain=Notation("1/{0}", PRODUCT, (POWER,)),
-            latex=Notation("\\frac{{1}}{{{0}}}", ATOM, (SUM,)),
-            public=False,
+            plain=("1/{0:4}", 2),
+            latex=("\\frac{{1}}{{{0}}}", 5),
         ),
-        _function(
-            "sqrt",
-            "0.5 * recip(f)",
-            math.sqrt,
-            np.sqrt,
-            torch.sqrt,
-            powers=(0.5,),
-            latex=Notation("\\sqrt{{{0}}}", ATOM, (SUM,)),
-        ),
-        _function("exp", "f", math.exp, np.exp, torch.exp),
-        _function("log", "recip(a)", math.log, np.log, torch.log),
-        _function("tanh", "1 - f * f", math.tanh, np.tanh, torch.tanh),
-        _function("sin", "cos(a)", math.sin, np.sin, torch.sin),
-        _function("cos", "-sin(a)", math.cos, np.cos, torch.cos),
-        _function(
+        _everywhere("sqrt", "0.5 * recip(f)", powers=(0.5,), latex=("\\sqrt{{{0}}}", 5)),
+        _everywhere("exp", "f"),
+        _everywhere("log", "recip(a)"),
+        _everywhere("tanh", "1 - f * f"),
+        _everywhere("sin", "cos(a)"),
+        _everywhere("cos", "-sin(a)"),
+        Operation(
             "softplus",
+            "softplus({0})",
             "softplus_slope(a)",
             lambda a: a if a > 20 else math.log1p(math.exp(a)),
             lambda a: np.where(a > 20, a, np.log1p(np.exp(np.minimum(a, 20.0)))),
             softplus,
         ),
-        _function(
+        Operation(
             "softplus_slope",
+            "softplus_slope({0})",
             "f * (1 - f)",
             lambda a: 1.0 if a > 20 else _logistic(a),
             lambda a: np.where(a > 20, 1.0, expit(a)),
             lambda a: torch.where(a > 20, 1.0, torch.sigmoid(a)),
-            public=False,
+            internal=True,
         ),
-        _function("logistic", "f * (1 - f)", _logistic, expit, torch.sigmoid),
+        Operation("logistic", "logistic({0})", "f * (1 - f)", _logistic, expit, torch.sigmoid),
         Operation(
             "max",
             "where(({1} > {0}) | ({1} != {1}), {1}, {0})",
-            "1 - choose(b - a, 1, 0), choose(b - a, 1, 0)",
+            "choose(b - a, 0, 1), choose(b - a, 1, 0)",
             alike=(0, 1),
-            public=True,
         ),
         Operation(
             "min",
             "where(({1} < {0}) | ({1} != {1}), {1}, {0})",
-            "1 - choose(a - b, 1, 0), choose(a - b, 1, 0)",
+            "choose(a - b, 0, 1), choose(a - b, 1, 0)",
             alike=(0, 1),
-            public=True,
         ),
         Operation(
             "choose",
             "where({0} > zero, {1}, {2})",
             "0, choose(a, 1, 0), choose(a, 0, 1)",
             alike=(1, 2),
-            public=True,
         ),
     )
 }
 
 #: Numbers of arguments of the functions that formulas of users may call.
-FUNCTIONS = {name: row.arguments for name, row in OPERATIONS.items() if row.public}
+FUNCTIONS = {
+    name: row.arguments for name, row in OPERATIONS.items() if not (row.plain or row.internal)
+}
 #: Names that code of operations contains, in the libraries that formulas are computed with.
 LIBRARIES: dict[str, dict[str, Any]] = {
     "number": {"where": lambda condition, a, b: a if condition else b},
@@ -201,7 +162,8 @@ LIBRARIES: dict[str, dict[str, Any]] = {
     "tensor": {"where": torch.where},
 }
 for _library, _names in LIBRARIES.items():
-    _names |= {name: getattr(row, _library) for name, row in OPERATIONS.items()} | {"zero": 0}
+    _names |= {row.name: getattr(row, _library) for row in OPERATIONS.values() if row.number}
+    _names["zero"] = 0
 
 
 def compiled(code: str, arguments: str, names: dict[str, Any]) -> Callable[..., Any]:

@@ -8,7 +8,7 @@ place of its own; there may be several such names.
 from __future__ import annotations
 
 import ast
-import math
+import sys
 from collections.abc import Callable, Mapping
 
 from nnode.errors import ConfigError
@@ -104,12 +104,12 @@ class _Reader:
         match node:
             case ast.BinOp() if type(node.op) in _BINARY:
                 a, b = self.read(node.left, depth + 1), self.read(node.right, depth + 1)
-                if isinstance(node.op, ast.Pow) and b.op == "const" and abs(b.value) > EXPONENT:
+                power = isinstance(node.op, ast.Pow) and b.op == "const"
+                if power and abs(b.value) > EXPONENT:
                     raise self.fail(node.right, f"an exponent is at most {EXPONENT}")
-                negative = isinstance(node.op, ast.Pow) and b.op == "const" and b.value < 0
-                if (isinstance(node.op, ast.Div) and b.is_number(0)) or (
-                    negative and a.is_number(0)
-                ):
+                negative = power and b.value < 0
+                divides = isinstance(node.op, ast.Div)
+                if (divides and b.is_number(0)) or (negative and a.is_number(0)):
                     raise self.fail(node.right, "this divides by 0")
                 return _BINARY[type(node.op)](a, b)
             case ast.UnaryOp(op=ast.USub()):
@@ -117,29 +117,19 @@ class _Reader:
             case ast.UnaryOp(op=ast.UAdd()):
                 return self.read(node.operand, depth + 1)
             case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
-                return self.number(node, value)
-            case ast.Name():
-                return self.name(node)
+                if not abs(value) <= sys.float_info.max:
+                    raise self.fail(node, "this number is too large")
+                return const(value)
+            case ast.Name(id=name):
+                if self.names is None:
+                    return symbol(name)
+                if name not in self.names:
+                    known = ", ".join(sorted(self.names))
+                    raise self.fail(node, f"{name} is unknown; there are {known}")
+                return self.names[name]
             case ast.Call(func=ast.Name(id=name)):
                 return self.call(node, name, depth)
         raise self.fail(node, f"this is not allowed in a formula; {_LISTED}")
-
-    def number(self, node: ast.AST, value: float) -> Expr:
-        try:
-            found = float(value)
-        except OverflowError:
-            found = math.inf
-        if not math.isfinite(found):
-            raise self.fail(node, "this number is too large")
-        return const(found)
-
-    def name(self, node: ast.Name) -> Expr:
-        if self.names is None:
-            return symbol(node.id)
-        if node.id not in self.names:
-            known = ", ".join(sorted(self.names))
-            raise self.fail(node, f"{node.id} is unknown; there are {known}")
-        return self.names[node.id]
 
     def call(self, node: ast.Call, name: str, depth: int) -> Expr:
         if name in self.laws:

@@ -12,7 +12,7 @@ from functools import cache
 
 from nnode.errors import ConfigError
 from nnode.model.expression import Expr, apply, const, reciprocal, symbol
-from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.terms import LaneDynamics
 
 #: Methods of compiled code: Euler's; places with the new speed (SUMO's own); places with the mean
 #: of both speeds (Treiber & Kanagaraj 2015); Runge and Kutta's of fourth order.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
-from nnode.model.formula import begins, crowd_of, lane_of, rates_of, starts_of
+from nnode.model.formula import crowd_of, effect_alone, lane_of, rates_of, starts_of
 from nnode.model.laws import Law
 from nnode.model.scene import DESIRED, Scene, wanted
 from nnode.model.term import Interval, State, Term, physical_parameters, short_names
@@ -79,16 +79,21 @@ class System(nn.Module):
             step: s, of the solver, for laws whose formula names it.
         """
         start = [batch.x[0], batch.v[0]][: self.order]
-        return torch.cat([*start, *self._memories(batch, step)], -1)
+        return torch.cat([*start, *self._added(batch, step)], -1)
 
-    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
-        """``(B, N, M)`` additional states at the start, term by term."""
-        x, v = batch.x[0], batch.v[0]
-        return [term.remember(x, v, self) for term in self._terms() if term.memory]
+    @property
+    def memory(self) -> int:
+        """Number M of states that terms add to those of motion."""
+        rules = (term.rule_for(self.order) for term in self._terms())
+        return sum(rule.memory for rule in rules if rule is not None)
+
+    def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
+        """``(B, N, M)`` the states that terms add, at the start."""
+        return []
 
     def acceleration(self, state: State) -> Tensor:
         """``(B, N, D)``: the sum of all terms, m/s (first order) or m/s² (second order)."""
-        return self._rates(state, None)[0]
+        return self._rates(state)
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
         """Positions and, in second-order models, velocities of the states at the samples."""
@@ -103,20 +108,21 @@ class System(nn.Module):
     def _terms(self) -> list[Term]:
         return cast(list[Term], list(self.terms))
 
-    def _rates(self, state: State, memory: Tensor | None) -> tuple[Tensor, list[Tensor]]:
-        """The sum of the terms, and the rates of their additional states ``(B, N, M)``."""
-        total, rates, first = torch.zeros_like(state.x), [], 0
-        for term in self._terms():
-            own = None
-            if term.memory:
-                assert memory is not None
-                own = memory[..., first : first + term.memory]
-                first += term.memory
-            now = replace(state, system=self, rate=total, memory=own)
-            total = self._imposed(total + term(now), state)
-            if term.memory:
-                rates.append(term.memory_rate(now))
-        return total, rates
+    def _rates(self, state: State, memory: Tensor | None = None) -> Tensor:
+        """``(B, N, D + M)`` the sum of the terms, then the rates of the states that they add."""
+        terms, total, first = self._terms(), torch.zeros_like(state.x), 0
+        added: list[Tensor] = []
+        for term in terms:
+            rule = term.rule_for(self.order)
+            number = 0 if rule is None else rule.memory
+            own = None if memory is None else memory[..., first : first + number]
+            first += number
+            found = term(replace(state, terms=terms, rate=total, memory=own))
+            if number:
+                added.append(found[..., self.dim :])
+                found = found[..., : self.dim]
+            total = self._imposed(total + found, state)
+        return torch.cat([total, *added], -1) if added else total
 
     def _imposed(self, rate: Tensor, state: State) -> Tensor:
         """The rates, where some agents' are known from elsewhere."""
@@ -193,20 +199,21 @@ class Traffic(System):
         lane = self.lane
         return lane is None or lane.names_places
 
-    def _memories(self, batch: Batch, step: float | None) -> list[Tensor]:
-        lane, terms = self.lane, self._terms()
-        if lane is None:  # what is code and remembers nothing does not matter at the start
-            terms = [term for i, term in enumerate(terms) if not i or term.memory]
-            lane = lane_of(terms)
-        if lane is None or not lane.starts:
-            return super()._memories(batch, step)
-        x, v, scene = batch.x[0], batch.v[0], self.scene(batch)
+    def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
+        if not self.memory:
+            return []
+        terms, lane, scene = self._terms(), self.lane, self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
-        known = starts_of(terms, lane, x, v, scene)
-        told = [t.remember(x, v, self) for t in terms if t.memory and not begins(t, self.order)]
-        others = iter(torch.cat(told, -1).unbind(-1) if told else ())
-        added = list(lane.rates)[self.order :]
-        return [torch.stack([known[s] if s in known else next(others) for s in added], -1)]
+        models = [(terms, lane)]
+        if lane is None:
+            added = [term for term in terms if (rule := term.rule_for(1)) and rule.memory]
+            models = [([terms[0], term], effect_alone(terms[0], term)) for term in added]
+        found: dict[tuple[int, str], Tensor] = {}
+        for i, (own, formula) in enumerate(models):
+            assert formula is not None
+            starts = starts_of(own, formula, batch.x[0], batch.v[0], scene)
+            found |= {(i, state): starts[state] for state in list(formula.rates)[self.order :]}
+        return [torch.stack(list(found.values()), -1)]
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
         place = scene.measured_at(t) if self.leader == "measured" else None
@@ -231,12 +238,12 @@ class Traffic(System):
         if lane is not None:
             rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
             return rate if place is None else rate.masked_fill(lead, 0.0)
-        x, memory = y[..., :1], y[..., 1:]
-        rate, own = self._rates(State(t, x, None, scene), memory)
-        if place is not None:
-            # the leader's state is never read: its place is known at every time
-            rate = rate.masked_fill(lead, 0.0)
-        return torch.cat([rate, *own], -1) if own else rate
+        found = self._rates(State(t, y[..., :1], None, scene), y[..., 1:])
+        if place is None:
+            return found
+        # the leader's state is never read: its place is known at every time
+        rate = found[..., :1].masked_fill(lead, 0.0)
+        return torch.cat([rate, found[..., 1:]], -1)
 
     def _imposed(self, rate: Tensor, state: State) -> Tensor:
         # of no account for laws of the gap, but effects look at the speed of the vehicle ahead
@@ -305,32 +312,37 @@ class Crowd(System):
         return wanted(super().scene(batch), batch, self.desired)
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
-        if self.order == 1:
-            seen = (scene.measured_at(t),) * 2 if self.neighbours == "measured" else None
-            return self._rates(State(t, y, None, scene, seen=seen), None)[0]
-        x, v, memory = y[..., :2], y[..., 2:4], y[..., 4:]
+        moving = [y] if self.order == 1 else [y[..., :2], y[..., 2:]]
         seen = None
         if self.neighbours == "measured":
-            seen = scene.measured_at(t), scene.measured_rate_at(t)
-        rate, own = self._rates(State(t, x, v, scene, seen=seen), memory)
-        return torch.cat([v, rate, *own], -1)
+            place = scene.measured_at(t)
+            seen = place, place if self.order == 1 else scene.measured_rate_at(t)
+        state = State(t, moving[0], moving[1] if self.order > 1 else None, scene, seen=seen)
+        return torch.cat([*moving[1:], self._rates(state)], -1)
 
 
-class _Initial(nn.Module):
-    """The start of a model as a module, so that its parameters can be replaced."""
+class _Given(nn.Module):
+    """A model in a module that calls a function of it, so that its parameters can be replaced."""
 
     def __init__(self, system: System) -> None:
         super().__init__()
         self.system = system
 
-    def forward(self, batch: Batch, step: float | None) -> Tensor:
-        return self.system.initial(batch, step)
+    def forward(self, function: Callable[[System], Any]) -> Any:
+        return function(self.system)
+
+
+def with_parameters(
+    system: System, parameters: Mapping[str, Tensor], function: Callable[[System], Any]
+) -> Any:
+    """A function of a model, with other parameters in place of the model's."""
+    own = {f"system.{name}": value for name, value in parameters.items()}
+    return functional_call(_Given(system), own, (function,))
 
 
 def initial_with(
     system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
 ) -> Tensor:
     """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
-    own = {f"system.{name}": value for name, value in parameters.items()}
-    found: Tensor = functional_call(_Initial(system), own, (batch, step))
+    found: Tensor = with_parameters(system, parameters, lambda own: own.initial(batch, step))
     return found

@@ -13,7 +13,7 @@ from functools import cache
 
 from nnode.model.differentiate import derivatives
 from nnode.model.expression import Expr, const, symbol, symbols
-from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.terms import LaneDynamics
 
 
 @cache

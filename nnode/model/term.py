@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from nnode.model.crowd_dynamics import CrowdRule
-from nnode.model.lane_dynamics import Rule
 from nnode.model.names import check_names
 from nnode.model.scene import Scene
-
-if TYPE_CHECKING:
-    from nnode.model.system import System
+from nnode.model.terms import Rule
 
 
 @dataclass
@@ -29,9 +25,9 @@ class State:
         x: ``(B, N, D)`` positions, m.
         v: ``(B, N, D)`` velocities, m/s; None in first-order models.
         scene: everything that does not change during the simulation.
-        system: the model whose terms are summed; an effect looks there for the law it modifies.
-        rate: ``(B, N, D)`` sum of the terms before the one that looks, m/s or m/s².
-        memory: ``(B, N, M)`` the M additional states of the term that looks.
+        terms: the model's terms; an effect looks there for the law that it changes.
+        rate: ``(B, N, D)`` sum of the terms before, m/s or m/s².
+        memory: ``(B, N, M)`` the M states that the term adds.
         seen: where the others are, ``(x, v)``, for a person who looks around; None where they
             are simulated as well.
     """
@@ -40,7 +36,7 @@ class State:
     x: Tensor
     v: Tensor | None
     scene: Scene
-    system: System | None = None
+    terms: Sequence[Term] = ()
     rate: Tensor | None = None
     memory: Tensor | None = None
     seen: tuple[Tensor, Tensor] | None = None
@@ -76,24 +72,21 @@ class Term(nn.Module):
 
     Class attributes:
         name: the field's name of the effect.
-        formula: the formula, in the symbols of the parameters.
+        formula: the formula of a term without rules, in the symbols of the parameters.
         source: where the formula stands.
-        memory: number M of additional states of each agent that the term owns.
-        fast: parameters that these states' time constants are proportional to, with the factor.
-        rule: what it does, as formulas, from which everything is made that computes it; None:
-            ``forward`` is code of its own, which runs in PyTorch.
-        second: what it does to a law that says an acceleration; None: nothing is known.
+        rule: of a law or a force, its formulas; None: ``forward`` is code, which runs in PyTorch.
+        rules: of an effect, the order of a model to what the effect does to it, as formulas.
+        fast: parameters that time constants of its states are proportional to, with the factor.
         side_by_side: whether ``forward`` takes many simulations at once, with times ``(B,)`` and
             scalar parameters ``(B, 1, 1)``.
     """
 
     name: ClassVar[str]
-    formula: ClassVar[str]
+    formula: ClassVar[str] = ""
     source: ClassVar[str]
-    memory: ClassVar[int] = 0
+    rule: Rule | None = None
+    rules: ClassVar[Mapping[int, Rule]] = {}
     fast: ClassVar[dict[str, float]] = {}
-    rule: Rule | CrowdRule | None = None
-    second: Rule | None = None
     side_by_side: ClassVar[bool] = False
 
     def __init__(self) -> None:
@@ -142,20 +135,80 @@ class Term(nn.Module):
             if bounds is not None:
                 parameter.clamp_(bounds.low, bounds.high)
 
+    def rule_for(self, order: int) -> Rule | None:
+        """Its formulas in a model of an order; None: there are none, or it is code."""
+        return self.rules.get(order)
+
+    @classmethod
+    def formula_for(cls, order: int) -> str:
+        """Its formula in a model of an order, as text."""
+        rule = cls.rules.get(order)
+        return cls.formula if rule is None else "; ".join(described(rule))
+
+    @classmethod
+    def formula_lines(cls) -> list[str]:
+        """Its formulas in all orders, line by line; lines that repeat are left out."""
+        found: list[str] = []
+        for order, rule in sorted(cls.rules.items()):
+            lines = described(rule)
+            of = "of an acceleration, " if order == 2 and not rule.of_crowd else ""
+            new = [of + lines[0], *(line for line in lines[1:] if line not in found)]
+            found += [f"{of}the same"] if lines == found else new
+        return found or [cls.formula]
+
     def forward(self, state: State) -> Tensor:
+        """``(B, N, D)`` what it adds to the sum; then the rates of the states that it adds."""
         raise NotImplementedError  # pragma: no cover - every term defines its own
 
     def inputs(self, scene: Scene) -> dict[str, Tensor]:
         """``(B, N)`` values of what agents have from the data, by the names of the rule's."""
         return {}
 
-    def remember(self, x: Tensor, v: Tensor, system: System) -> Tensor:
-        """``(B, N, M)`` the additional states at the start, of positions and velocities then."""
-        raise NotImplementedError  # pragma: no cover - every term with a memory defines its own
 
-    def memory_rate(self, state: State) -> Tensor:
-        """``(B, N, M)`` time derivative of the additional states."""
-        raise NotImplementedError  # pragma: no cover - every term with a memory defines its own
+#: Entries of a crowd's rule that are reduced over others or walls, in words.
+_REDUCED = {
+    "others": "sum over others",
+    "points": "sum over wall points",
+    "walls": "sum over walls",
+    "smallest": "smallest over others",
+    "largest": "largest over others",
+}
+
+
+def described(rule: Rule, left: str = "W becomes ") -> list[str]:
+    """The formulas of a rule, line by line.
+
+    Args:
+        left: what stands before the rate of a lane.
+    """
+    if rule.of_crowd:
+        change = "dv{}/dt: {}{}" if rule.order == 2 else "d{}/dt = {}{}"
+        found = [
+            change.format(axis, "" if rule.order == 1 or text.startswith("-") else "+ ", text)
+            for axis, text in zip("xy", rule.rate, strict=True)
+        ]
+        for over, words in _REDUCED.items():
+            parts = getattr(rule, over)
+            found += [f"{name} = {words} of {text}" for name, (_, text) in parts.items()]
+    else:
+        found = [f"{left}{rule.rate}" if rule.rate else f"a leader's W becomes {rule.leader}"]
+        found += [
+            f"{name} = {text}, {delay} ago (at most {rule.remembered} steps)"
+            for name, (text, _, delay) in rule.delayed.items()
+        ]
+        found += [
+            f"d{name}/dt = {rate}, at the start {start}"
+            for name, (_, rate, start) in rule.states.items()
+        ]
+    found += [f"{name} = {text}" for name, text in rule.where.items()]
+    found += [
+        f"{name} = {value:g} {'' if unit == '1' else unit}".rstrip()
+        for name, (value, unit) in rule.constants.items()
+    ]
+    return found + [
+        f"{name}: of each agent, from the data{'' if unit == '1' else f' ({unit})'}"
+        for name, unit in rule.inputs.items()
+    ]
 
 
 def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:

@@ -95,35 +95,61 @@ OTHERS, POINTS, WALLS = "others", "points", "walls"
 SMALLEST, LARGEST = "smallest", "largest"
 #: Entries of a rule that are reduced over others or walls, in the order in which they are read.
 REDUCED = (OTHERS, POINTS, WALLS, SMALLEST, LARGEST)
+
+
+def _units(**names: str) -> dict[str, str]:
+    """Name to unit, from the names of one unit each."""
+    units = {"one": "1", "metre": "m", "speed": "m/s", "second": "s", "any": "*"}
+    return {name: units[unit] for unit, text in names.items() for name in text.split()}
+
+
 #: What a sum's summand sees of what it runs over.
 SEEN = {
-    OTHERS: {"dx": "m", "dy": "m", "dvx": "m/s", "dvy": "m/s"},
-    POINTS: {"dx": "m", "dy": "m", "normal_x": "1", "normal_y": "1"},
-    WALLS: {"dx": "m", "dy": "m", "along_x": "m", "along_y": "m"},
-    SMALLEST: {"dx": "m", "dy": "m", "dvx": "m/s", "dvy": "m/s"},
+    OTHERS: _units(metre="dx dy", speed="dvx dvy"),
+    POINTS: _units(metre="dx dy", one="normal_x normal_y"),
+    WALLS: _units(metre="dx dy along_x along_y"),
+    SMALLEST: _units(metre="dx dy", speed="dvx dvy"),
 }
 _SEEN = frozenset(name for found in SEEN.values() for name in found)
 #: Names of a lane, and their units.
-UNITS = {
-    "x": "m", "x_1": "m", "x_2": "m", "gap": "m", "gap_1": "m",
-    "v": "m/s", "v_1": "m/s", "v_2": "m/s", "dv": "m/s", "dx_1": "m/s", "measured": "m/s",
-    "length_1": "m", "t": "s", "clock": "s", "dt": "s", "second": "1",
-}  # fmt: skip
+UNITS = _units(
+    metre="x x_1 x_2 gap gap_1 length_1",
+    speed="v v_1 v_2 dv dx_1 measured",
+    second="t clock dt",
+    one="second",
+)
 #: Names of a crowd, and their units.
-CROWD_UNITS = {
-    "x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "goal_x": "m", "goal_y": "m", "pace": "m/s",
-    "t": "s", "start": "s", "people": "1", "points": "1",
-    **SEEN[OTHERS], **SEEN[POINTS], **SEEN[WALLS],
-    "small_m": "m", "small_v": "m/s", "r": "m", "nobody": "*",
-}  # fmt: skip
-#: Of a lane's names these are made of others.
-_MADE = {
-    "gap": symbol("x_1") - symbol("x"),
-    "gap_1": symbol("x_2") - symbol("x_1"),
-    "dv": symbol("v") - symbol("v_1"),
+CROWD_UNITS = _units(
+    metre="x y goal_x goal_y dx dy along_x along_y small_m r",
+    speed="vx vy pace dvx dvy small_v",
+    second="t start",
+    one="people points normal_x normal_y",
+    any="nobody",
+)
+_LENGTH = "sqrt(({0})*({0}) + ({1})*({1}) + {2}*{2})"
+_TO, _WALKS = (
+    _LENGTH.format("goal_x - x", "goal_y - y", "small_m"),
+    _LENGTH.format("vx", "vy", "small_v"),
+)
+_APART = _LENGTH.format("dx", "dy", "small_m")
+_ITS = _LENGTH.format("vx - dvx", "vy - dvy", "small_v")
+#: Names that are made of others, of a lane and of a crowd.
+_LANE = {"gap": "x_1 - x", "gap_1": "x_2 - x_1", "dv": "v - v_1", "clock": "start + t"}
+_CROWD = {
+    "clock": "start + t",
+    "way_x": f"(goal_x - x)/{_TO}",
+    "way_y": f"(goal_y - y)/{_TO}",
+    "speed": _WALKS,
+    "e_x": f"vx/{_WALKS}",
+    "e_y": f"vy/{_WALKS}",
+    "d": _APART,
+    "n_x": f"dx/{_APART}",
+    "n_y": f"dy/{_APART}",
+    "other_x": f"(vx - dvx)/{_ITS}",
+    "other_y": f"(vy - dvy)/{_ITS}",
 }
-_ZERO = const(0)
 _WORD = re.compile(r"[A-Za-z_]\w*")
+_ZERO = const(0)
 #: What a term of a law can be named by with other quantities in it.
 _CALLED = ("law", "force_x", "force_y", "drive_x", "drive_y")
 
@@ -138,8 +164,8 @@ class Rule:
             that it adds, of the velocity where ``order`` is 1.
         leader: what becomes of the speed of a leader that drives by itself, ``W`` before;
             empty: it stays.
-        states: name to (unit, rate) of states that the term adds, or (unit, rate, start); without
-            a start the term's ``remember`` gives it.
+        states: name to (unit, rate, start) of states that the term adds. A start may name v, v_1
+            and v_2 in laws of first order as well: measured speeds at the first sample.
         delayed: name to (formula, unit, delay), the formula's value some time ago; the delay
             in s, from none to as many steps as the term remembers. Before the first sample
             it was what it is there.
@@ -153,12 +179,12 @@ class Rule:
         inputs: name to unit of what an agent has from the data.
         force: the sums over others whose summands effects know as ``force_x`` and ``force_y``.
         drive: whether effects know the rate as ``drive_x`` and ``drive_y``.
-        order: of a crowd, 2 or 1.
+        order: of a law: 2, its rate is an acceleration, or 1, a velocity.
     """
 
     rate: str | tuple[str, str] = ""
     leader: str = ""
-    states: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    states: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     delayed: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     remembered: int = 0
     others: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -177,13 +203,18 @@ class Rule:
     def __post_init__(self) -> None:
         for kind in ("states", "delayed", *REDUCED, "where", "constants", "settings", "inputs"):
             check_names(kind, getattr(self, kind))
-        steps = len(self.delayed) * self.remembered
+        steps = self.memory - len(self.states)
         if not 0 <= steps <= REMEMBERED:
             raise ConfigError(
                 f"remembered: {self.remembered} steps of {len(self.delayed)} delayed quantities "
                 f"are {steps} states of every vehicle, expected at most {REMEMBERED}; take a "
                 "larger step or a shorter delay"
             )
+
+    @property
+    def memory(self) -> int:
+        """Number of states that the term adds to each agent."""
+        return len(self.states) + len(self.delayed) * self.remembered
 
     @property
     def of_crowd(self) -> bool:
@@ -276,7 +307,7 @@ class LaneDynamics(Dynamics):
 
     @property
     def outputs(self) -> list[Expr]:
-        return [*self.rates.values(), self.leader, *self.leads.values(), *self.starts.values()]
+        return [*self.rates.values(), self.leader, *self.leads.values()]
 
     @property
     def names(self) -> Mapping[str, Expr]:
@@ -317,13 +348,14 @@ class LaneDynamics(Dynamics):
 
     def flat(self) -> LaneDynamics:
         """With everything that is made of other quantities written out."""
-        made = {**_MADE, "clock": symbol("start") + symbol("t"), **self.fixed}
+        made = {**{name: parse(text) for name, text in _LANE.items()}, **self.fixed}
         if self.order > 1:
             made["dx_1"] = symbol("v_1")
         rates = {state: substitute(rate, made) for state, rate in self.rates.items()}
         starts: dict[str, Expr] = {}
+        at_start = {**made, "dx_1": symbol("v_1")}
         for state, start in self.starts.items():  # one may name those before it
-            starts[state] = substitute(substitute(start, made), starts)
+            starts[state] = substitute(substitute(start, at_start), starts)
         lead = substitute(self.leader, made)
         chained = {"x": "dx_1"} if "dx_1" in symbols([*rates.values(), lead]) else {}
         return replace(self, rates=rates, leader=lead, starts=starts, chained=chained)
@@ -390,26 +422,10 @@ class CrowdDynamics(Dynamics):
         return substitute(summand, away)
 
 
-def _crowd_names() -> dict[str, Expr]:
-    def length(a: Expr, b: Expr, small: str) -> Expr:
-        return apply("sqrt", a * a + b * b + symbol(small) * symbol(small))
-
-    found = {name: symbol(name) for name in CROWD_UNITS if name != "start"}
-    found["clock"] = symbol("start") + symbol("t")
-    vx, vy, dx, dy = (symbol(name) for name in ("vx", "vy", "dx", "dy"))
-    to_x, to_y = symbol("goal_x") - symbol("x"), symbol("goal_y") - symbol("y")
-    far = length(to_x, to_y, "small_m")
-    found["way_x"], found["way_y"] = to_x / far, to_y / far
-    found["speed"], found["d"] = length(vx, vy, "small_v"), length(dx, dy, "small_m")
-    found["e_x"], found["e_y"] = vx / found["speed"], vy / found["speed"]
-    found["n_x"], found["n_y"] = dx / found["d"], dy / found["d"]
-    to_x, to_y = vx - symbol("dvx"), vy - symbol("dvy")
-    pace = length(to_x, to_y, "small_v")
-    found["other_x"], found["other_y"] = to_x / pace, to_y / pace
-    return found
-
-
-_CROWD_NAMES = _crowd_names()
+_CROWD_NAMES = {
+    **{name: symbol(name) for name in CROWD_UNITS if name != "start"},
+    **{name: parse(text) for name, text in _CROWD.items()},
+}
 D = TypeVar("D", LaneDynamics, CrowdDynamics)
 
 
@@ -527,11 +543,14 @@ def _in_lane(
         _remember(reader, part, entry, rates, starts)
     reader.parts(())
     given = {"W": leader, "measured": symbol("measured")}
-    for part, (unit, formula, *start) in rule.states.items():
+    moving = reader.names
+    at_start = {**{speed: symbol(speed) for speed in ("v", "v_1", "v_2", "dv")}, **moving}
+    for part, (unit, rate, start) in rule.states.items():
         own = f"{name}__{part}"
-        rates[own] = reader.formula(f"d{part}/dt of {name}", formula, f"{unit}/s")
-        for text in start:
-            starts[own] = reader.formula(f"{part} of {name} at the start", text, unit)
+        rates[own] = reader.formula(f"d{part}/dt of {name}", rate, f"{unit}/s")
+        reader.names = at_start
+        starts[own] = reader.formula(f"{part} of {name} at the start", start, unit)
+        reader.names = moving
     if isinstance(rule.rate, str) and rule.rate:
         unit = "m/s" if model.order == 1 else "m/s^2"
         rates[model.top] = reader.formula(name, rule.rate, unit)

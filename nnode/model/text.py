@@ -3,23 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from nnode.model.expression import Expr, topological
-from nnode.model.operations import ATOM, OPERATIONS, POWER, PRODUCT, SIGN, SUM, Notation
+from nnode.model.operations import OPERATIONS, Notation
 
 #: Characters of a part that is written out: what can be read again. A part that is named often
 #: is written as often: without a bound, 40 parts that double have 10^12 characters.
 LONGEST = 2000
-#: Notations of products of equal factors and of products with a reciprocal.
-_SQUARE = {
-    "plain": Notation("{0}**2", POWER, (ATOM,)),
-    "latex": Notation("{{{0}}}^{{2}}", POWER, (ATOM,)),
-}
-_QUOTIENT = {
-    "plain": Notation("{0}/{1}", PRODUCT, (PRODUCT, POWER)),
-    "latex": Notation("\\frac{{{0}}}{{{1}}}", ATOM, (SUM, SUM)),
-}
-_BRACKETS = {"plain": "({0})", "latex": "\\left({0}\\right)"}
+
+
+class _Language(NamedTuple):
+    brackets: str
+    call: str
+    square: Notation
+    quotient: Notation
+
+
+_PLAIN = _Language("({})", "{}({})", ("{0:5}**2", 4), ("{0:2}/{1:4}", 2))
+_LATEX = _Language(
+    "\\left({}\\right)",
+    "\\mathrm{{{}}}\\left({}\\right)",
+    ("{{{0:5}}}^{{2}}", 4),
+    ("\\frac{{{0}}}{{{1}}}", 5),
+)
+
+
+class _Part(NamedTuple):
+    """A part that is written, how tightly it binds, and the brackets of its language."""
+
+    text: str
+    level: int
+    brackets: str
+
+    def __format__(self, least: str) -> str:
+        return self.brackets.format(self.text) if self.level < int(least or 0) else self.text
 
 
 def number(value: float) -> str:
@@ -31,54 +49,50 @@ def number(value: float) -> str:
 def plain(node: Expr) -> str:
     """As :func:`nnode.model.parse.parse` reads it; parts that are longer than it reads are
     written ``(...)``."""
-    return _written(node, "plain", {})
+    return _written(node, _PLAIN, {})
 
 
 def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
     """For a page; ``names`` of symbols that are written otherwise."""
-    return _written(node, "latex", names or {})
+    return _written(node, _LATEX, names or {})
 
 
-def _written(node: Expr, language: str, names: Mapping[str, str]) -> str:
-    """Every part with how tightly it binds, each after what it is made of."""
-    found: dict[Expr, tuple[str, int]] = {}
+def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
+    found: dict[Expr, _Part] = {}
     for part in topological([node]):
+        args: tuple[Expr, ...] = part.args
+        level = 5
         if part.op == "const":
-            text, level = number(part.value), ATOM if part.value >= 0 else SIGN
+            text, level = number(part.value), 5 if part.value >= 0 else 3
         elif part.op == "symbol":
             # in plain text a parameter by its address
-            own = part.value.replace("__", ".") if language == "plain" else _subscript(part.value)
-            text, level = names.get(part.value, own), ATOM
+            own = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
+            text = names.get(part.value, own)
+        elif part.op == "mul" and args[0] is args[1]:
+            text, level = language.square
+        elif part.op == "mul" and "recip" in (args[0].op, args[1].op):
+            over, under = args if args[1].op == "recip" else args[::-1]
+            args = (over, under.args[0])
+            text, level = language.quotient
+        elif notation := _notation(part.op, language):
+            text, level = notation
         else:
-            notation, args = _notation(part, language)
-            level = notation.level
-            text = notation.text.format(
-                *(
-                    found[a][0] if found[a][1] >= least else _BRACKETS[language].format(found[a][0])
-                    for a, least in zip(args, notation.least, strict=True)
-                )
-            )
-        found[part] = (text, level) if len(text) <= LONGEST else ("(...)", ATOM)
-    return found[node][0]
+            name = part.value if part.op == "call" else part.op
+            text = language.call.format(name, ", ".join(found[a].text for a in args))
+            args = ()
+        text = text.format(*(found[a] for a in args)) if args else text
+        if len(text) > LONGEST:
+            text, level = "(...)", 5
+        found[part] = _Part(text, level, language.brackets)
+    return found[node].text
 
 
-def _notation(part: Expr, language: str) -> tuple[Notation, tuple[Expr, ...]]:
-    """How an operation is written, and the arguments of that."""
-    if part.op == "mul":
-        a, b = part.args
-        if a is b:
-            return _SQUARE[language], (a,)
-        for over, under in ((a, b), (b, a)):
-            if under.op == "recip":
-                return _QUOTIENT[language], (over, under.args[0])
-    if part.op != "call" and (notation := getattr(OPERATIONS[part.op], language)) is not None:
-        return notation, part.args
-    name = part.value if part.op == "call" else part.op
-    name = name if language == "plain" else f"\\mathrm{{{{{name}}}}}"
-    fields = ", ".join(f"{{{i}}}" for i in range(len(part.args)))
-    return Notation(name + _BRACKETS[language].format(fields), ATOM, (SUM,) * len(part.args)), (
-        part.args
-    )
+def _notation(op: str, language: _Language) -> Notation | None:
+    """Of an operation that is not written as a call."""
+    if op == "call":
+        return None
+    row = OPERATIONS[op]
+    return row.plain if language is _PLAIN else row.latex or row.plain
 
 
 _GREEK = {"alpha", "beta", "gamma", "kappa", "tau", "phi", "sigma", "lambda", "eta"}

@@ -21,7 +21,6 @@ from nnode.model.text import plain
 Dimension = tuple[Fraction, Fraction, Fraction]
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
 _BASE = ("[length]", "[time]", "[mass]")
-_NAMES = ("m", "s", "kg")
 
 # Pint computes the text of a quantity: a tower of powers such as 9**9**9 would never end. Only
 # names of units may be raised, once each, to one digit: the package's laws need m⁴ at most.
@@ -114,9 +113,9 @@ def _powers(found: Mapping[str, Any]) -> Dimension:
 
 def shown(found: Dimension) -> str:
     """A dimension as a unit, such as m/s²."""
-    order = sorted(zip(_NAMES, found, strict=True), key=lambda one: one[0] != "kg")
-    over = [_raised(name, power) for name, power in order if power > 0]
-    under = [_raised(name, -power) for name, power in order if power < 0]
+    powers = {"kg": found[2], "m": found[0], "s": found[1]}
+    over = [_raised(name, power) for name, power in powers.items() if power > 0]
+    under = [_raised(name, -power) for name, power in powers.items() if power < 0]
     top = " ".join(over) or "1"
     if not under:
         return top

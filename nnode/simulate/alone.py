@@ -20,13 +20,13 @@ import torch
 from torch import Tensor
 
 from nnode.model.crowd_formula import CrowdRates, people_of, settings_of, walls_of
-from nnode.model.formula import added_to, crowd_of, rule_of
+from nnode.model.formula import added_to, crowd_of
 from nnode.model.laws import InteractionForce, Law
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State, Term
 from nnode.model.terms import CrowdDynamics, own_values, values_of
-from nnode.simulate.kernels.crowds.alone import FIELDS, WalkSource, compiled
+from nnode.simulate.kernels.alone import FIELDS, WalkSource, compiled
 from nnode.simulate.linear import DenseSolver
 from nnode.simulate.numpy import simulated
 
@@ -78,7 +78,7 @@ class Surroundings:
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, ...]:
-        """Arguments of the compiled law, see :mod:`nnode.simulate.kernels.crowds.alone`."""
+        """Arguments of the compiled law, see :mod:`nnode.simulate.kernels.alone`."""
         scene, which, who = self.scene, self.window.numpy(), self.person.numpy()
         others = self.others.transpose(0, 2, 1, 3)
         meets = scene.agent.numpy()[which].astype(float)
@@ -230,12 +230,13 @@ class PersonAlone:
         others = around.x[at].flatten(0, 1), around.v[at].flatten(0, 1)
         scene = around.repeated(len(x))
         x, v, rate = x.flatten(0, 1), v.flatten(0, 1), rate.flatten(0, 1)
-        return State(t, x, v, scene, system, rate=rate, seen=others)
+        terms = cast(list[Term], list(system.terms))
+        return State(t, x, v, scene, terms, rate=rate, seen=others)
 
 
 def _is_formula(term: Term) -> bool:
     """Whether a term is an effect with a rule."""
-    return rule_of(term) is not None and not isinstance(term, Law)
+    return term.rule_for(2) is not None and not isinstance(term, Law)
 
 
 class RunAlone:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Mapping
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.model.formula import rule_of
 from nnode.model.steps import METHODS
-from nnode.model.system import System
+from nnode.model.system import System, with_parameters
 from nnode.model.term import Term
 from nnode.simulate.base import (
     Trajectory,
@@ -23,9 +21,7 @@ from nnode.simulate.base import (
     simulated_batch,
     substeps,
 )
-from nnode.simulate.kernels import lanes
-from nnode.simulate.kernels.crowds import cells
-from nnode.simulate.kernels.crowds import runs as crowds
+from nnode.simulate.kernels import crowds, lanes
 from nnode.simulate.ode import TorchdiffeqSolver
 
 log = logging.getLogger(__name__)
@@ -59,7 +55,7 @@ class FusedSolver:
         cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
             left out, in units of A. The acceleration of one person is then off by less than
             ``cutoff_error`` A / m through people, and as much through walls; see
-            :func:`nnode.simulate.kernels.crowds.cells.cutoff_distance`. 0 lets everybody meet
+            :func:`nnode.simulate.kernels.crowds.cutoff_distance`. 0 lets everybody meet
             everybody.
         method: of lanes, one of :data:`nnode.model.steps.METHODS`; None takes the law's own,
             ``rk4`` for the smooth laws of the field, else ``ballistic`` for accelerations and
@@ -88,7 +84,7 @@ class FusedSolver:
                 f"solver.method={method} is unknown to solver=fused, expected one of "
                 f"{', '.join(METHODS)}, or null for the law's own"
             )
-        cells.check_cutoff(cutoff, cutoff_error)
+        crowds.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads
         self.cutoff, self.cutoff_error = cutoff, cutoff_error
         self.method, self.uncompiled = method, ""
@@ -106,12 +102,22 @@ class FusedSolver:
 
     def unchecked(self, system: System, batch: Batch) -> Trajectory:
         """The same, with states that are not finite among them."""
-        n = self._substeps(system, batch)
-        lane = lanes.supports(system, batch)
-        if lane is None:
-            return self._other(system, batch, n)
-        near, origin = simulated_batch(system, batch)
-        y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
+        n, near, origin = self._posed(system, batch)
+        lane, law = lanes.supports(system, batch), crowds.supports(system, batch)
+        if lane is not None:
+            y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
+        elif law is not None:
+            y = crowds.simulate(system, law, near, n, self.threads, self.cutoff, self.cutoff_error)
+        else:
+            # the relaxation alone is a baseline, and cheap
+            if not self.uncompiled and not crowds.without_partners(system):
+                self.uncompiled = _reason(system)
+                log.warning(
+                    "solver=fused works in PyTorch and not in compiled code: %s; the gradient is "
+                    "the same, but costs up to hundreds of times as much, see docs/performance.md",
+                    self.uncompiled,
+                )
+            return TorchdiffeqSolver(self.method, "discrete", self.dt).solve(system, batch)
         return observed(system, y, batch, origin)
 
     def ensemble(
@@ -133,56 +139,42 @@ class FusedSolver:
             ConfigError: as in a single run, an unknown name, or shapes that do not fit.
             DataError: as in a single run.
         """
-        n = self._substeps(system, batch)
         stacked = _stack(system, parameters)
         lane = lanes.supports(system, batch)
-        if lane is not None:
-            near, origin = simulated_batch(system, batch)
+        if lane is None:
+            runs = [
+                with_parameters(
+                    system,
+                    {name: value[r] for name, value in stacked.items()},
+                    lambda own: self.unchecked(own, batch),
+                )
+                for r in range(len(next(iter(stacked.values()))))
+            ]
+        else:
+            n, near, origin = self._posed(system, batch)
             y = lanes.simulate(system, lane, near, n, self.threads, stacked, self.method)
-            runs = [observed(system, y[:, r], batch, origin).x for r in range(y.shape[1])]
-            return Trajectory(torch.stack(runs, 1), None)
-        found = []
-        for r in range(len(next(iter(stacked.values())))):
-            own = {name: value[r] for name, value in stacked.items()}
-            found.append(self._other(_replaced(system, own), batch, n))
-        x = torch.stack([run.x for run in found], 1)
-        speeds = [run.v for run in found if run.v is not None]
-        return Trajectory(x, torch.stack(speeds, 1) if speeds else None)
+            runs = [observed(system, own, batch, origin) for own in y.unbind(1)]
+        v = [run.v for run in runs if run.v is not None]
+        return Trajectory(torch.stack([run.x for run in runs], 1), torch.stack(v, 1) if v else None)
 
-    def _substeps(self, system: System, batch: Batch) -> int:
+    def _posed(self, system: System, batch: Batch) -> tuple[int, Batch, Tensor | None]:
+        """Steps in a sampling interval, the batch as it is simulated, and the origins of its
+        places."""
         if batch.x.shape[-1] != system.dim:
             system.scene(batch)  # says so
-        law = crowds.supports(system, batch)
-        if self.cutoff is not None and law is None and not crowds.without_partners(system):
+        paired = crowds.supports(system, batch) or crowds.without_partners(system)
+        if self.cutoff is not None and not paired:
             raise ConfigError(
                 f"solver.cutoff={self.cutoff:g} m works for crowds whose terms are formulas, as "
                 "model=sf or model=nn, only; set it to null"
             )
-        return substeps(batch.dt, self.dt, system)
-
-    def _other(self, system: System, batch: Batch, n: int) -> Trajectory:
-        law = crowds.supports(system, batch)
-        if law is not None:
-            near, origin = simulated_batch(system, batch)
-            x, v = crowds.simulate(
-                system, law, near, n, self.threads, self.cutoff, self.cutoff_error
-            )
-            return observed(system, x if v is None else torch.cat([x, v], -1), batch, origin)
-        # the relaxation alone is a baseline, and cheap
-        if not self.uncompiled and not crowds.without_partners(system):
-            self.uncompiled = _reason(system)
-            log.warning(
-                "solver=fused works in PyTorch and not in compiled code: %s; the gradient is the "
-                "same, but costs up to hundreds of times as much, see docs/performance.md",
-                self.uncompiled,
-            )
-        return TorchdiffeqSolver(self.method, "discrete", self.dt).solve(system, batch)
+        return substeps(batch.dt, self.dt, system), *simulated_batch(system, batch)
 
 
 def _reason(system: System) -> str:
     """Why compiled code is not used, in words: terms that it does not cover, by their names."""
     terms = cast(list[Term], list(system.terms))
-    names = ", ".join(t.name for t in terms if rule_of(t) is None or (t.memory and t.rule is None))
+    names = ", ".join(t.name for t in terms if t.rule_for(system.order) is None)
     if names:
         return f"it does not cover {names}"
     alone = "models that begin with a law of the gap, without people who meet themselves and others"
@@ -210,14 +202,3 @@ def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor
         name: parameters[name] if name in parameters else value.expand(number, *value.shape)
         for name, value in own.items()
     }
-
-
-def _replaced(system: System, parameters: Mapping[str, Tensor]) -> System:
-    """A copy of the system that computes with other tensors in place of its parameters."""
-    other = copy.deepcopy(system)
-    for name, value in parameters.items():
-        owner, _, leaf = name.rpartition(".")
-        module: nn.Module = other.get_submodule(owner)
-        delattr(module, leaf)
-        setattr(module, leaf, value)
-    return other

@@ -10,6 +10,7 @@ import torch
 
 from nnode.calibrate.cost import Convention, sequence_costs
 from nnode.calibrate.ensemble import EnsembleCost
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.build import build_model
 from nnode.model.system import System
@@ -51,13 +52,13 @@ def one_by_one(system: System, batch: Batch) -> tuple[torch.Tensor, torch.Tensor
 def test_as_single_runs(options: dict, batch: Batch) -> None:  # type: ignore[type-arg]
     cost = EnsembleCost(build_model(options), batch, FusedSolver(DT))
     draw = torch.Generator().manual_seed(1)
-    rows = torch.stack([cost.row(build_model(options, seed)) for seed in range(3)])
+    rows = torch.stack([ParameterVector(build_model(options, seed)).row for seed in range(3)])
     rows = rows * (1 + 0.05 * torch.rand(rows.shape, generator=draw, dtype=torch.float64))
     value, gradient = cost(rows)
     each = cost.costs(rows)
     for r in range(3):
-        system = cost.fill_(build_model(options), rows[r])
-        torch.testing.assert_close(cost.row(system), rows[r])
+        system = ParameterVector(build_model(options)).fill_(rows[r])
+        torch.testing.assert_close(ParameterVector(system).row, rows[r])
         costs, slope = one_by_one(system, batch)
         torch.testing.assert_close(each[r], costs, rtol=1e-10, atol=0)
         torch.testing.assert_close(value[r], costs.mean(), rtol=1e-10, atol=0)
@@ -66,7 +67,7 @@ def test_as_single_runs(options: dict, batch: Batch) -> None:  # type: ignore[ty
 
 def test_weights_choose_sequences(batch: Batch) -> None:
     cost = EnsembleCost(build_model(LIN), batch, FusedSolver(DT))
-    rows = cost.row(build_model(LIN)).expand(2, -1)
+    rows = ParameterVector(build_model(LIN)).row.expand(2, -1)
     value, gradient = cost(rows, torch.tensor([[1.0, 0.0], [0.25, 0.75]], dtype=torch.float64))
     each = cost.costs(rows)[0]
     assert value[0] == pytest.approx(float(each[0]))
@@ -75,7 +76,7 @@ def test_weights_choose_sequences(batch: Batch) -> None:
 
 
 def test_conventions_differ_by_the_sampling_interval(batch: Batch) -> None:
-    row = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).row(build_model(LIN))[None]
+    row = ParameterVector(build_model(LIN)).row[None]
     found = [
         EnsembleCost(build_model(LIN), batch, FusedSolver(DT), convention).costs(row)
         for convention in (Convention.integral, Convention.sum)
@@ -86,7 +87,7 @@ def test_conventions_differ_by_the_sampling_interval(batch: Batch) -> None:
 def test_the_admissible_set_comes_from_the_model(batch: Batch) -> None:
     law = EnsembleCost(build_model(LIN), batch, FusedSolver(DT))
     limits = dict(
-        zip(law.names, zip(law.low.tolist(), law.high.tolist(), strict=True), strict=True)
+        zip(law.vector.names, zip(law.low.tolist(), law.high.tolist(), strict=True), strict=True)
     )
     assert limits["terms.0.L"] == (2.0, math.inf)
     assert limits["terms.0.v0"] == (-math.inf, math.inf)
@@ -97,9 +98,9 @@ def test_the_admissible_set_comes_from_the_model(batch: Batch) -> None:
 
 def test_a_run_that_blows_up_costs_infinity_and_spares_the_others(batch: Batch) -> None:
     cost = EnsembleCost(build_model(LIN), batch, FusedSolver(DT))
-    good = cost.row(build_model(LIN))
+    good = ParameterVector(build_model(LIN)).row
     bad = good.clone()
-    bad[cost.names.index("terms.0.v0")] = 1e300
+    bad[cost.vector.names.index("terms.0.v0")] = 1e300
     each = cost.costs(torch.stack([good, bad]))
     assert torch.isfinite(each[0]).all()
     assert torch.isinf(each[1]).all()
@@ -119,7 +120,7 @@ def test_a_sequence_without_weight_cannot_spoil_a_gradient(
     monkeypatch.setattr(
         EnsembleCost, "_without_the_rest", lambda *args: called.append(1) or honest(*args)
     )
-    row = spoiled.row(system)[None]
+    row = ParameterVector(system).row[None]
     value, gradient = spoiled(row, torch.tensor([[1.0, 0.0]], dtype=torch.float64))
     assert called
     alone, slope = EnsembleCost(system, single.select([0]), FusedSolver(DT))(row)
@@ -128,7 +129,7 @@ def test_a_sequence_without_weight_cannot_spoil_a_gradient(
 
 
 def test_selected_sequences_cost_the_same(batch: Batch) -> None:
-    row = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).row(build_model(LIN))[None]
+    row = ParameterVector(build_model(LIN)).row[None]
     each = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).costs(row)
     for i in (0, 1):
         part = batch.select([i])

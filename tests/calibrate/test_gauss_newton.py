@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs
-from nnode.calibrate.gauss_newton.intervals import intervals
-from nnode.calibrate.gauss_newton.method import TangentCost, alone, pooled, sandwich
-from nnode.calibrate.optimizers.damped import GaussNewton
+from nnode.calibrate.intervals import intervals
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
+from nnode.calibrate.problem import ResidualProblem, alone, pooled
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, System, build_model, make_law
+from nnode.model import System, Traffic, build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
+from nnode.model.term import State, Term
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
 from tests.simulate.fused.compare import RungeKutta
 
@@ -55,7 +56,7 @@ def pairs() -> Batch:
 @pytest.mark.parametrize("kind", list(Convention))
 def test_costs_and_slopes_are_those_of_autograd(kind: Convention, pairs: Batch) -> None:
     system = model(T=1.1)
-    cost = TangentCost(system, pairs, FusedSolver(), kind)
+    cost = ResidualProblem(system, pairs, FusedSolver(), kind)
     curved = cost(cost.start)
     wanted = sequence_costs(RungeKutta()(system, pairs), pairs, kind)
     np.testing.assert_allclose(curved.cost, wanted.detach().numpy(), rtol=1e-11)
@@ -70,7 +71,7 @@ def test_costs_of_platoons_are_those_that_come_with_slopes(kind: Convention) -> 
     lead = 12 * time + np.sin(time)
     x = np.stack([lead - 45, lead - 20, lead], 1)[..., None]
     batch = collate([Sequence(name="a", recording="r", time=time, x=x)])
-    cost = TangentCost(model(), batch, FusedSolver(), kind)
+    cost = ResidualProblem(model(), batch, FusedSolver(), kind)
     wanted = sequence_costs(RungeKutta()(model(), batch), batch, kind)
     np.testing.assert_allclose(cost(cost.start).cost, wanted.detach().numpy(), rtol=1e-11)
     np.testing.assert_allclose(cost.costs(cost.start), wanted.detach().numpy(), rtol=1e-11)
@@ -92,7 +93,7 @@ def test_costs_are_what_their_names_say(pairs: Batch) -> None:
 
 
 def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) -> None:
-    cost = TangentCost(model(v0=30, T=1.0, s0=2, a=1.5, b=1.5), pairs, FusedSolver(),
+    cost = ResidualProblem(model(v0=30, T=1.0, s0=2, a=1.5, b=1.5), pairs, FusedSolver(),
                        Convention.gap)  # fmt: skip
     fit = pooled(cost)
     assert np.abs(cost(fit.row).gradient.mean(0) * (1 + np.abs(fit.row))).max() < 1e-6
@@ -111,29 +112,16 @@ def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) ->
 
 
 def test_shrinkage_pulls_towards_the_pool(pairs: Batch) -> None:
-    cost = TangentCost(model(**TRUE), pairs, FusedSolver(), Convention.gap)
-    centre = np.array([TRUE[name.split("__")[1]] for name in cost.names])
+    cost = ResidualProblem(model(**TRUE), pairs, FusedSolver(), Convention.gap)
+    centre = np.array([TRUE[name.split(".")[1]] for name in cost.names])
     free = alone(cost, centre)
-    tied = alone(cost, centre, pool=(centre, np.full(5, 1e6)))
+    tied = alone(cost, centre, penalty=(centre, np.full(5, 1e6)))
     assert np.abs(tied.row - centre).max() < 1e-3
     assert np.abs(free.row - centre).max() > np.abs(tied.row - centre).max()
 
 
-def test_the_sandwich_is_that_of_linear_regression() -> None:
-    """With clusters of one sequence it is White's, which can be written down."""
-    from nnode.calibrate.gauss_newton.method import Curved
-
-    rng = np.random.default_rng(5)
-    x, e = rng.standard_normal((40, 2)), rng.standard_normal(40)
-    curved = Curved(e**2, -2 * e[:, None] * x, 2 * x[:, :, None] * x[:, None, :])
-    found = sandwich(curved, np.full(40, 1 / 40), np.arange(40), np.ones(2, dtype=bool))
-    bread = np.linalg.inv(x.T @ x)
-    wanted = bread @ (x.T * e**2 @ x) @ bread * 40 / 39
-    np.testing.assert_allclose(found, wanted, rtol=1e-10)
-
-
 def test_parameters_at_a_bound_are_flagged(pairs: Batch) -> None:
-    cost = TangentCost(model(**{**TRUE, "b": 0.05}), pairs, FusedSolver(), Convention.gap)
+    cost = ResidualProblem(model(**{**TRUE, "b": 0.05}), pairs, FusedSolver(), Convention.gap)
     own = intervals(cost, cost.start, np.arange(6))["parameters"]["idm.b"]
     assert own["at_bound"] == "low"
     assert own["low"] is None
@@ -157,12 +145,22 @@ def test_the_optimiser_goes_on_as_if_it_had_not_stopped(pairs: Batch) -> None:
         assert torch.equal(a, b)
 
 
+class Coded(Term):
+    """A term that is code without a formula."""
+
+    name = "coded"
+
+    def forward(self, state: State) -> torch.Tensor:
+        return torch.zeros_like(state.x)
+
+
 def test_what_has_no_tangents_is_refused(pairs: Batch) -> None:
+    lin = {"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0, "L": 5.0, "L_min": 2.0}
+    coded = Traffic([*build_model(lin).terms, Coded()], leader="measured")
     with pytest.raises(ConfigError, match="gauss_newton needs a model of a lane"):
-        TangentCost(Crowd([make_law("relaxation")]), pairs, FusedSolver())
+        GaussNewton(coded).attach(FusedSolver(), pairs, Convention.sum)
     with pytest.raises(ConfigError, match="needs solver=fused"):
         GaussNewton(model()).attach(TorchdiffeqSolver(), pairs, Convention.gap)
-    lin = {"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0, "L": 5.0, "L_min": 2.0}
     run = FusedSolver(0.1)(build_model(lin), pairs)
     with pytest.raises(ConfigError, match="second order"):
         sequence_costs(run, pairs, Convention.speed)

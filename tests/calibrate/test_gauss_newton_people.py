@@ -14,14 +14,14 @@ import nnode
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import sensitivity
-from nnode.calibrate.gauss_newton.crowd import CrowdCost
-from nnode.calibrate.gauss_newton.method import Curved, sandwich
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.model.build import build_model
 from nnode.simulate import FusedSolver
-from nnode.simulate.rates import Rates
+from nnode.simulate.ode import Rates
 
 TRUTH = (0.5, 40.0, 12.0)
 
@@ -55,7 +55,7 @@ def people() -> list[Sequence]:
 
 def test_derivatives_are_those_of_forward_mode(people: list[Sequence]) -> None:
     batch, model = collate(people), social(1.0, 20.0, 5.0)
-    found = CrowdCost(model, batch, FusedSolver(), Convention.sum)
+    found = ResidualProblem(model, batch, FusedSolver(), Convention.sum)
     curved = found(found.start)
     rates, first = Rates(model, batch, 1), model.initial(batch)
 
@@ -80,7 +80,7 @@ def test_derivatives_are_those_of_forward_mode(people: list[Sequence]) -> None:
 @pytest.mark.parametrize("at", [0.0, 1e-9])
 def test_derivatives_at_a_bound_stay_inside(people: list[Sequence], at: float) -> None:
     batch = collate(people)
-    cost = CrowdCost(social(at, 20.0, 5.0), batch, FusedSolver())
+    cost = ResidualProblem(social(at, 20.0, 5.0), batch, FusedSolver())
     slope = cost(np.array([at, 20.0, 5.0])).gradient.sum(0)[0]
     costs = [cost.costs(np.array([a, 20.0, 5.0])).sum() for a in (at, at + 1e-5)]
     assert slope == pytest.approx((costs[1] - costs[0]) / 1e-5, rel=1e-2)
@@ -149,20 +149,10 @@ def test_people_who_do_not_meet_identify_no_force() -> None:
     assert "not identified" in fitted.result_.summary()
 
 
-def test_a_flat_combination_has_no_narrow_interval() -> None:
-    # the cost depends on p0 + p1 and on p2
-    rows = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    hessian = np.stack([rows.T @ rows] * 5)
-    rng = np.random.default_rng(0)
-    gradient = rng.normal(size=(5, 2)) @ rows
-    curved = Curved(np.ones(5), gradient, hessian)
-    found = sandwich(curved, np.full(5, 0.2), np.arange(5), np.ones(3, dtype=bool))
-    assert np.isinf(np.diag(found)).tolist() == [True, True, False]
-
-
 def test_networks_and_costs_of_vehicles_are_refused(people: list[Sequence]) -> None:
     batch = collate(people)
     with pytest.raises(ConfigError, match="formulas without networks"):
-        CrowdCost(build_model(model_options("nn")), batch, FusedSolver())
+        GaussNewton(build_model(model_options("nn"))).attach(FusedSolver(), batch, Convention.sum)
+    problem = ResidualProblem(social(*TRUTH), batch, FusedSolver(), Convention.gap)
     with pytest.raises(ConfigError, match="vehicles that follow"):
-        CrowdCost(social(*TRUTH), batch, FusedSolver(), Convention.gap)
+        problem.costs(problem.start)

@@ -11,9 +11,9 @@ import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton.method import TangentCost
-from nnode.calibrate.gauss_newton.pooling import Own, own_parameters
 from nnode.calibrate.options import Pooling
+from nnode.calibrate.pooling import Own, own_parameters
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.simulate import FusedSolver
@@ -29,7 +29,7 @@ def own(kind: Pooling, sequences: list[Sequence]) -> Own:
     with torch.no_grad():
         for name, value in HELLY.items():
             getattr(system.terms[0], name).fill_(value)
-    cost = partial(TangentCost, solver=FusedSolver(), convention=Convention.spacing)
+    cost = partial(ResidualProblem, solver=FusedSolver(), convention=Convention.spacing)
     return own_parameters(kind, system, sequences, cost, seed=0)
 
 

@@ -10,8 +10,8 @@ import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton.method import TangentCost, pooled
-from nnode.calibrate.gauss_newton.start_speeds import StartSpeedCost
+from nnode.calibrate.options import StartSpeeds
+from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import start_smoothed
 from nnode.errors import ConfigError
@@ -30,6 +30,10 @@ def known(name: str = "helly") -> System:
     return system
 
 
+def fitted_starts(system: System, batch: Batch, convention: Convention) -> ResidualProblem:
+    return ResidualProblem(system, batch, FusedSolver(), convention, StartSpeeds.fitted)
+
+
 def wrong_starts(sequences: list[Sequence]) -> Batch:
     """True paths, whose first speeds are off by 1 m/s to and fro."""
     batch = collate(sequences)
@@ -41,14 +45,14 @@ def wrong_starts(sequences: list[Sequence]) -> Batch:
 def test_wrong_first_speeds_are_found_beside_the_parameters() -> None:
     sequences = driven()
     batch = wrong_starts(sequences)
-    given = TangentCost(known(), batch, FusedSolver(), Convention.spacing)
-    fitted = StartSpeedCost(known(), batch, FusedSolver(), Convention.spacing)
+    given = ResidualProblem(known(), batch, FusedSolver(), Convention.spacing)
+    fitted = fitted_starts(known(), batch, Convention.spacing)
     row = np.array(list(HELLY.values()))
     assert pooled(given, row * 1.2).cost > 0.1
     found = pooled(fitted, row * 1.2)
     assert found.cost < 1e-3
     np.testing.assert_allclose(found.row, row, rtol=1e-3)
-    starts = fitted.starts(found.row)
+    starts = fitted.start_speeds(found.row)
     for s in sequences:
         np.testing.assert_allclose(starts[s.name], s.velocity()[0, :, 0], atol=1e-3)
     assert float(batch.v[0, 0, 0]) == pytest.approx(10.0)  # what was given is not changed
@@ -57,8 +61,10 @@ def test_wrong_first_speeds_are_found_beside_the_parameters() -> None:
 @pytest.mark.parametrize("name", ["helly", "helly + memory"])
 @pytest.mark.parametrize("kind", [Convention.integral, Convention.spacing, Convention.log_gap])
 def test_the_gradient_is_that_of_the_least_cost(name: str, kind: Convention) -> None:
-    cost = StartSpeedCost(known(name), wrong_starts(driven()), FusedSolver(), kind)
-    row = cost.row(cost.system) * 1.1
+    cost = ResidualProblem(
+        known(name), wrong_starts(driven()), FusedSolver(), kind, StartSpeeds.fitted
+    )
+    row = cost.start * 1.1
     curved = cost(row)
     for i, value in enumerate(row):
         h = 1e-5 * value
@@ -78,10 +84,10 @@ def test_every_follower_of_a_platoon_has_its_own() -> None:
     batch = collate([one])
     batch.x = run.x
     batch.v[0, 0, :2, 0] += torch.tensor([0.7, -0.4])
-    cost = StartSpeedCost(known(), batch, FusedSolver(), Convention.gap)
-    row = cost.row(cost.system)
-    assert TangentCost(known(), batch, FusedSolver(), Convention.gap).costs(row)[0] > 1e-2
-    np.testing.assert_allclose(cost.starts(row)["a"], [13.0, 13.0, 13.0], atol=1e-4)
+    cost = fitted_starts(known(), batch, Convention.gap)
+    row = cost.start
+    assert ResidualProblem(known(), batch, FusedSolver(), Convention.gap).costs(row)[0] > 1e-2
+    np.testing.assert_allclose(cost.start_speeds(row)["a"], [13.0, 13.0, 13.0], atol=1e-4)
     assert cost.costs(row)[0] < 1e-8
 
 
@@ -129,8 +135,8 @@ def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
     sequences = driven()
     row = np.array(list(HELLY.values()))
     batch = collate(sequences)
-    given = TangentCost(known(), batch, FusedSolver(), Convention.integral)
-    fitted = StartSpeedCost(known(), batch, FusedSolver(), Convention.integral)
+    given = ResidualProblem(known(), batch, FusedSolver(), Convention.integral)
+    fitted = fitted_starts(known(), batch, Convention.integral)
     fitted(row * 3.0)
     fitted(row * 0.2)
     assert (fitted.costs(row) <= given.costs(row) + 1e-9).all()

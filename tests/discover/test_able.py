@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.able import check_effect, check_model
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
 from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import evaluated
 from nnode.discover.statistics.random_effects import individuals
 from nnode.discover.statistics.score import traces
@@ -24,16 +24,19 @@ from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import build_model
 from nnode.model.crowd import norm, velocity
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
-from nnode.model.effects.crowd_individual import GaitSway
-from nnode.model.effects.crowd_pairs import heading
-from nnode.model.effects.following import Inertia
-from nnode.model.effects.traffic import DriverHeterogeneity, SpeedZone, for_followers, gaps
+from nnode.model.effects.crowd import GaitSway, heading
+from nnode.model.effects.lane import DriverHeterogeneity, Inertia, SpeedZone, gaps
 from nnode.model.extend import extended
+from nnode.model.lane_dynamics import Rule
 from nnode.model.term import Interval, State, Term
 from tests.discover import walkers
 from tests.discover.platoons import LENGTH, V0, platoons
 
 ANY = Strength(0.0, 0.1, Interval(0.0, 5.0), "1")
+
+
+def followers(state: State, change: Tensor) -> Tensor:
+    return torch.where(state.scene.follower, change, 0.0)[..., None]
 
 
 class Haste(IndividualEffect):
@@ -46,7 +49,7 @@ class Haste(IndividualEffect):
     strengths: ClassVar = {"sigma": ANY}
 
     def forward(self, state: State) -> Tensor:
-        return for_followers(state, self.known(state.scene, state.x)[0])
+        return followers(state, self.known(state.scene, state.x)[0])
 
 
 class Stride(IndividualEffect):
@@ -93,17 +96,6 @@ class Faint(Limit):
         return 0.01 * super().forward(state)
 
 
-class Tired(Effect):
-    """What a person remembers."""
-
-    name = "tired"
-    domain = "crowd"
-    formula = "-c m"
-    source = "this test"
-    strengths: ClassVar = {"c": ANY}
-    memory = 1
-
-
 class Optimal(Term):
     """A law of the user's own, which is no law of the gap alone."""
 
@@ -119,7 +111,7 @@ class Optimal(Term):
         self.declare("d", 25.0, unit="m", bounds=Interval(5.0, 80.0))
 
     def forward(self, state: State) -> Tensor:
-        return for_followers(state, self.v0 * torch.tanh(gaps(state.x) / self.d))
+        return followers(state, self.v0 * torch.tanh(gaps(state.x) / self.d))
 
 
 def lane() -> System:
@@ -135,14 +127,14 @@ def crowd(*more: Term) -> Crowd:
 @pytest.fixture(scope="module")
 def platoon_engine() -> TrafficEngine:
     engine = TrafficEngine(platoons(number=4, driver=0.2))
-    engine.settle(lane(), row_of(lane()))
+    engine.settle(lane(), ParameterVector(lane()).row)
     return engine
 
 
 @pytest.fixture(scope="module")
 def crowd_engine() -> CrowdEngine:
     engine = CrowdEngine(walkers.crowd(sequences=3))
-    engine.settle(crowd(), row_of(crowd()))
+    engine.settle(crowd(), ParameterVector(crowd()).row)
     return engine
 
 
@@ -166,7 +158,7 @@ def test_a_lane_asks_an_individual_effect_what_it_does(
         return found
 
     system = model(np.array(start)) if own else lane()
-    row = row_of(lane())
+    row = ParameterVector(lane()).row
     found = engine.individual(system, row, kind, {})
     before = engine.residuals(model(np.array(start)), row[None])[0]
     for place in range(4):  # the leader's place is the last
@@ -178,7 +170,7 @@ def test_a_lane_asks_an_individual_effect_what_it_does(
 
 
 def test_two_individual_effects_have_different_columns(platoon_engine: TrafficEngine) -> None:
-    row = row_of(lane())
+    row = ParameterVector(lane()).row
     ours, theirs = (
         platoon_engine.individual(lane(), row, kind, {}) for kind in (Haste, DriverHeterogeneity)
     )
@@ -186,11 +178,11 @@ def test_two_individual_effects_have_different_columns(platoon_engine: TrafficEn
 
 
 def test_a_crowd_asks_an_individual_effect_for_its_amounts(crowd_engine: CrowdEngine) -> None:
-    engine, row = crowd_engine, row_of(crowd())
+    engine, row = crowd_engine, ParameterVector(crowd()).row
     sine, cosine = engine.individual(crowd(), row, Stride, {})
     people = dict.fromkeys(engine.names, [0.9] * 6)
     system = crowd(Stride(people=people, a=0.05))
-    change = engine.residuals(system, row_of(system)[None])[0]
+    change = engine.residuals(system, ParameterVector(system).row[None])[0]
     change = change - engine.residuals(crowd(), row[None])[0]
     expected = 0.05 * (math.cos(0.9) * sine + math.sin(0.9) * cosine)
     assert apart(change, expected) < 0.1
@@ -198,11 +190,11 @@ def test_a_crowd_asks_an_individual_effect_for_its_amounts(crowd_engine: CrowdEn
 
 
 def test_a_crowd_looks_for_an_effect_without_strengths(crowd_engine: CrowdEngine) -> None:
-    engine, row = crowd_engine, row_of(crowd())
+    engine, row = crowd_engine, ParameterVector(crowd()).row
     assert Limit.probes(engine.batch, crowd()) == [Probe({}, {})]
     (trace,) = traces(engine, evaluated(engine, crowd()), Limit)
     system = crowd(Faint())
-    change = engine.residuals(system, row_of(system)[None])[0]
+    change = engine.residuals(system, ParameterVector(system).row[None])[0]
     change = change - engine.residuals(crowd(), row[None])[0]
     assert trace.columns.shape == (len(change), 1)
     assert apart(torch.from_numpy(trace.columns[:, 0]), change / 0.01) < 0.02
@@ -226,14 +218,18 @@ def test_a_law_of_another_kind_is_diagnosed_in_a_lane() -> None:
 def test_an_effect_on_a_law_that_is_missing_says_so(platoon_engine: TrafficEngine) -> None:
     system = Traffic([Optimal(), Inertia()], leader="measured")
     with pytest.raises(ConfigError, match=r"needs a model with one; derive .*FollowTheLeader"):
-        platoon_engine.residuals(system, row_of(system)[None])
+        platoon_engine.residuals(system, ParameterVector(system).row[None])
 
 
-class Moody(Haste):
-    """As Haste, with a memory."""
+class Moody(IndividualEffect):
+    """Every driver reacts late, and by a number of his own."""
 
     name = "moody"
-    memory = 1
+    domain = "traffic"
+    source = "this test"
+    rules: ClassVar = {1: Rule(rate="m", states={"m": ("m/s", "eta*(W - m)/unit", "W")},
+                               inputs={"eta": "1"}, constants={"unit": (1.0, "s")})}  # fmt: skip
+    strengths: ClassVar = {"sigma": ANY}
 
 
 class Fickle(Haste):
@@ -249,11 +245,10 @@ class Fickle(Haste):
 @pytest.mark.parametrize(
     ("effect", "words"),
     [
-        (Tired, "crowds cannot look for tired: it has a memory"),
         (Moody, "lanes cannot look for moody: it has a memory"),
         (Fickle, "lanes cannot look for fickle: it has 2 amounts for every driver"),
     ],
-    ids=["memory in a crowd", "memory and numbers", "two numbers"],
+    ids=["memory and numbers", "two numbers"],
 )
 def test_what_no_engine_can_look_for_is_refused_before_any_work(
     effect: type[Effect], words: str, monkeypatch: pytest.MonkeyPatch
@@ -272,10 +267,6 @@ def test_every_effect_of_the_catalogue_can_be_looked_for() -> None:
 
 
 def test_models_that_no_engine_can_simulate_are_refused() -> None:
-    with pytest.raises(ConfigError, match="model's term tired: it has a memory"):
-        check_model(crowd(Tired()))
-    with pytest.raises(ConfigError, match="model's term tired: it has a memory"):
-        CrowdEngine(walkers.crowd(sequences=1)).settle(crowd(Tired()), row_of(crowd(Tired())))
     with pytest.raises(ConfigError, match="effect speed_zone twice"):
         check_model(Traffic([Optimal(), SpeedZone(), SpeedZone(a=200.0, b=300.0)]))
     with pytest.raises(ConfigError, match="no parameter that is calibrated"):

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.model.effects.traffic import EDGE
+from nnode.model.effects.lane import EDGE
 from tests.app.following import LONG, STEP, TRUE, idm
 from tests.app.test_replay import held, tracks
 from tests.exchange.by_sumo import call

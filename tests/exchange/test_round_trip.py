@@ -16,8 +16,7 @@ import torch
 
 from benchmarks.recovery import by_jupedsim, by_sumo
 from benchmarks.recovery.cases import SLOWLY
-from nnode.calibrate.ensemble import EnsembleCost
-from nnode.calibrate.least_squares import least_squares, trajectory_residuals
+from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.options import SumoOptions
 from nnode.data.readers.sumo import read_sumo
 from nnode.data.sequence import Sequence, collate
@@ -131,11 +130,7 @@ def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
     for name in ("k", "kappa"):
         getattr(force, name).requires_grad_(False)
     parts = [part for whole in first for part in by_jupedsim.pieces(whole, seconds=1.0)]
-    cost = EnsembleCost(system, collate(parts), FusedSolver(dt=dt))
-    end = least_squares(
-        trajectory_residuals(cost), cost.row(system).numpy(), cost.low.numpy(), cost.high.numpy(),
-        steps=30,
-    )  # fmt: skip
+    end = pooled(ResidualProblem(system, collate(parts), FusedSolver(dt=dt)), steps=30)
     assert end.row == pytest.approx(16.0, rel=2e-3)
     with torch.no_grad():
         force.A.fill_(end.row[0])

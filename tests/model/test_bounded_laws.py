@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from nnode.errors import ConfigError, NNodeError
-from nnode.model.lane_dynamics import REMEMBERED
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.model.names import ENTRIES
 from nnode.model.network import NEURONS, FeedForward
 from nnode.model.parse import OPERATIONS
+from nnode.model.terms import REMEMBERED
 from nnode.model.text import LONGEST, latex, plain
 
 LAW: dict[str, Any] = {

@@ -59,7 +59,7 @@ def test_effects_on_accelerations_stand_in_the_page() -> None:
     table = METHOD.split("what becomes of an acceleration W")[1].split("\n\n")[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
-    assert names == {e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None}
+    assert names == {e.name for e in CATALOGUE.of("traffic", every=True) if 2 in e.rules}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

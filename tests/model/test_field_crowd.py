@@ -14,7 +14,8 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.model import Crowd, build_model
-from nnode.model.laws import PEDESTRIAN_LAWS, without_walls
+from nnode.model.laws import PEDESTRIAN_LAWS
+from nnode.study.walking.laws import without_walls
 
 R = 0.25
 

@@ -10,7 +10,7 @@ import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, InteractionForce, Scene, State, Term, make_law
-from nnode.model.effects.crowd_force import FieldOfView
+from nnode.model.effects.crowd import FieldOfView
 
 A, K, KAPPA, R, B, MASS = 3.0, 40.0, 9.0, 0.25, 0.1, 70.0
 #: the walkable corridor lies between y = 0 and y = 2
@@ -146,7 +146,7 @@ def test_effects_change_no_force_of_a_person_on_himself() -> None:
         draw = torch.Generator().manual_seed(2)
         force = make_law("network_force", hidden=4, self_interaction=oneself, generator=draw)
         terms = [force, FieldOfView(lambda_=0.2)]
-        state = State(torch.zeros(()), batch.x[0], batch.v[0], scene, system=Crowd(terms))
+        state = State(torch.zeros(()), batch.x[0], batch.v[0], scene, terms)
         changes.append(terms[1](state))
     torch.testing.assert_close(changes[0], changes[1], rtol=0, atol=0)
 

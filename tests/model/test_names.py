@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from nnode.errors import ConfigError
-from nnode.model.crowd_dynamics import CrowdRule
 from nnode.model.effects import CATALOGUE
 from nnode.model.expression import symbol
-from nnode.model.lane_dynamics import Rule
 from nnode.model.laws import (
     CAR_FOLLOWING_LAWS,
     NEURONS,
@@ -22,9 +20,10 @@ from nnode.model.laws import (
 )
 from nnode.model.names import check_names, check_symbols
 from nnode.model.term import Term
-from nnode.simulate.kernels.crowds.alone import WalkSource
-from nnode.simulate.kernels.crowds.source import CrowdSource
-from nnode.simulate.kernels.lanes.source import LaneSource
+from nnode.model.terms import Rule
+from nnode.simulate.kernels.alone import WalkSource
+from nnode.simulate.kernels.crowds import CrowdSource
+from nnode.simulate.kernels.lanes import LaneSource
 
 CODE = '__import__("os").abort()'
 #: An annotation, an index, a default, a second line, letters and digits that are not ASCII.
@@ -93,7 +92,7 @@ def test_nor_has_a_rule(kind: str) -> None:
         Rule(**{kind: {f"a: {CODE}": ("m", "v", "x")}})  # type: ignore[arg-type]
     if kind not in ("states", "delayed"):
         with pytest.raises(ConfigError, match=rf"^{kind}: "):
-            CrowdRule(("0", "0"), **{kind: {f"a: {CODE}": "m"}})  # type: ignore[arg-type]
+            Rule(("0", "0"), **{kind: {f"a: {CODE}": "m"}})  # type: ignore[arg-type]
 
 
 def test_nor_has_an_effect() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from nnode.model import System, build_model
 from nnode.model.build import add_effects
-from nnode.model.effects.traffic import SpeedZone
+from nnode.model.effects.lane import SpeedZone
 from nnode.model.laws import make_law
 from nnode.model.term import short_names
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.ensemble import EnsembleCost
-from nnode.calibrate.gauss_newton.method import TangentCost
+from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import Crowd, System, Traffic, make_law
@@ -98,9 +99,9 @@ def test_costs_of_an_ensemble_and_tangents_far_away() -> None:
     model, solver = idm(torch.float32), FusedSolver()
     near, far = (single(CASES["idm"][1](shift)) for shift in (0.0, 7e6))
     rows = [EnsembleCost(model, b, solver) for b in (near, far)]
-    row = rows[0].row(model)[None]
+    row = ParameterVector(model).row[None]
     torch.testing.assert_close(rows[0].costs(row), rows[1].costs(row), rtol=1e-4, atol=1e-6)
-    curved = [TangentCost(model, b, solver)(row[0].numpy()) for b in (near, far)]
+    curved = [ResidualProblem(model, b, solver)(row[0].numpy()) for b in (near, far)]
     np.testing.assert_allclose(curved[0].cost, curved[1].cost, rtol=1e-4)
     scale = np.abs(curved[0].gradient).max()
     np.testing.assert_allclose(curved[0].gradient, curved[1].gradient, atol=1e-3 * scale)

@@ -57,7 +57,7 @@ class Calibrator:
         leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
         pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
-            pool's, in ``result_.own``; see :mod:`nnode.calibrate.gauss_newton.pooling`.
+            pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
         start_speeds: ``auto``, ``given``, or ``fitted`` beside the parameters to each training
             sequence; see :class:`nnode.calibrate.options.StartSpeeds`.
         optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the

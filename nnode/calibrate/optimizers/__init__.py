@@ -1,25 +1,131 @@
 """Optimisers of the training loop, by name."""
 
-from nnode.calibrate.optimizers.by_name import (
-    OPTIMIZERS,
-    AdadeltaOptions,
-    AdamOptions,
-    ConsensusOptions,
-    GaussNewtonOptions,
-    LbfgsOptions,
-    OptimizerOptions,
-    build_optimizer,
-    needs_full_batch,
-)
+from __future__ import annotations
 
-__all__ = [
-    "OPTIMIZERS",
-    "AdadeltaOptions",
-    "AdamOptions",
-    "ConsensusOptions",
-    "GaussNewtonOptions",
-    "LbfgsOptions",
-    "OptimizerOptions",
-    "build_optimizer",
-    "needs_full_batch",
-]
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from omegaconf import MISSING
+from torch.optim import Optimizer
+
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
+from nnode.calibrate.optimizers.consensus import ConsensusBased
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
+from nnode.calibrate.parameters import ParameterVector
+from nnode.errors import ConfigError
+from nnode.model.system import System
+
+
+@dataclass
+class OptimizerOptions:
+    """What all optimisers share."""
+
+    name: str = MISSING  # of the optimiser
+
+
+@dataclass
+class AdadeltaOptions(OptimizerOptions):
+    """The paper's: ADADELTA with decaying Gaussian noise."""
+
+    name: str = "adadelta"
+    lr: float = 1.0  # factor on the steps
+    rho: float = 0.95  # memory of squared gradients and steps, below 1
+    eps: float = 1e-6  # added to both under the root
+    eta1: float = 1.0  # variance of the noise: eta1 / (1 + k)^eta2
+    eta2: float = 0.55  # how fast the noise decays with the step k
+
+
+@dataclass
+class AdamOptions(OptimizerOptions):
+    """Adam."""
+
+    name: str = "adam"
+    lr: float = 0.05  # step
+    beta1: float = 0.9  # memory of gradients
+    beta2: float = 0.999  # memory of squared gradients
+    eps: float = 1e-8  # added to their root
+
+
+@dataclass
+class LbfgsOptions(OptimizerOptions):
+    """L-BFGS with a strong Wolfe line search; wants all sequences in one mini-batch."""
+
+    name: str = "lbfgs"
+    lr: float = 1.0  # first length tried by the line search
+    max_iter: int = 20  # iterations per step, which is an epoch
+    history: int = 20  # steps that the curvature is taken from
+
+
+@dataclass
+class ConsensusOptions(OptimizerOptions):
+    """Consensus-based optimisation; wants all sequences in one mini-batch."""
+
+    name: str = "cbo"
+    particles: int = 30  # parameter sets at a time
+    spread: float = 0.5  # standard deviation of their start
+    alpha: float = 30.0  # weight of good ones in the consensus
+    drift: float = 1.0  # towards the consensus, per unit of time
+    sigma: float = 2.0  # noise, by the distance from the consensus
+    dt: float = 0.1  # of a step, no unit
+
+
+@dataclass
+class GaussNewtonOptions(OptimizerOptions):
+    """Damped Gauss-Newton; formulas of lanes or people, solver=fused, all sequences at once."""
+
+    name: str = "gauss_newton"
+    damping: float = 1e-3  # of the first step, relative to each parameter's curvature
+    tolerance: float = 1e-9  # ends when a step lowers the cost by less than this share
+
+
+def _trained(model: System) -> list[torch.nn.Parameter]:
+    return list(ParameterVector(model).parameters.values())
+
+
+def _lbfgs(model: System, o: dict[str, Any]) -> Optimizer:
+    for name in ("max_iter", "history"):
+        if o[name] < 1:
+            raise ValueError(f"{name}={o[name]} must be at least 1")
+    history = o.pop("history")
+    line = {"history_size": history, "line_search_fn": "strong_wolfe"}
+    return torch.optim.LBFGS(_trained(model), **o, **line)
+
+
+#: Name to how it is built, of a model, options and a seed.
+OPTIMIZERS: dict[str, Callable[[System, dict[str, Any], int], Optimizer]] = {
+    "adadelta": lambda model, o, seed: NoisyAdadelta(_trained(model), **o, seed=seed),
+    "adam": lambda model, o, _: torch.optim.Adam(
+        _trained(model), betas=(o.pop("beta1"), o.pop("beta2")), **o
+    ),
+    "lbfgs": lambda model, o, _: _lbfgs(model, o),
+    "cbo": lambda model, o, seed: ConsensusBased(
+        _trained(model), **o, project=model.project_, seed=seed
+    ),
+    "gauss_newton": lambda model, o, _: GaussNewton(model, **o),
+}
+
+
+def needs_full_batch(name: str) -> bool:
+    """Whether the optimiser compares costs of different steps, so that they must be of the
+    same sequences."""
+    return name in ("lbfgs", "cbo", "gauss_newton")
+
+
+def build_optimizer(model: System, options: OptimizerOptions, seed: int = 0) -> Optimizer:
+    """The optimiser that ``options`` describe; random ones depend on ``seed`` alone.
+
+    Raises:
+        ConfigError: unknown name, or a value outside its range.
+    """
+    values = asdict(options)
+    name = values.pop("name")
+    if name not in OPTIMIZERS:
+        raise ConfigError(
+            f"optimizer.name={name} is unknown, expected one of {', '.join(OPTIMIZERS)}"
+        )
+    try:
+        return OPTIMIZERS[name](model, values, seed)
+    except ValueError as error:
+        raise ConfigError(f"optimizer {name}: {error}") from error

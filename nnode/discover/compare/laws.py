@@ -17,13 +17,14 @@ from typing import cast
 
 import numpy as np
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import divide
 from nnode.discover.judge.confirm import engine_of
 from nnode.discover.name.search import Search, Step, begun
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.residuals.engine import Engine, row_of, square_of
+from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.rules import rules
@@ -68,7 +69,7 @@ def compare_laws(
     engine = engine_of(domain, chosen, label)
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
-        engine.settle(found[first].system, row_of(found[first].system))
+        engine.settle(found[first].system, ParameterVector(found[first].system).row)
         found = {n: refine(engine, copy.deepcopy(fit.system)) for n, fit in found.items()}
         costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
         best = min(costs, key=lambda name: _level(costs[name]))
@@ -134,7 +135,7 @@ def imitated(
         The effects, and the one-sided p-value of that comparison.
     """
     common = engine_of(str(nearer.system.domain), engine.sequences, label)
-    common.settle(nearer.system, row_of(nearer.system))
+    common.settle(nearer.system, ParameterVector(nearer.system).row)
     costs = [
         heldout(refine(common, copy.deepcopy(system)), common.cluster)
         for system in (found.fit.system, nearer.system)

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.able import check_model
 from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows
 from nnode.discover.found import Simulation
-from nnode.discover.residuals.engine import Squares, fill, of_residuals, runs_of, trained
+from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
@@ -172,7 +173,7 @@ class CrowdEngine:
 
     def _simulated(self, system: System, row: Tensor) -> tuple[System, Tensor, RunAlone]:
         states = self._states(system, row[None])[:, 0]
-        filled = fill(copy.deepcopy(system), row)
+        filled = ParameterVector(copy.deepcopy(system)).fill_(row)
         assert self._around is not None
         run = RunAlone(self._around, filled, states[..., :2], states[..., 2:])
         return system, row.clone(), run
@@ -263,7 +264,7 @@ class CrowdEngine:
         first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
         found = []
         for part in rows.split(max(1, CHUNK // (w * n * n))):
-            rhs = PersonAlone(self._around, system, runs_of(system, part))
+            rhs = PersonAlone(self._around, system, ParameterVector(system).runs(part))
             found.append(rhs.simulated(first, windows.steps))
         return torch.cat(found, 1)
 
@@ -282,7 +283,7 @@ class CrowdEngine:
 def _differences(system: System) -> list[float]:
     """``(K,)``: differences of the parameters by which derivatives are taken."""
     found = []
-    for name, p in trained(system).items():
+    for name, p in ParameterVector(system).parameters.items():
         _, place, key = name.split(".", 2)
         term = system.terms[int(place)]
         strength = term.strengths.get(key) if isinstance(term, Effect) else None

@@ -20,11 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.paths import Path, Smoother
-from nnode.discover.residuals.engine import Rate, fill, row_of, runge_kutta
-from nnode.discover.residuals.fit import ROUGH, Fit, limits, refine
+from nnode.discover.residuals.engine import Rate, runge_kutta
+from nnode.discover.residuals.fit import ROUGH, Fit, refine
 from nnode.errors import SimulationError
 from nnode.model.system import Crowd, System
 
@@ -61,16 +62,16 @@ def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
         ]
         try:
             engine, system = CrowdEngine(measured), copy.deepcopy(fit.system)
-            engine.settle(system, row_of(system))
+            engine.settle(system, ParameterVector(system).row)
             found.append(refine(engine, system, tolerance=ROUGH / 10).row)
         except SimulationError:
             log.debug("a simulated crowd could not be calibrated")
     if len(found) < 2:
         return fit
     off = np.where(fit.free, np.mean(found, 0) - fit.row, 0.0)
-    row = np.clip(fit.row - off, *limits(fit.system))
+    row = np.clip(fit.row - off, *ParameterVector(fit.system).bounds)
     error = np.where(fit.free, np.std(found, 0, ddof=1) / np.sqrt(len(found)), 0.0)
-    system = fill(copy.deepcopy(fit.system), torch.from_numpy(row))
+    system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
     return replace(fit, system=system, row=row, simulated=error)
 
 

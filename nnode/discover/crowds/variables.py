@@ -11,7 +11,7 @@ from torch import Tensor
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
 from nnode.model.crowd import dot, norm, velocity
 from nnode.model.crowd_formula import walls_of
-from nnode.model.effects.crowd_pairs import heading
+from nnode.model.effects.crowd import heading
 from nnode.model.term import State
 
 Of = Callable[[State], Tensor]

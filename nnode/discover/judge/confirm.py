@@ -18,12 +18,13 @@ from functools import cached_property
 
 import numpy as np
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.residuals.engine import Engine, row_of
+from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
@@ -58,7 +59,7 @@ class Comparing:
     ) -> None:
         self._domain, self._sequences, self._base, self._label = domain, sequences, base, label
         self._whole = engine_of(domain, sequences, label, whole=True)
-        self._whole.settle(base, row_of(base))
+        self._whole.settle(base, ParameterVector(base).row)
 
     @property
     def floor(self) -> float:
@@ -70,19 +71,19 @@ class Comparing:
         if self._domain == "crowd":
             return self._whole
         found = engine_of(self._domain, self._sequences, self._label)
-        found.settle(self._base, row_of(self._base))
+        found.settle(self._base, ParameterVector(self._base).row)
         return found
 
     def squares(self, system: System) -> np.ndarray:
         """``(S,)`` mean square errors of positions, m²; NaN where nothing is compared."""
-        found = self._whole.squares(system, row_of(system)).means()
+        found = self._whole.squares(system, ParameterVector(system).row).means()
         # the last ones may be too short to be compared
         missing = len(self._sequences) - len(found)
         return np.pad(found, (0, missing), constant_values=np.nan)
 
     def simulated(self, system: System) -> list[Simulation | None]:
         """The simulations whose errors are :meth:`squares`."""
-        return self._whole.simulated(system, row_of(system))
+        return self._whole.simulated(system, ParameterVector(system).row)
 
     def scores(self, system: System) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the
@@ -90,7 +91,7 @@ class Comparing:
         return sums(self._residuals(system) ** 2, self._windows.cluster)
 
     def _residuals(self, system: System) -> np.ndarray:
-        found = self._windows.residuals(system, row_of(system)[None])[0].numpy()
+        found = self._windows.residuals(system, ParameterVector(system).row[None])[0].numpy()
         return np.nan_to_num(found, nan=np.inf)
 
     def leaning(self, before: System, after: System) -> np.ndarray:

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.found import Simulation
 from nnode.discover.judge.confirm import Comparing, engine_of
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import DataError, SimulationError
 from nnode.model.system import Crowd, System
@@ -71,7 +71,7 @@ def later(
         return None
     try:
         engine = engine_of(domain, early)
-        engine.settle(system, row_of(system))
+        engine.settle(system, ParameterVector(system).row)
         people, shared = (
             _carried(early, last, numbers(engine, system, one, common=common))
             for common in (False, True)

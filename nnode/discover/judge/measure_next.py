@@ -21,11 +21,11 @@ import numpy as np
 import torch
 from scipy import stats
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.lanes.paths import velocity
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import sums
 from nnode.discover.result import Profile
 from nnode.errors import SimulationError
@@ -99,7 +99,7 @@ def distance(
     paths = _driven(engine, truth, template, time, place[:, None] + start)
     kept = time >= LASTS - dt / 2
     found = _engine(engine, template, time[kept], paths[kept])
-    row = row_of(wrong)
+    row = ParameterVector(wrong).row
     residual = found.residuals(wrong, row[None])[0].numpy()
     columns = found.tangents(wrong, row).numpy().T
     if not (np.isfinite(residual).all() and np.isfinite(columns).all()):
@@ -114,7 +114,7 @@ def _driven(
     """``(K, N)`` paths behind the leader of ``x``, from its starts, m."""
     found = _engine(engine, template, time, x)
     with torch.no_grad():
-        states = found.simulate(system, row_of(system)[None])[0]
+        states = found.simulate(system, ParameterVector(system).row[None])[0]
     return np.where(
         np.arange(x.shape[1]) < x.shape[1] - 1, states[:, 0, : x.shape[1], 0].numpy(), x
     )
@@ -138,7 +138,8 @@ def _leaders(engine: TrafficEngine) -> np.ndarray:
 
 def _excess(engine: TrafficEngine, one: System, other: System) -> float:
     """How far clusters' residuals lean beyond what independent ones do."""
-    first, second = (engine.residuals(s, row_of(s)[None])[0].numpy() for s in (one, other))
+    rows = {s: ParameterVector(s).row[None] for s in (one, other)}
+    first, second = (engine.residuals(s, row)[0].numpy() for s, row in rows.items())
     lean = sums(first * (first - second), engine.cluster)
     expected = float(((first - second) ** 2).sum())
     if len(lean) < 2 or not expected > 0:

@@ -50,7 +50,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
     coefficients = _coefficients(engine, fit, step)
     return NamedEffect(
         name=effect.name,
-        formula=effect.formula,
+        formula=effect.formula_for(fit.system.order),
         source=effect.source,
         coefficients=coefficients,
         where=_where(effect, coefficients, step.chosen.score.options),
@@ -77,8 +77,8 @@ def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profil
     return advised(engine, fit.system, rival.fit.system, level)
 
 
-def named_agents(one: Individuals, confirmed: float) -> NamedEffect:
-    """An individual effect that was confirmed."""
+def named_agents(one: Individuals, confirmed: float, order: int) -> NamedEffect:
+    """An individual effect that was confirmed, in a law of an order."""
     effect = one.effect
     found = {}
     for name, strength in effect.strengths.items():
@@ -89,7 +89,7 @@ def named_agents(one: Individuals, confirmed: float) -> NamedEffect:
         found[name] = Coefficient(value, low, high, setting.unit)
     return NamedEffect(
         name=effect.name,
-        formula=effect.formula,
+        formula=effect.formula_for(order),
         source=effect.source,
         coefficients=found,
         where="everybody, everywhere",
@@ -145,7 +145,7 @@ def _absence(score: Score, way: Way) -> Absence:
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
     known = error > 0 and math.isfinite(error) and bool(score.evidence)
     expected, detectable, least = strength.expected, math.inf, 0.0
-    if known and effect.memory:
+    if known and effect.remembers():
         # what was tried at a size says nothing of smaller ones
         found = [
             max(one.size, way.detectable(score, one, max(one.size, expected)))

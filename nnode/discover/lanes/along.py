@@ -68,4 +68,4 @@ class Along:
         x = torch.where(lead, every.measured[0], x)
         speed = torch.where(lead, every.measured_rate[0], rate)
         time = self.time[:, None].expand(-1, len(self.scene.agent)).flatten()
-        return State(time, x, speed if system.order > 1 else None, every, system, speed)
+        return State(time, x, speed if system.order > 1 else None, every, rate=speed)

@@ -61,7 +61,7 @@ class Bent(Motion):
         if time.ndim:
             time = time.expand(-1, sequences).flatten()
         speed = rate if self.top else None
-        state = State(time, x, speed, self.every, self.system, rate)
+        state = State(time, x, speed, self.every, rate=rate)
         found = self.curve.variable.value(state)
         return found, found.detach().numpy().T.reshape(x.shape[1], -1, sequences)
 

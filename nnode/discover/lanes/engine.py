@@ -7,13 +7,14 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 from torch import Tensor, nn
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.along import Along
@@ -23,15 +24,7 @@ from nnode.discover.lanes.response import Response
 from nnode.discover.lanes.runs import side_by_side
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
-from nnode.discover.residuals.engine import (
-    Squares,
-    fill,
-    names_of,
-    of_residuals,
-    row_of,
-    runge_kutta,
-)
-from nnode.discover.residuals.fit import limits
+from nnode.discover.residuals.engine import Squares, of_residuals, runge_kutta
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.expression import symbols
@@ -171,7 +164,7 @@ class TrafficEngine:
         """``(S, n)`` derivatives of the residuals with respect to a probe's strengths, by linear
         response; the change by the effect as a whole where it has no strength."""
         response = self.linear(system, row)
-        if effect.memory:
+        if effect.remembers():
             return self._whole(response, effect, probe)
         base = response.along.rates(response.system)
         sources = []
@@ -192,7 +185,7 @@ class TrafficEngine:
             values[name], amount = effect.strengths[name].neutral + step, step
         changed, _ = extended(response.system, effect(**values))
         with torch.no_grad():
-            x = self.simulate(changed, row_of(changed)[None])[0][..., 0]
+            x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
         moved = torch.where(self.follows, x - response.states[..., 0], 0.0)
         seen = self.batch.x[..., 0][self.batch.valid]
         if not float(moved.abs().max()) <= float(seen.max() - seen.min()):
@@ -230,7 +223,7 @@ class TrafficEngine:
         if last is None or last[0] is not system or not torch.equal(last[1], row):
             self.deviations(system, row[None])
         assert self._last is not None
-        fixed = fill(copy.deepcopy(system), row)
+        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         stride, steps = self._steps(system, row[None])
         scene = replace(fixed.scene(self.smoothed), step=self.batch.dt * stride / steps)
         with torch.no_grad():
@@ -251,9 +244,10 @@ class TrafficEngine:
         """A copy whose law is fitted to the smoothed rates: simulations started from there do
         not end in a far minimum. The regression itself is biased by noise, as a start it may."""
         found, batch = copy.deepcopy(system), self.smoothed
-        if any(getattr(term, "memory", 0) for term in found.terms):
+        if found.memory:
             return found  # speeds alone do not tell of states that nobody measures
-        low, high = limits(found)
+        vector = ParameterVector(found)
+        low, high = vector.bounds
         states, wanted = batch.x, batch.v[..., 0]
         if system.order > 1 and batch.n_samples > 1:
             states = torch.cat([batch.x, batch.v], -1)
@@ -261,13 +255,13 @@ class TrafficEngine:
         along = Along(found.scene(batch), states)
 
         def missed(row: np.ndarray) -> np.ndarray:
-            rate = along.rates(fill(found, torch.from_numpy(row)))[..., system.order - 1]
+            rate = along.rates(vector.fill_(row))[..., system.order - 1]
             away: np.ndarray = (wanted - rate)[self.follows].numpy()
             return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
 
-        start = np.clip(row_of(found).numpy(), low, high)
+        start = np.clip(vector.row.numpy(), low, high)
         best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
-        return fill(found, torch.from_numpy(best.x))
+        return vector.fill_(best.x)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
@@ -337,19 +331,14 @@ def fastest(system: System, rows: Tensor) -> float:
     factors = {
         f"terms.{i}.{name}": factor
         for i, term in enumerate(system.terms)
-        for name, factor in _fast(term).items()
+        for name, factor in cast(Term, term).fast.items()
     }
     found = [
         factors[name] * float(rows[:, j].min())
-        for j, name in enumerate(names_of(system))
+        for j, name in enumerate(ParameterVector(system).names)
         if name in factors
     ]
     return min(found, default=math.inf)
-
-
-def _fast(term: nn.Module) -> dict[str, float]:
-    assert isinstance(term, Term)
-    return term.fast
 
 
 def _between(before: Any, start: Any, after: Any, end: Any, h: float, stride: int) -> list[Any]:

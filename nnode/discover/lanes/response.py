@@ -12,12 +12,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import jvp, vmap
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.discover.lanes.along import Along
 from nnode.discover.lanes.bent import Bend, Bent, motion_of
 from nnode.discover.lanes.motion import Motion, slopes
 from nnode.discover.lanes.sweep import Sweep
-from nnode.discover.residuals.engine import trained
 from nnode.model.scene import Scene
 from nnode.model.system import System
 
@@ -117,14 +117,16 @@ class Response:
 
     def parameters(self) -> Tensor:
         """``(C, K, B, N)`` m per unit of each parameter that is calibrated."""
-        own = trained(self.system)
+        own = ParameterVector(self.system).parameters
         source = self._sources_by_code() if self._motion is None else self._sources(self._motion)
         return self.moved(source, self._starts(own))
 
     def _sources(self, motion: Motion) -> Tensor:
         """``(C, K, B, N, W)`` derivatives of the rates by the parameters."""
         slopes, width = self._slopes, self.states.shape[-1]
-        entries = {entry: c for c, entry in enumerate(_entries(trained(self.system)))}
+        entries = {
+            entry: c for c, entry in enumerate(_entries(ParameterVector(self.system).parameters))
+        }
         n, times, sequences = len(motion.leads), len(self.states), len(self.batch)
         found = np.zeros((len(entries), width, n, times, sequences))
         for symbol, (name, place, _) in motion.lane.owned.items():
@@ -183,7 +185,7 @@ class Response:
 
     def _sources_by_code(self) -> Tensor:
         """As :meth:`_sources`."""
-        own = {name: p.detach() for name, p in trained(self.system).items()}
+        own = {name: p.detach() for name, p in ParameterVector(self.system).parameters.items()}
 
         def rates(parameters: dict[str, Tensor]) -> Tensor:
             return self.along.by_code(self.system, parameters)(self.states)

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.motion import Leaders, Motion
-from nnode.discover.residuals.engine import runs_of
 from nnode.model.scene import Scene
 from nnode.model.system import System, initial_with
 
@@ -35,8 +35,8 @@ class Runs(Protocol):
 
 def side_by_side(system: System, rows: Tensor, scene: Scene) -> Runs:
     """Runs of a model with parameters ``(R, K)``, see
-    :func:`~nnode.discover.residuals.engine.row_of`."""
-    motion = motion_of(system, scene, runs_of(system, rows))
+    :class:`~nnode.calibrate.parameters.ParameterVector`."""
+    motion = motion_of(system, scene, ParameterVector(system).runs(rows))
     if motion is None:
         return _ByCode(system, rows, scene)
     return _ByFormula(system, rows, motion, Leaders(scene))
@@ -45,10 +45,10 @@ def side_by_side(system: System, rows: Tensor, scene: Scene) -> Runs:
 @torch.no_grad()
 def _starts(system: System, rows: Tensor, batch: Batch) -> Tensor:
     """``(R, B, N, W)`` states at the start; what terms remember depends on the parameters."""
-    if not any(getattr(term, "memory", 0) for term in system.terms):
+    if not system.memory:
         y = system.initial(batch)
         return y.expand(len(rows), *y.shape)
-    every = runs_of(system, rows)
+    every = ParameterVector(system).runs(rows)
     return torch.stack(
         [
             initial_with(system, {name: p[r] for name, p in every.items()}, batch)
@@ -86,7 +86,7 @@ class _ByCode:
 
     def __init__(self, system: System, rows: Tensor, scene: Scene) -> None:
         self._system, self._scene = system, scene
-        self._parameters = runs_of(system, rows)
+        self._parameters = ParameterVector(system).runs(rows)
         self._rows = rows
 
     def start(self, batch: Batch) -> Tensor:

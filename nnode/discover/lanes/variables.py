@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nnode.data.sequence import PADDING_GAP, Batch
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
-from nnode.model.effects.traffic import gaps, rate_of
+from nnode.model.effects.lane import gaps
 from nnode.model.term import State
 
 #: Knots of a curve.
@@ -43,11 +43,12 @@ def _position(state: State) -> Tensor:
 
 
 def _speed(state: State) -> Tensor:
-    return rate_of(state)
+    assert state.rate is not None
+    return state.rate[..., 0]
 
 
 def _speed_difference(state: State) -> Tensor:
-    rate = rate_of(state)
+    rate = _speed(state)
     return torch.cat([rate[:, 1:] - rate[:, :-1], torch.zeros_like(rate[:, :1])], 1)
 
 

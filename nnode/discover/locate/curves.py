@@ -10,8 +10,9 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from nnode.discover.residuals.engine import Engine, fill, square_of
-from nnode.discover.residuals.fit import ROUGH, Fit, grams, limits, refine, sums
+from nnode.calibrate.parameters import ParameterVector
+from nnode.discover.residuals.engine import Engine, square_of
+from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
 from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
@@ -188,8 +189,8 @@ class _Look:
 def with_curve(fit: Fit, curve: Curves) -> System:
     """A model with a curve as one more term, its own parameters moved to make room for it."""
     found = copy.deepcopy(fit.system)
-    low, high = limits(found)
-    fill(found, torch.from_numpy(np.clip(fit.row + curve.shift, low, high)))
+    vector = ParameterVector(found)
+    vector.fill_(np.clip(fit.row + curve.shift, *vector.bounds))
     found.terms.append(Curve(curve.variable, curve.amounts))
     return found
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.locate.curves import curves
 from nnode.discover.name.candidate import Candidate, calibrated
 from nnode.discover.residuals.comparison import Comparison
-from nnode.discover.residuals.engine import Engine, row_of, square_of
+from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
@@ -84,7 +85,7 @@ def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:
     """Calibrate a model, and the engine's filter to what it leaves, in turns."""
     fit = refine(engine, system)
     for _ in range(rounds):
-        engine.settle(fit.system, row_of(fit.system))
+        engine.settle(fit.system, ParameterVector(fit.system).row)
         fit = refine(engine, fit.system)
     return fit
 

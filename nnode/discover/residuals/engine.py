@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence
 from nnode.discover.found import Simulation
 from nnode.model.effects import Effect, IndividualEffect, Probe
@@ -81,7 +81,8 @@ class Engine(Protocol):
 
         Args:
             system: the model.
-            rows: ``(R, K)`` its parameters that are calibrated, see :func:`row_of`.
+            rows: ``(R, K)`` its parameters that are calibrated, see
+                :class:`~nnode.calibrate.parameters.ParameterVector`.
         """
         ...
 
@@ -144,44 +145,9 @@ def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
     return found
 
 
-def trained(system: System) -> dict[str, nn.Parameter]:
-    """The parameters that are calibrated, by name."""
-    return {name: p for name, p in system.named_parameters() if p.requires_grad}
-
-
-def row_of(system: System) -> Tensor:
-    """``(K,)`` all parameters that are calibrated, one after the other, float64."""
-    own = [p.detach().double().flatten() for p in trained(system).values()]
-    return torch.cat(own) if own else torch.zeros(0, dtype=torch.float64)
-
-
-def names_of(system: System) -> list[str]:
-    """K names: of the parameter that each number of a row belongs to."""
-    return [name for name, p in trained(system).items() for _ in range(p.numel())]
-
-
 def square_of(engine: Engine, system: System) -> float:
     """Mean square error of positions, m², every sequence alike."""
-    return float(engine.squares(system, row_of(system)).means().mean())
-
-
-@torch.no_grad()
-def fill(system: System, row: Tensor) -> System:
-    """Write a row into the system and return it."""
-    own = trained(system)
-    parts = row.split([p.numel() for p in own.values()])
-    for parameter, part in zip(own.values(), parts, strict=True):
-        parameter.copy_(part.reshape(parameter.shape))
-    return system
-
-
-def runs_of(system: System, rows: Tensor) -> dict[str, Tensor]:
-    """``(R, ...)`` the calibrated parameters of R runs by name, from rows ``(R, K)``."""
-    own = trained(system)
-    parts = rows.split([p.numel() for p in own.values()], 1)
-    return {
-        name: part.reshape(-1, *p.shape) for (name, p), part in zip(own.items(), parts, strict=True)
-    }
+    return float(engine.squares(system, ParameterVector(system).row).means().mean())
 
 
 def runge_kutta(

@@ -10,32 +10,21 @@ import torch
 from scipy import stats
 from scipy.sparse import csr_array
 
-from nnode.calibrate.least_squares import box_step
-from nnode.discover.residuals.engine import Engine, fill, names_of, row_of
+from nnode.calibrate.intervals import LEVEL, ClusterInfluence
+from nnode.calibrate.least_squares import Quadratic, least_squares
+from nnode.calibrate.parameters import ParameterVector
+from nnode.discover.residuals.engine import Engine
 from nnode.errors import SimulationError
 from nnode.model.system import System
-from nnode.model.term import Interval
 
 if TYPE_CHECKING:
     from nnode.discover.residuals.variables import Curves
 
 #: Dampings that are tried side by side, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
-
-#: Singular values of scaled tangents below this share of the largest one say nothing.
-COLLINEAR = 1e-4
-#: A share of the knowledge of a parameter that is none, but for rounding.
-UNKNOWN = 1e-9
-#: From this share on, a direction that is not known makes a parameter unknown.
-APIECE = 1e-6
-
 #: Tolerance of calibrations whose result is compared with others that are far off, and with
 #: others that are near.
 ROUGH, FINE = 1e-3, 1e-6
-
-
-#: Shares ``(M,)`` of knowledge, directions ``(F, M)``, and where they are pulled.
-_Others = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass
@@ -72,65 +61,35 @@ class Fit:
         """``(n, F)`` derivatives with respect to the parameters that are free."""
         return self.jacobian[:, self.free]
 
-    def left_out(self, cluster: np.ndarray, least: float) -> np.ndarray:
-        """``(G, F)`` how the free parameters move when each cluster is left out of the fit.
-
-        One Gauss and Newton step from the full fit. A direction of the parameters stays where the
-        other clusters know less than the share ``least`` of what all know of it.
-        """
-        return _moved(self._others(cluster), least)
-
-    def _others(self, cluster: np.ndarray) -> list[_Others]:
-        """What is known without each cluster: directions ``(F, M)`` of the free parameters, the
-        share ``(M,)`` of the knowledge of each that the others have, and where they pull it."""
+    def influence(self, cluster: np.ndarray) -> ClusterInfluence:
+        """Of the clusters on the free parameters."""
         columns = self.tangents
-        scale = np.sqrt((columns**2).sum(0))
-        # an orthonormal basis: what the others know of a direction is then a share of the whole
-        basis, size, turn = np.linalg.svd(columns / scale, full_matrices=False)
-        kept = size > COLLINEAR * size[0]
-        basis, back = basis[:, kept], (turn[kept] / size[kept, None] / scale).T
-        found = []
-        for rows in members(cluster):
-            part, residual = basis[rows], self.residual[rows]
-            known, vector = np.linalg.eigh(np.eye(part.shape[1]) - part.T @ part)
-            # at the minimum the gradient of the others is minus that of this cluster
-            found.append((known, back @ vector, vector.T @ (part.T @ residual)))
-        return found
+        scores = sums(columns * self.residual[:, None], cluster)
+        return ClusterInfluence(grams(columns, cluster), scores)
 
     def errors(self, cluster: np.ndarray) -> np.ndarray:
         """``(K,)`` standard errors that allow for any dependence within a cluster.
 
-        By the jackknife over clusters. NaN for parameters at a bound, for those of which one
-        cluster alone tells, and where there are fewer than three clusters.
-
-        Source: MacKinnon, Nielsen & Webb 2023, Journal of Econometrics 232 (CV3).
+        NaN for parameters at a bound, for those of which one cluster alone tells, and where there
+        are fewer than three clusters.
         """
-        found = np.full(len(self.row), np.nan)
-        number = len(np.unique(cluster))
-        if number >= 3 and self.free.any():
-            parts = self._others(cluster)
-            own = np.sqrt((number - 1) / number * (_moved(parts, UNKNOWN) ** 2).sum(0))
-            for known, ways, _ in parts:
-                share = ways**2 / np.maximum((ways**2).sum(1, keepdims=True), 1e-300)
-                own[share[:, known <= UNKNOWN].sum(1) > APIECE] = np.nan
-            found[self.free] = own
-        return found if self.simulated is None else np.hypot(found, self.simulated)
+        return self._uncertain(cluster)[0]
 
-    def intervals(self, cluster: np.ndarray, level: float = 0.95) -> np.ndarray:
-        """``(K, 2)`` confidence intervals: :meth:`errors` with Student's quantile."""
-        number = len(np.unique(cluster))
-        half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(cluster)
+    def intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
+        """``(K, 2)`` confidence intervals: :meth:`errors` with Student's quantiles."""
+        error, degrees = self._uncertain(cluster)
+        half = stats.t.ppf(0.5 + level / 2, degrees) * error
         return np.stack([self.row - half, self.row + half], 1)
 
-
-def _moved(parts: list[_Others], least: float) -> np.ndarray:
-    """``(G, F)``: see :meth:`Fit.left_out`."""
-    return np.stack(
-        [
-            ways @ np.where(known > least, pull / np.maximum(known, least), 0.0)
-            for known, ways, pull in parts
-        ]
-    )
+    def _uncertain(self, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Standard errors and their degrees of freedom ``(K,)``."""
+        error, degrees = np.full((2, len(self.row)), np.nan)
+        if len(np.unique(cluster)) >= 3 and self.free.any():
+            found = self.influence(cluster)
+            variance = np.diag(found.covariance())
+            error[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
+            degrees[self.free] = found.degrees()
+        return error if self.simulated is None else np.hypot(error, self.simulated), degrees
 
 
 def sums(values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
@@ -154,29 +113,55 @@ def grams(z: np.ndarray, label: np.ndarray) -> np.ndarray:
     return np.stack([z[rows].T @ z[rows] for rows in members(label)])
 
 
-def limits(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """``(K,)`` lower and upper bounds of the parameters that are calibrated."""
-    known, free = system.bounds(), Interval()
-    both = [known.get(name, free) for name in names_of(system)]
-    return np.array([one.low for one in both]), np.array([one.high for one in both])
+class _EngineProblem:
+    """The residuals of an engine as a problem of least squares.
 
-
-class _Linear:
-    """Residuals and their derivatives; derivatives come with the first of several trials."""
+    The derivatives at the parameters that were tried first come from the same simulation.
+    """
 
     def __init__(self, engine: Engine, system: System) -> None:
         self.engine, self.system = engine, system
-        self.low, self.high = limits(system)
+        self.vector = ParameterVector(system)
+        self.low, self.high = self.vector.bounds
+        self._rows, self._found = np.empty((0, len(self.low))), np.empty((0, 0))
+        self._fit: Fit | None = None
 
-    def at(self, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals ``(T, n)`` of all trials ``(T, K)``, derivatives ``(n, K)`` at the first.
+    def costs(self, trials: np.ndarray) -> np.ndarray:
+        """``(T, 1)`` of trials ``(T, 1, K)``; inf where one blows up."""
+        self._rows = trials[:, 0]
+        self._found = self.engine.residuals(self.system, torch.from_numpy(self._rows)).numpy()
+        finite = np.isfinite(self._found).all(1)
+        return np.where(finite, (self._found**2).sum(1), np.inf)[:, None]
 
-        The derivatives are zero where the first trial blows up.
+    def __call__(self, rows: np.ndarray) -> Quadratic:
+        """Costs and their derivatives ``(1, ...)``.
+
+        Raises:
+            SimulationError: it cannot be simulated.
         """
-        found = self.engine.residuals(self.system, torch.from_numpy(trials)).numpy()
-        if not np.isfinite(found[0]).all():
-            return found, np.zeros((found.shape[1], trials.shape[1]))
-        return found, self.engine.tangents(self.system, torch.from_numpy(trials[0])).numpy().T
+        fit = self.fit(rows[0])
+        if not np.isfinite(fit.residual).all():
+            raise SimulationError(
+                "the model blows up on these data at its present parameters; start from others"
+            )
+        gradient, curvature = fit.jacobian.T @ fit.residual, fit.jacobian.T @ fit.jacobian
+        return Quadratic(np.array([fit.cost]), 2 * gradient[None], 2 * curvature[None])
+
+    def fit(self, row: np.ndarray) -> Fit:
+        """The model with parameters ``(K,)``; derivatives are zero where it blows up."""
+        if self._fit is not None and np.array_equal(self._fit.row, row):
+            return self._fit
+        if not (self._rows == row).all(1).any():
+            self.costs(row[None, None])
+        residual = self._found[np.flatnonzero((self._rows == row).all(1))[0]]
+        jacobian = np.zeros((len(residual), len(row)))
+        if np.isfinite(residual).all():
+            jacobian = self.engine.tangents(self.system, torch.from_numpy(row)).numpy().T
+        gradient = jacobian.T @ residual
+        pressed = ((row <= self.low) & (gradient > 0)) | ((row >= self.high) & (gradient < 0))
+        free = ~pressed & ((jacobian**2).sum(0) > 0)
+        self._fit = Fit(self.system, self.vector.names, row, residual, jacobian, free)
+        return self._fit
 
 
 def refine(
@@ -187,68 +172,32 @@ def refine(
     tolerance: float = 1e-4,
     hopeless: float = 0.0,
 ) -> Fit:
-    """Levenberg and Marquardt's method from the system's own parameters, within their bounds.
+    """Calibrate from the system's own parameters, within their bounds.
 
     Args:
         steps: simulations of all trials and derivatives at most.
         tolerance: ends when a step lowers the cost by less than this share.
-        hopeless: ends as soon as the cost has nearly stopped to fall (by less than a tenth of
-            what is missing) and is still above this one.
+        hopeless: see :func:`~nnode.calibrate.least_squares.least_squares`.
 
     Raises:
         SimulationError: the start cannot be simulated.
     """
-    linear = _Linear(engine, system)
-    low, high = linear.low, linear.high
-    row = np.clip(row_of(system).numpy(), low, high)
-    found, jacobian = linear.at(row[None])
-    residual = found[0]
-    if not np.isfinite(residual).all():
-        raise SimulationError(
-            "the model blows up on these data at its present parameters; start from others"
-        )
-    first = 0
-    for _ in range(steps):
-        cost = float(residual @ residual)
-        gradient, curvature = jacobian.T @ residual, jacobian.T @ jacobian
-        dampings = DAMPINGS[first:] + DAMPINGS[:first]
-        trials = np.stack([box_step(row, gradient, curvature, d, low, high) for d in dampings])
-        found, ahead = linear.at(trials)
-        costs = np.where(np.isfinite(found).all(1), (found**2).sum(1), np.inf)
-        best = int(np.argmin(costs))
-        if not costs[best] < cost:
-            break
-        gained = cost - costs[best]
-        row, residual = trials[best], found[best]
-        # the trial that was best is tried first, with its derivatives, from now on
-        first = (first + best) % len(DAMPINGS)
-        small = gained < tolerance * cost
-        if small or (costs[best] > hopeless > 0 and gained < 0.1 * (costs[best] - hopeless)):
-            if best == 0:
-                jacobian = ahead
-            break
-        jacobian = ahead if best == 0 else linear.at(row[None])[1]
-    fill(system, torch.from_numpy(row))
-    return _fit(system, row, residual, jacobian, low, high)
+    problem = _EngineProblem(engine, system)
+    found = least_squares(
+        problem,
+        problem.costs,
+        problem.vector.row.numpy()[None],
+        problem.low,
+        problem.high,
+        steps=steps,
+        tolerance=tolerance,
+        dampings=DAMPINGS,
+        hopeless=hopeless,
+    )
+    problem.vector.fill_(found.row[0])
+    return problem.fit(found.row[0])
 
 
 def evaluated(engine: Engine, system: System) -> Fit:
     """A model as it is, in the residuals of an engine."""
-    linear = _Linear(engine, system)
-    row = row_of(system).numpy()
-    found, jacobian = linear.at(row[None])
-    return _fit(system, row, found[0], jacobian, linear.low, linear.high)
-
-
-def _fit(
-    system: System,
-    row: np.ndarray,
-    residual: np.ndarray,
-    jacobian: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> Fit:
-    gradient = jacobian.T @ residual
-    at_low, at_high = (row <= low) & (gradient > 0), (row >= high) & (gradient < 0)
-    moves = (jacobian**2).sum(0) > 0
-    return Fit(system, names_of(system), row, residual, jacobian, ~(at_low | at_high) & moves)
+    return _EngineProblem(engine, system).fit(ParameterVector(system).row.numpy())

@@ -20,7 +20,7 @@ ALONE = 0.02
 def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
     """``(G,)`` cost of each cluster under the parameters that the other clusters give.
 
-    See :meth:`Fit.left_out`.
+    See :meth:`~nnode.calibrate.intervals.ClusterInfluence.moved`.
     """
     return sums(_left_out(fit, cluster) ** 2, cluster)
 
@@ -69,7 +69,7 @@ def _left_out(fit: Fit, cluster: np.ndarray) -> np.ndarray:
     columns, residual = fit.tangents, fit.residual
     if not columns.shape[1]:
         return residual
-    moved = fit.left_out(cluster, ALONE)
+    moved = fit.influence(cluster).moved(1.0, ALONE)
     found: np.ndarray = residual + (columns * moved[cluster]).sum(1)
     return found
 

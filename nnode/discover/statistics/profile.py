@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from scipy import stats
 
-from nnode.discover.residuals.engine import Engine, fill
+from nnode.calibrate.parameters import ParameterVector
+from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.model.effects import Effect
 from nnode.model.extend import place_of
@@ -116,7 +117,7 @@ def moved(engine: Engine, fit: Fit, name: str) -> Fit:
             break
         row = fit.row.copy()
         row[best.index] = best.at[int(np.argmin(best.rise))]
-        trial = refine(engine, fill(copy.deepcopy(fit.system), torch.from_numpy(row)))
+        trial = refine(engine, ParameterVector(copy.deepcopy(fit.system)).fill_(row))
         if trial.cost >= fit.cost:
             break
         fit = trial

@@ -191,7 +191,7 @@ class Screen:
                 every = (known.evidence if known else []) + score.evidence
                 if known is None or score.gain > known.gain:
                     best[name] = score
-                if trace.effect.memory or not trace.effect.strengths:
+                if trace.effect.remembers() or not trace.effect.strengths:
                     best[name].evidence = every
         if best:
             self._judge(best, largest)
@@ -260,7 +260,7 @@ class Screen:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._by_chance(trace.effect.name, chance)
         # of an effect with a memory the trace is that of a finite strength, where it has one
-        size = max(map(abs, probe.steps.values()), default=0.0) if trace.effect.memory else 0.0
+        size = max(map(abs, probe.steps.values()), default=0.0) if trace.effect.remembers() else 0.0
         evidence = [
             Evidence(probe.options, size, parts[:, i], grams[:, i, i], minimal[i])
             for i in range(z.shape[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch, Domain
 from nnode.model.formula import contribution, effect_increment
+from nnode.model.laws import Law, entries
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import Interval, State, Term
@@ -80,15 +82,19 @@ class Setting:
 
 
 class Effect(Term):
-    """A named effect: a term with strengths, settings, and the traces to look for.
+    """A named effect: a term with strengths, settings, and the probes that are looked for.
 
-    A subclass states its class attributes and ``forward``; all parameters are calibrated. The
-    constructor takes each parameter by keyword.
+    A subclass states its class attributes, with a rule per order or :meth:`forward`; all parameters
+    are calibrated. The constructor takes each parameter by keyword.
 
     Class attributes:
         domain: ``traffic`` or ``crowd``.
         strengths: parameter name to :class:`Strength`; may be empty, see :class:`Probe`.
         settings: parameter name to :class:`Setting`.
+        tried: one setting to the values, or one strength to the amounts, of a probe each; empty:
+            there is one probe, of all strengths at the settings' own values.
+        acts_on: what of the laws of people it changes, ``force`` or ``drive``, see
+            :class:`nnode.model.terms.Rule`; empty: it acts on every model.
         rank: place in the sum of terms; one that modifies the sum before it comes later.
         confusable_group: name of the class of effects that data often cannot tell apart from it;
             empty: none.
@@ -96,20 +102,22 @@ class Effect(Term):
         contains: names of effects that are special cases of this one.
         consecutive: the probes are neighbouring intervals of one quantity, and an effect on
             several of them is the sum of their traces. ``a`` and ``b`` are the interval's ends.
-        covariate: ``kind``, ``group`` or ``length``: what of an agent it acts by. Where that is
-            fixed within every recording, recordings are what tells of it.
+        covariate: ``kind``, ``group`` or ``length``: the property of an agent by which it acts. It
+            may be fixed within every recording; then recordings are the units of evidence.
         individual: every agent has a strength of its own, with mean zero over the agents; the
             reported strength is their standard deviation.
         searched_orders: orders of the laws in which a diagnosis looks for it.
-        built_into_laws: whether other laws of its domain have something like it in themselves, so
-            that finding it in one of them is right where another law is nearer to the truth.
+        built_into_laws: whether other laws of its domain contain something like it, so that finding
+            it in one of them is right where another law is nearer to the truth.
         sets_desired_speed: whether it gives people a preferred speed, which some of their laws
             have.
     """
 
     domain: ClassVar[Domain]
-    strengths: ClassVar[dict[str, Strength]]
+    strengths: ClassVar[dict[str, Strength]] = {}
     settings: ClassVar[dict[str, Setting]] = {}
+    tried: ClassVar[dict[str, tuple[float, ...]]] = {}
+    acts_on: ClassVar[str] = ""
     rank: ClassVar[int] = 0
     confusable_group: ClassVar[str] = ""
     distinguishing_data: ClassVar[str] = ""
@@ -121,6 +129,11 @@ class Effect(Term):
     built_into_laws: ClassVar[bool] = False
     sets_desired_speed: ClassVar[bool] = False
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "forward" in vars(cls) and "rules" not in vars(cls):
+            cls.rules = {}  # its code replaces the rules of the class that it derives from
+
     def __init__(self, **values: float) -> None:
         super().__init__()
         unknown = sorted(set(values) - set(self.strengths) - set(self.settings))
@@ -129,30 +142,56 @@ class Effect(Term):
                 f"effect {self.name} has no parameter {', '.join(unknown)}; it has "
                 f"{', '.join([*self.strengths, *self.settings])}"
             )
-        for name, strength in self.strengths.items():
-            # a time constant has no neutral value of its own: the least plausible one stands in
-            value = values.get(name, strength.at(0.0))
-            self.declare(name, value, unit=strength.unit, bounds=strength.range)
-        for name, setting in self.settings.items():
-            value = values.get(name, setting.value)
-            self.declare(name, value, unit=setting.unit, bounds=setting.range)
+        parameters: dict[str, Strength | Setting] = {**self.strengths, **self.settings}
+        for name, given in parameters.items():
+            # a time constant has no neutral value: the nearest plausible one is its default
+            usual = given.at(0.0) if isinstance(given, Strength) else given.value
+            self.declare(name, values.get(name, usual), unit=given.unit, bounds=given.range)
 
     def forward(self, state: State) -> Tensor:
-        """By its rule; an effect without one defines its own."""
-        if self.domain == "crowd":
-            return contribution(self, state)
-        return effect_increment(self, state)[..., :1]
+        """``(B, N, D + M)`` what its rule adds to the rate, and the rates of its M states.
 
-    def memory_rate(self, state: State) -> Tensor:
-        return effect_increment(self, state)[..., 1:]
+        An effect without a rule defines its own ``(B, N, D)``.
+
+        Raises:
+            ValueError: the model lacks the term that it acts on.
+        """
+        if not self.finds(state.terms):
+            names = [name for name, entry in entries().items() if entry.get(self.acts_on)]
+            raise ValueError(
+                f"effect {self.name} changes the {self.acts_on} of a law, but the model has none; "
+                f"add {' or '.join(names)} to its terms"
+            )
+        return (
+            contribution(self, state) if self.domain == "crowd" else effect_increment(self, state)
+        )
+
+    @classmethod
+    def remembers(cls) -> bool:
+        """Whether it adds states to the model's."""
+        return any(rule.memory for rule in cls.rules.values())
+
+    @classmethod
+    def finds(cls, terms: Iterable[object]) -> bool:
+        """Whether these terms have what it acts on."""
+        laws = (term for term in terms if isinstance(term, Law))
+        return not cls.acts_on or any(getattr(law.formulas, cls.acts_on) for law in laws)
+
+    @classmethod
+    def applies(cls, batch: Batch, system: System) -> bool:
+        """Whether it can act on ``system``, and ``batch`` can show it."""
+        return cls.finds(system.terms)
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        """What is looked for in the data of ``batch`` by ``system``; empty: cannot act there.
-
-        By default one probe at the settings' own values.
-        """
+        """What is looked for in the data of ``batch`` by ``system``; empty: it cannot act there."""
         steps = {name: strength.step for name, strength in cls.strengths.items()}
+        if not cls.applies(batch, system):
+            return []
+        for name, values in cls.tried.items():
+            if name in cls.settings:
+                return [Probe({name: value}, steps) for value in values]
+            return [Probe({}, {name: value}) for value in values]
         return [Probe({}, steps)]
 
     def options(self) -> dict[str, Any]:
@@ -165,23 +204,30 @@ class Effect(Term):
 class IndividualEffect(Effect):
     """An effect with a number for every agent that is estimated beside the parameters.
 
+    Class attributes:
+        in_equation: whether its strengths stand in the equation; otherwise they describe the
+            distribution of the agents' numbers alone, and are not calibrated.
+
     Args:
         people: sequence name to the numbers of its agents; without them there is no effect.
         values: the parameters.
     """
 
     individual = True
+    in_equation: ClassVar[bool] = True
 
     def __init__(self, people: dict[str, list[float]] | None = None, **values: float) -> None:
         super().__init__(**values)
         self.people = {str(k): [float(own) for own in v] for k, v in (people or {}).items()}
+        for name in () if self.in_equation else self.strengths:
+            self.idle(name)
 
     def options(self) -> dict[str, Any]:
         return {**super().options(), "people": self.people}
 
     @classmethod
     def directions(cls, options: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
-        """The amounts that are fitted to an agent, which :meth:`person` makes his number of.
+        """The amounts that are fitted to an agent; :meth:`person` makes his number of them.
 
         Args:
             options: settings.
@@ -201,6 +247,11 @@ class IndividualEffect(Effect):
     def spread(cls, sigma: float) -> float:
         """The strength, from the standard deviation of the amounts of each direction."""
         return sigma
+
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        """The rule's first input is the agents' numbers; a second one, where they are known."""
+        (rule, *_) = self.rules.values()
+        return dict(zip(rule.inputs, self.known(scene, scene.length), strict=False))
 
     def known(self, scene: Scene, like: Tensor) -> tuple[Tensor, Tensor]:
         """``(B, N)`` the agents' numbers (0 where unknown), and 1 where they are known."""

@@ -9,20 +9,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from importlib.resources import files
-from typing import Any
+from operator import itemgetter
+from typing import Any, ClassVar
 
 import torch
 import yaml
 from torch import Tensor
 
 from nnode.errors import ConfigError
+from nnode.model.arrays import Code, computed
 from nnode.model.crowd_formula import rates_of, settings_of
 from nnode.model.expression import Expr, call, const, substitute, symbol, symbols
 from nnode.model.names import check_names
 from nnode.model.network import FeedForward
 from nnode.model.parse import parse
 from nnode.model.steps import METHODS
-from nnode.model.tensors import Code, computed
 from nnode.model.term import Interval, State, Term
 from nnode.model.terms import (
     LARGEST,
@@ -93,14 +94,6 @@ PEDESTRIAN_LAWS = _described(_CROWD_KEYS, {"vx", "y"})
 NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
 
 
-def without_walls(description: Mapping[str, Any]) -> dict[str, Any]:
-    """A law of people whose walls nobody feels."""
-    unit = "0" if "x" in description["rate"] else "0 m/s²"
-    zero = dict.fromkeys(description.get("walls", {}), unit)
-    kept = {key: value for key, value in description.items() if key != "walls"}
-    return {**kept, "constants": {**description.get("constants", {}), **zero}}
-
-
 class Law(Term):
     """A term that effects change: a law of vehicles or people, described by an entry.
 
@@ -139,6 +132,9 @@ class Law(Term):
     order = 2
     step: str | None = None
     formulas: Rule
+    #: Methods that replace formulas where a subclass defines them: what they replace, their inputs.
+    methods: ClassVar[dict[str, tuple[str, str]]] = {"speed": ("rate", "gap")}
+    _calls: dict[str, Callable[..., Expr]]
 
     def __init__(
         self,
@@ -164,13 +160,7 @@ class Law(Term):
         self.network: FeedForward | None = None
         self.formulas = _rule(found)
         self.domain = "crowd" if self.formulas.of_crowd else "traffic"
-        if self.domain == "traffic":
-            self.order, self.step = 1 if "x" in found["rate"] else 2, found.get("step")
-        else:
-            self.order = self.formulas.order
-        self.memory = (  # type: ignore[misc]
-            len(self.formulas.states) + len(self.formulas.delayed) * self.formulas.remembered
-        )
+        self.order, self.step = self.formulas.order, found.get("step")
         if self.step is not None and self.step not in METHODS:
             raise ConfigError(
                 f"model.law.step={self.step} is unknown, expected {', '.join(METHODS)}"
@@ -270,23 +260,37 @@ class Law(Term):
 
     def _coded(self) -> None:
         """Say by ``rule`` what the class says: formulas, or calls of its own code."""
-        self.rule = self.formulas
-        self._methods: dict[str, Callable[..., Expr]] = {}
-        if type(self).speed is not Law.speed and self.domain == "traffic" and self.order == 1:
-            self._methods["speed"] = partial(call, "speed")
-            self.rule = replace(self.formulas, rate="speed(gap)")
-        if type(self).forward not in (Law.forward, InteractionForce.forward):
-            self.rule = None
+        rule, self._calls = self.formulas, {}
+        for method, (entry, inputs) in self.methods.items():
+            own = getattr(type(self), method) is not getattr(InteractionForce, method)
+            replaced = getattr(rule, entry)
+            if not own or not replaced or (entry == "rate" and self.order == 2):
+                continue
+            if isinstance(replaced, str):
+                self._calls[method] = partial(call, method)
+                rule = replace(rule, rate=f"{method}({inputs})")
+                continue
+            names = [f"{method}_{axis}" for axis in "xy"]
+            self._calls |= {name: partial(_output, method, k) for k, name in enumerate(names)}
+            sums: Any = {
+                part: ("N", f"{f}({inputs})") for part, f in zip(replaced, names, strict=True)
+            }
+            rule = replace(rule, **{entry: sums})
+        coded = type(self).forward not in (Law.forward, InteractionForce.forward)
+        self.rule = None if coded else rule
 
     @property
     def shape(self) -> tuple[Any, ...]:
         sizes = [getattr(self, module).sizes for module in self.networks]
         return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
 
+    def rule_for(self, order: int) -> Rule | None:
+        return self.rule
+
     @property
     def of_gap(self) -> bool:
         """Whether it is a speed that depends on the gap alone."""
-        if self.domain != "traffic" or self.order != 1 or self.memory:
+        if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
         return _names_gap_alone(self.dynamics(called=True))
 
@@ -296,8 +300,8 @@ class Law(Term):
 
     def code(self) -> dict[str, Code]:
         """What calls in its formulas stand for, by name."""
-        found: dict[str, Code] = {"speed": self.speed, "0": _first, "1": _second}
-        return {**found, **{m: partial(_joined, getattr(self, m)) for m in self.networks}}
+        networks = {module: partial(_joined, getattr(self, module)) for module in self.networks}
+        return {"speed": self.speed, **{str(k): itemgetter((..., k)) for k in (0, 1)}, **networks}
 
     def written(
         self, model: Any, owner: str, place: int, rule: Rule | None = None, called: bool = False
@@ -314,7 +318,7 @@ class Law(Term):
         """
         rule = rule or self.rule or self.formulas
         parameters, owned, units = parameters_of(self, owner, place)
-        functions = dict(self._methods)
+        functions = dict(self._calls)
         for module, names in self.networks.items():
             if called:
                 functions |= {name: partial(_output, module, k) for k, name in enumerate(names)}
@@ -426,13 +430,6 @@ def _names_gap_alone(lane: LaneDynamics) -> bool:
     return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
 
-#: Methods of a force that formulas can call, with the functions that are their outputs.
-_CODED = {
-    "pair_force": ["pair_force_x", "pair_force_y"],
-    "wall_force": ["wall_force_x", "wall_force_y"],
-}
-
-
 def velocity(state: State) -> Tensor:
     """``(B, N, 2)`` m/s.
 
@@ -442,14 +439,6 @@ def velocity(state: State) -> Tensor:
     if state.v is None:
         raise ValueError("a term of a second-order model needs velocities")
     return state.v
-
-
-def _first(out: Tensor) -> Tensor:
-    return out[..., 0]
-
-
-def _second(out: Tensor) -> Tensor:
-    return out[..., 1]
 
 
 def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
@@ -507,6 +496,10 @@ class InteractionForce(Law):
     """
 
     mass: float
+    methods: ClassVar[dict[str, tuple[str, str]]] = {
+        "pair_force": (OTHERS, "dx, dy, dvx, dvy"),
+        "wall_force": (POINTS, "dx, dy, vx, vy, normal_x, normal_y"),
+    }
 
     def __init__(
         self,
@@ -523,23 +516,9 @@ class InteractionForce(Law):
 
     def _coded(self) -> None:
         if not self.walls:
-            bare = dict.fromkeys(self.formulas.points, ("N", "0"))
-            self.formulas = replace(self.formulas, points=bare)
+            nothing = {**self.formulas.where, **dict.fromkeys(self.formulas.points, "0")}
+            self.formulas = replace(self.formulas, points={}, where=nothing)
         super()._coded()
-        if self.rule is None:
-            return
-        for over, method, inputs in (
-            (OTHERS, "pair_force", "dx, dy, dvx, dvy"),
-            (POINTS, "wall_force", "dx, dy, vx, vy, normal_x, normal_y"),
-        ):
-            own = getattr(type(self), method) is not getattr(InteractionForce, method)
-            if own and (over == OTHERS or self.walls):
-                names = zip(getattr(self.rule, over), _CODED[method], strict=True)
-                sums: Any = {name: ("N", f"{f}({inputs})") for name, f in names}
-                self.rule = replace(self.rule, **{over: sums})
-                self._methods |= {
-                    name: partial(_output, method, k) for k, name in enumerate(_CODED[method])
-                }
 
     def code(self) -> dict[str, Code]:
         def pair(dx: Tensor, dy: Tensor, dvx: Tensor, dvy: Tensor) -> Tensor:
@@ -547,24 +526,26 @@ class InteractionForce(Law):
 
         return {**super().code(), "pair_force": pair}
 
-    def _force(self, over: str, **seen: Tensor) -> Tensor:
-        """``(..., 2)`` N: the entry's summands over the others or over wall points."""
+    def _force(self, over: str, seen: Mapping[str, Tensor]) -> Tensor:
+        """``(..., 2)`` N: the entry's summands over the others or over wall points.
+
+        Args:
+            seen: vectors ``(..., 2)``; their names have {} for the axis.
+        """
         sums = self.dynamics(called=True).sums[over]
         if not sums:
             raise NotImplementedError(f"{type(self).__name__} has no force from {over}")
-        parts = {
-            key: value[..., c] for name, value in seen.items() for c, key in enumerate(_AXES[name])
-        }
+        parts = {name.format(c): seen[name][..., k] for name in seen for k, c in enumerate("xy")}
         return torch.stack(self.computed([*sums.values()], parts), -1)
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
         """Force on i from j, ``(..., 2)`` N, of x_i - x_j (m) and v_i - v_j (m/s)."""
-        return self._force(OTHERS, dx=dx, dv=dv)
+        return self._force(OTHERS, {"d{}": dx, "dv{}": dv})
 
     def wall_force(self, dx: Tensor, v: Tensor, normal: Tensor) -> Tensor:
         """Force on i from a wall point, ``(..., 2)`` N, of x_i - x_w (m), v_i (m/s) and the
         wall's unit normal."""
-        return self._force(POINTS, dx=dx, v=v, normal=normal)
+        return self._force(POINTS, {"d{}": dx, "v{}": v, "normal_{}": normal})
 
     def pairs(self, state: State) -> Tensor:
         """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third),
@@ -595,10 +576,6 @@ class InteractionForce(Law):
         return sum(self.components(state).values(), torch.zeros_like(state.x))
 
 
-#: Components of what a force sees.
-_AXES = {
-    "dx": ("dx", "dy"), "dv": ("dvx", "dvy"), "v": ("vx", "vy"), "normal": ("normal_x", "normal_y")
-}  # fmt: skip
 #: A force between people that is code.
 _FORCE: dict[str, Any] = {
     "parameters": {},
@@ -681,42 +658,36 @@ def _rule(entry: Mapping[str, Any]) -> Rule:
         ConfigError: a rate that is neither of a lane nor of a crowd, or an entry of another form.
     """
     rate = entry["rate"]
-    states = set(rate) if isinstance(rate, Mapping) else set()
-    parts: dict[str, Any] = {
-        "where": {str(k): str(v) for k, v in (entry.get("where") or {}).items()},
-        "constants": {str(k): in_si(str(v)) for k, v in (entry.get("constants") or {}).items()},
-        "settings": {k: in_si(str(v))[1] for k, v in entry.get("settings", {}).items()},
-    }
-    if states in ({"x"}, {"v"}):
-        leader = "v0" if "v0" in entry["parameters"] else "measured"
-        return Rule(
-            rate=str(next(iter(rate.values()))),
-            leader="v" if states == {"v"} else leader,
-            states=_threes("states", "[unit, rate, start]", entry),
-            delayed=_threes("delayed", "[formula, unit, delay]", entry),
-            remembered=int(entry.get("remembered", 0)),
-            **parts,
-        )
-    if states not in ({"vx", "vy"}, {"x", "y"}):
-        if states & {"vx", "vy", "y"}:
+    states = sorted(map(str, rate)) if isinstance(rate, Mapping) else []
+    if states not in (["v"], ["vx", "vy"], ["x"], ["x", "y"]):
+        if {"vx", "vy", "y"}.isdisjoint(states):
             raise ConfigError(
-                f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
-                "components of a person's acceleration; or x and y: of his velocity"
+                f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
+                "or v: a formula of an acceleration (second order); or vx and vy, of a crowd, or "
+                "x and y, of a crowd of first order"
             )
         raise ConfigError(
-            f"model.law.rate={rate} must be one entry, x: a formula of a speed (first order) "
-            "or v: a formula of an acceleration (second order); or vx and vy, of a crowd, or "
-            "x and y, of a crowd of first order"
+            f"model.law.rate={rate} must have two entries, vx and vy: formulas of both "
+            "components of a person's acceleration; or x and y: of his velocity"
         )
-    for over in REDUCED:
-        parts[over] = {str(k): ("", str(v)) for k, v in (entry.get(over) or {}).items()}
-    first, second = ("x", "y") if states == {"x", "y"} else ("vx", "vy")
+    texts = [str(rate[state]) for state in states]
+    leader = {"v": "v", "x": "v0" if "v0" in entry["parameters"] else "measured"}
+    reduced: dict[str, Any] = {
+        over: {str(k): ("", str(v)) for k, v in (entry.get(over) or {}).items()} for over in REDUCED
+    }
     return Rule(
-        rate=(str(rate[first]), str(rate[second])),
-        order=1 if first == "x" else 2,
+        rate=texts[0] if len(texts) == 1 else (texts[0], texts[1]),
+        order=1 if "x" in states else 2,
+        leader=leader.get("".join(states), ""),
+        states=_threes("states", "[unit, rate, start]", entry),
+        delayed=_threes("delayed", "[formula, unit, delay]", entry),
+        remembered=int(entry.get("remembered", 0)),
+        where={str(k): str(v) for k, v in (entry.get("where") or {}).items()},
+        constants={str(k): in_si(str(v)) for k, v in (entry.get("constants") or {}).items()},
+        settings={k: in_si(str(v))[1] for k, v in entry.get("settings", {}).items()},
         force=tuple(entry["force"]) if "force" in entry else None,
         drive=entry.get("drive", False),
-        **parts,
+        **reduced,
     )
 
 

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
-
-from nnode.model.formula import crowd_of
-from nnode.model.system import System, Traffic
-from nnode.model.term import Term
+from nnode.model.system import Crowd, System, Traffic
 
 
 def source(model: System) -> str:
@@ -15,15 +11,11 @@ def source(model: System) -> str:
     Raises:
         ValueError: the model has a term that is no formula.
     """
-    from nnode.simulate.kernels.crowds.source import CrowdSource
-    from nnode.simulate.kernels.lanes.source import LaneSource
+    from nnode.simulate.kernels.crowds import CrowdSource
+    from nnode.simulate.kernels.lanes import LaneSource
 
-    if isinstance(model, Traffic):
-        lane = model.lane
-        if lane is not None and lane.is_formula:
-            return LaneSource(lane).text()
-    else:
-        law = crowd_of(cast(list[Term], list(model.terms)))
-        if law is not None:
-            return CrowdSource(law).text()
+    if isinstance(model, Traffic) and model.lane is not None and model.lane.is_formula:
+        return LaneSource(model.lane).text()
+    if isinstance(model, Crowd) and model.formula is not None:
+        return CrowdSource(model.formula).text()
     raise ValueError("the model has a term that is code of its own: it runs in PyTorch")

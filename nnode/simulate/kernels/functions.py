@@ -37,15 +37,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
 #: Flags of every compiled function: fused multiply-add, and zeros without sign.
 FLAGS = {"contract", "nsz"}
 #: Options of every function that is to vanish into its caller's loop.
 INLINE: Any = {"forceinline": True, "fastmath": FLAGS, "error_model": "numpy"}
-_CONTRACT = ("contract",)
+#: Options of functions that hold a loop.
+LOOP: Any = {"fastmath": FLAGS, "error_model": "numpy"}
 
 # Chebyshev interpolants of the named functions, computed with 50 digits; lowest power first.
 # e^r for |r| <= log(2)/2, errors 2e-9 and 3e-18
@@ -133,84 +134,11 @@ LOG2 = {
     64: (0.693147180369123816490, 1.90821492927058770002e-10),
 }
 LOG2E = 1.442695040888963407360
+_DIGITS: dict[int, Any] = {32: np.int32, 64: np.int64}
 #: Binary digits after the leading one.
 MANTISSA = {32: 23, 64: 52}
 #: Where e^x leaves the normal numbers of its type: below it is 0, above inf
 RANGE = {32: (-87.6, 89.0), 64: (-708.7, 710.0)}
-
-
-def _polynomial(table: dict[int, tuple[float, ...]], factor: float = 1.0) -> Any:
-    """A function of x that evaluates one polynomial, coefficients by bit width."""
-
-    @intrinsic
-    def evaluate(typing_context: Any, x: Any) -> Any:
-        def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            kind = args[0].type
-            terms = [
-                ir.Constant(kind, np.float32(c * factor) if x.bitwidth == 32 else c * factor)
-                for c in table[x.bitwidth]
-            ]
-            total = terms[-1]
-            for term in terms[-2::-1]:
-                product = builder.fmul(total, args[0], flags=_CONTRACT)
-                total = builder.fadd(product, term, flags=_CONTRACT)
-            return total
-
-        return x(x), emit
-
-    return evaluate
-
-
-_exp_polynomial = _polynomial(_EXP, 2.0)
-_log1p_polynomial = _polynomial(_LOG1P)
-_log_polynomial = _polynomial(_LOG)
-
-
-def _whole(width: int) -> float:
-    """A number so large that its last binary digit is 1; adding it rounds."""
-    return 1.5 * 2.0 ** MANTISSA[width]
-
-
-def _half_power_code(typing_context: Any, t: Any) -> Any:
-    """2^(n-1), where n + bias - 1 stands in the lowest digits of ``t``."""
-    width = t.bitwidth
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        integer = ir.IntType(width)
-        digits = builder.bitcast(args[0], integer)
-        shifted = builder.shl(digits, ir.Constant(integer, MANTISSA[width]))
-        return builder.bitcast(shifted, args[0].type)
-
-    return t(t), emit
-
-
-def _mantissa_exponent_code(typing_context: Any, x: Any) -> Any:
-    """(m, k) of a positive normal number m 2^k with sqrt(1/2) <= m < sqrt(2)."""
-    width = x.bitwidth
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        integer, kind = ir.IntType(width), args[0].type
-        digit = np.int32 if width == 32 else np.int64
-        real = np.float32 if width == 32 else np.float64
-
-        def digits_of(value: float) -> int:
-            return int(real(value).view(digit))
-
-        shift = ir.Constant(integer, MANTISSA[width])
-        digits = builder.bitcast(args[0], integer)
-        away = builder.sub(digits, ir.Constant(integer, digits_of(0.5**0.5)))
-        k = builder.ashr(away, shift)
-        m = builder.bitcast(builder.sub(digits, builder.shl(k, shift)), kind)
-        # conversion of 64-bit integers is scalar on many processors, an addition is not
-        large = builder.add(k, ir.Constant(integer, digits_of(_whole(width))))
-        number = builder.fsub(builder.bitcast(large, kind), ir.Constant(kind, _whole(width)))
-        return context.make_tuple(builder, signature.return_type, (m, number))
-
-    return types.UniTuple(x, 2)(x), emit
-
-
-_half_power: Any = intrinsic(_half_power_code)
-_mantissa_exponent: Any = intrinsic(_mantissa_exponent_code)
 
 
 def _for_compiled_code(typed: Callable[[Any, int], Callable[[Any], Any]]) -> Callable[[Any], Any]:
@@ -228,6 +156,59 @@ def _for_compiled_code(typed: Callable[[Any, int], Callable[[Any], Any]]) -> Cal
 
     function.__name__, function.__doc__ = typed.__name__, typed.__doc__
     return function
+
+
+def _polynomial(table: dict[int, tuple[float, ...]], factor: float = 1.0) -> Any:
+    """A function of x that evaluates one polynomial, coefficients by bit width."""
+
+    def evaluate(kind: Any, width: int) -> Callable[[Any], Any]:
+        numbers = tuple(kind(factor * c) for c in table[width])
+        text = "c[-1]"
+        for i in reversed(range(len(numbers) - 1)):
+            text = f"c[{i}] + x * ({text})"
+        body: Callable[[Any], Any] = eval(f"lambda x: {text}", {"c": numbers})
+        body.__annotations__ = {"x": "Any"}  # as Numba compares it with the others
+        return body
+
+    return _for_compiled_code(evaluate)
+
+
+_exp_polynomial = _polynomial(_EXP, 2.0)
+_log1p_polynomial = _polynomial(_LOG1P)
+_log_polynomial = _polynomial(_LOG)
+
+
+def _whole(width: int) -> float:
+    """A number so large that its last binary digit is 1; adding it rounds."""
+    return 1.5 * 2.0 ** MANTISSA[width]
+
+
+@_for_compiled_code
+def _half_power(kind: Any, width: int) -> Callable[[Any], Any]:
+    """2^(n-1), where n + bias - 1 stands in the lowest digits of ``t``."""
+    digits, shift = _DIGITS[width], _DIGITS[width](MANTISSA[width])
+
+    def body(x: Any) -> Any:
+        return digits(kind(x).view(digits) << shift).view(kind)
+
+    return body
+
+
+@_for_compiled_code
+def _mantissa_exponent(kind: Any, width: int) -> Callable[[Any], Any]:
+    """(m, k) of a positive normal number m 2^k with sqrt(1/2) <= m < sqrt(2)."""
+    digits, shift = _DIGITS[width], _DIGITS[width](MANTISSA[width])
+    least, large = kind(0.5**0.5).view(digits), kind(_whole(width))
+    base = large.view(digits)
+
+    def body(x: Any) -> Any:
+        bits = kind(x).view(digits)
+        k = digits(digits(bits - least) >> shift)
+        m = digits(bits - digits(k << shift)).view(kind)
+        # conversion of 64-bit integers is scalar on many processors, an addition is not
+        return m, digits(k + base).view(kind) - large
+
+    return body
 
 
 def real(value: float, like: Any) -> Any:
@@ -388,3 +369,22 @@ def softplus(x: Any) -> Any:
 @njit(**INLINE)
 def softplus_slope(x: Any) -> Any:
     return torch_softplus(x)[1]
+
+
+_memmove: Any = cgutils.raw_memmove
+
+
+@intrinsic
+def copy(typing_context: Any, target: Any, source: Any, number: Any) -> Any:
+    """The first numbers of a row to another one, which may be the same array further on: a loop
+    that cannot know how far would take them one by one."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        rows = [
+            context.make_array(kind)(context, builder, value).data
+            for kind, value in zip(signature.args[:2], args[:2], strict=True)
+        ]
+        _memmove(builder, *rows, args[2], context.get_abi_sizeof(rows[0].type.pointee))
+        return context.get_dummy_value()
+
+    return types.none(target, source, types.intp), emit

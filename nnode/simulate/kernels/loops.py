@@ -1,19 +1,17 @@
 """Loops over rows of numbers, as source text for Numba.
 
-What does not vary along a row is computed once before the loop; sums over the loop are pulled
-back through it after the loop.
+What does not vary along a row is computed once before the loop; the gradient by it is computed from
+sums over the loop, after the loop.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from nnode.model.differentiate import vjp
 from nnode.model.expression import Expr, const, symbol, symbols, topological
 from nnode.model.operations import OPERATIONS
-
-_PAIR = ("softplus", "softplus_slope")
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Loop:
         sums: Mapping[str, Expr] | None = None,
         after: Sequence[str] = (),
     ) -> str:
-        """A function ``name(room, lo, n, q, t, dt, drives, total)`` that computes rows.
+        """A function ``name(buffer, lo, n, q, t, dt, drives, total)`` that computes rows.
 
         Args:
             rows: row to what is stored there.
@@ -57,29 +55,34 @@ class Loop:
         """
         sums = sums or {}
         outputs = [*rows.values(), *sums.values()]
-        varies = self.varies(outputs)
-        names = self.names(outputs)
-        before, inside = self.lines(topological(outputs), varies, names)
-        read = [n.value for n in topological(outputs) if n.op == "symbol" and varies[n]]
-        text = f"\n\n@njit(**{self.options})\ndef {name}(room, lo, n, q, t, dt, drives, total):\n"
-        text += "    zero = real(0, dt)\n"
-        text += self.given(outputs)
-        text += _indented(before, 1)
-        text += "".join(f"    sum_{label} = zero\n" for label in sums)
-        text += "    for j in range(np.uint64(n)):\n        k = np.uint64(lo) + j\n"
-        text += "".join(f"        {row} = room[k + _{row}]\n" for row in read)
-        text += _indented(inside, 2)
-        text += "".join(f"        room[k + _{row}] = {names[n]}\n" for row, n in rows.items())
-        text += "".join(f"        sum_{s} = add(sum_{s}, {names[n]})\n" for s, n in sums.items())
-        return text + _indented(after, 1)
+        varies, names = self.varies(outputs), self.names(outputs)
+        lines = self.lines(names)
+        read = [n.value for n in names if n.op == "symbol" and varies[n]]
+        inside = [
+            "k = np.uint64(lo) + j",
+            *(f"{row} = buffer[k + _{row}]" for row in read),
+            *(line for n, line in lines.items() if varies[n]),
+            *(f"buffer[k + _{row}] = {names[n]}" for row, n in rows.items()),
+            *(f"sum_{s} = add(sum_{s}, {names[n]})" for s, n in sums.items()),
+        ]
+        body = [
+            "zero = real(0, dt)",
+            *self.given(outputs),
+            *(line for n, line in lines.items() if not varies[n]),
+            *(f"sum_{label} = zero" for label in sums),
+            "for j in range(np.uint64(n)):",
+            *(f"    {line}" for line in inside),
+            *after,
+        ]
+        head = f"\n\n@njit(**{self.options})\ndef {name}(buffer, lo, n, q, t, dt, drives, total):\n"
+        return head + "".join(f"    {line}\n" for line in body)
 
-    def given(self, outputs: Sequence[Expr]) -> str:
+    def given(self, outputs: Iterable[Expr]) -> list[str]:
         """Lines that name the uniform quantities that formulas need."""
-        needed = {n.value for n in topological(outputs) if n.op == "symbol"}
-        found = [(p, j) for j, p in enumerate(self.uniform) if p in needed]
-        return "".join(f"    {p} = q[{j}]\n" for p, j in found)
+        needed = set(symbols(outputs))
+        return [f"{p} = q[{j}]" for j, p in enumerate(self.uniform) if p in needed]
 
-    def pulled(
+    def vjp(
         self, name: str, seeds: Mapping[Expr, Expr], rows: Mapping[str, str], onto: Sequence[str]
     ) -> str:
         """A function that adds to ``total`` the gradient by the uniform quantities, and stores
@@ -97,18 +100,11 @@ class Loop:
         found = {
             n.value: b
             for n, b in rest.items()
-            if n.op == "symbol" and n.value in self.uniform and n.value not in self.fixed
+            if n.value in self.uniform and n.value not in self.fixed
         }
         # what the chain behind the loop needs is computed there
-        outputs = list(found.values())
-        names = {
-            **self.names(outputs, "u"),
-            **{symbol(f"sum_{i}"): f"sum_{i}" for i in range(len(ends))},
-        }
-        lines, _ = self.lines(
-            topological(outputs), dict.fromkeys(topological(outputs), False), names
-        )
-        after = self.given(outputs).replace("    ", "").splitlines() + lines
+        names = self.names(found.values(), "u")
+        after = [*self.given(found.values()), *self.lines(names).values()]
         after += [f"total[{self.uniform.index(p)}] += {names[b]}" for p, b in found.items()]
         return self.function(name, stored, sums, after)
 
@@ -124,46 +120,23 @@ class Loop:
         ends = {n: b for n, b in bar.items() if not varies[n] and not set(symbols([n])) <= still}
         return stored, ends
 
-    def of_numbers(self, formulas: Mapping[str, Expr]) -> list[str]:
-        """Lines that compute formulas of numbers by their names."""
-        parts = topological(formulas.values())
-        names = self.names(parts)
-        lines, _ = self.lines(parts, dict.fromkeys(parts, False), names)
-        return lines + [f"{name} = {names[node]}" for name, node in formulas.items()]
+    def of_numbers(self, name: str, formula: Expr) -> list[str]:
+        """Lines that compute a formula of numbers and give it a name."""
+        names = self.names([formula])
+        return [*self.lines(names).values(), f"{name} = {names[formula]}"]
 
-    def names(self, outputs: Sequence[Expr], prefix: str = "n") -> dict[Expr, str]:
+    def names(self, outputs: Iterable[Expr], prefix: str = "n") -> dict[Expr, str]:
+        """Names of nodes in code, each after what it is made of."""
+        nodes = enumerate(topological(outputs))
+        return {n: n.value if n.op == "symbol" else f"{prefix}{i}" for i, n in nodes}
+
+    def lines(self, names: Mapping[Expr, str]) -> dict[Expr, str]:
+        """Lines that compute nodes."""
         found = {}
-        for i, node in enumerate(topological(outputs)):
-            found[node] = node.value if node.op == "symbol" else f"{prefix}{i}"
-        return found
-
-    def lines(
-        self, nodes: Sequence[Expr], varies: Mapping[Expr, bool], names: Mapping[Expr, str]
-    ) -> tuple[list[str], list[str]]:
-        """Lines before the loop, and inside."""
-        before: list[str] = []
-        inside: list[str] = []
-        known = {(n.op, n.args): n for n in nodes}
-        done: set[Expr] = set()
-        for node in nodes:
-            if node.op == "symbol" or node in done:
-                continue
-            lines = inside if varies[node] else before
+        for node, name in names.items():
             if node.op == "const":
-                lines.append(f"{names[node]} = real({node.value!r}, dt)")
-                continue
-            own = [names[a] for a in node.args]
-            if node.op in _PAIR:
-                other = known.get((_PAIR[node.op == _PAIR[0]], node.args))
-                if other is not None:
-                    done.add(other)
-                    pair = (node, other) if node.op == _PAIR[0] else (other, node)
-                    left = ", ".join(names[n] for n in pair)
-                    lines.append(f"{left} = torch_softplus({own[0]})")
-                    continue
-            lines.append(f"{names[node]} = {OPERATIONS[node.op].code.format(*own)}")
-        return before, inside
-
-
-def _indented(lines: Sequence[str], depth: int) -> str:
-    return "".join(f"{'    ' * depth}{line}\n" for line in lines)
+                found[node] = f"{name} = real({node.value!r}, dt)"
+            elif node.op != "symbol":
+                code = OPERATIONS[node.op].code.format(*(names[a] for a in node.args))
+                found[node] = f"{name} = {code}"
+        return found

@@ -7,15 +7,13 @@ therefore begins with the first samples of every sequence and follows the minimu
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from nnode.calibrate.ensemble import EnsembleCost
-from nnode.calibrate.least_squares import Minimum, least_squares, trajectory_residuals
+from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.sequence import Batch
 from nnode.model.build import build_model
 from nnode.model.network import FeedForward
@@ -23,7 +21,6 @@ from nnode.model.options import CrowdOptions, NetworkForceOptions, SocialForceOp
 from nnode.model.system import System
 from nnode.plots.interaction import interaction
 from nnode.simulate.fused import FusedSolver
-from nnode.study.crowd.data import cut
 
 #: Social force and networks; those with the person himself in the sum, j = i, as printed.
 OPTIONS: dict[str, CrowdOptions] = {
@@ -40,8 +37,6 @@ GROWTH = {"sf": (4, 8, 13, 26, 51), "nn": (6, 13), "nn_self": (6, 13)}
 SHORT_STEPS = {"sf": 8, "nn": 3, "nn_self": 3}
 #: Networks bear rounding to single precision and are twice as fast in it; A is too small for it.
 DTYPE = {"sf": torch.float64, "nn": torch.float32, "nn_self": torch.float32}
-#: Parameters below this size are varied as if they had it.
-LEAST = {"sf": 1e-3, "nn": 0.1, "nn_self": 0.1}
 
 
 def new_system(model: str, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
@@ -63,11 +58,26 @@ def row_of(system: System) -> np.ndarray:
     return torch.nn.utils.parameters_to_vector(system.parameters()).detach().double().numpy()
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """Where a calibration ended.
+
+    Attributes:
+        row: ``(K,)`` all parameters of the model.
+        cost: of training, m² s.
+        evaluations: simulations.
+    """
+
+    row: np.ndarray
+    cost: float
+    evaluations: int
+
+
 def calibrate(
     model: str, batch: Batch, start: np.ndarray, *, people: bool = True, grow: bool = True,
     weights: np.ndarray | None = None, steps: int = 30,
-) -> Minimum:  # fmt: skip
-    """Levenberg and Marquardt's method within the model's bounds.
+) -> Fitted:  # fmt: skip
+    """Damped least squares within the model's bounds.
 
     Args:
         model: of OPTIONS.
@@ -78,27 +88,19 @@ def calibrate(
         grow: begin with the first samples of every sequence.
         weights: ``(B,)`` weight of each sequence, of sum 1; None takes the mean.
         steps: on whole sequences, at most.
-
-    Returns:
-        All parameters of the model and its training cost, m² s.
     """
     system = system_of(model, start)
     if not people:
         silence(system)
-    dtype = DTYPE[model]
-    system.to(dtype)
-    number = 0
-    lengths = [n for n in GROWTH[model] if n < batch.n_samples] if grow else []
-    for samples in (*lengths, batch.n_samples):
-        limit = steps if samples == batch.n_samples else min(steps, SHORT_STEPS[model])
-        cost = EnsembleCost(system, cut(batch, samples).to(dtype=dtype), FusedSolver())
-        found = least_squares(
-            trajectory_residuals(cost, weights), cost.row(system).numpy(), cost.low.numpy(),
-            cost.high.numpy(), steps=limit, least=LEAST[model],
-        )  # fmt: skip
-        cost.fill_(system, torch.from_numpy(found.row))
-        number += found.evaluations
-    return replace(found, row=row_of(system), evaluations=number)
+    system.to(DTYPE[model])
+    problem = ResidualProblem(system, batch.to(dtype=DTYPE[model]), FusedSolver())
+    options: dict[str, Any] = {"weights": weights, "tolerance": 1e-6}
+    begin = problem.start
+    if grow:
+        begin = problem.begin(begin, GROWTH[model], steps=min(steps, SHORT_STEPS[model]), **options)
+    found = pooled(problem, begin, steps=steps, **options)
+    row = row_of(problem.vector.fill_(found.row))
+    return Fitted(row, float(found.cost), problem.simulations)
 
 
 def silence(system: System) -> None:
@@ -111,11 +113,10 @@ def silence(system: System) -> None:
             weight.zero_()
 
 
-def costs(model: str, row: np.ndarray | list[float], batch: Batch) -> Tensor:
+def costs(model: str, row: np.ndarray | list[float], batch: Batch) -> np.ndarray:
     """``(B,)`` cost of every sequence, m² s, in float64."""
-    system = system_of(model, row)
-    cost = EnsembleCost(system, batch, FusedSolver())
-    return cost.costs(cost.row(system)[None])[0]
+    problem = ResidualProblem(system_of(model, row), batch, FusedSolver())
+    return problem.costs(problem.vector.row.numpy())
 
 
 def named(model: str, row: np.ndarray | list[float]) -> dict[str, Any]:

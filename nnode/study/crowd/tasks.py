@@ -136,5 +136,5 @@ def _of(model: str, row: Any, batch: Batch) -> dict[str, float]:
     return _by_name(batch, costs(model, row, batch))
 
 
-def _by_name(batch: Batch, each: torch.Tensor) -> dict[str, float]:
+def _by_name(batch: Batch, each: np.ndarray | torch.Tensor) -> dict[str, float]:
     return dict(zip(batch.names, each.tolist(), strict=True))

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate.gauss_newton.method import TangentCost
-from nnode.calibrate.gauss_newton.pooling import scattered
+from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.pooling import scattered
+from nnode.calibrate.problem import ResidualProblem
 from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.system import System
@@ -111,16 +112,18 @@ EVERY: dict[str, Candidate] = {
 REFERENCE = "idm"
 
 
-def starts(candidate: Candidate, cost: TangentCost, number: int, seed: int) -> np.ndarray:
+def starts(candidate: Candidate, cost: ResidualProblem, number: int, seed: int) -> np.ndarray:
     """``(number, P)`` rows: the shelf's own values, then random ones within the limits.
 
     Weights of networks are drawn as models draw them, those beside a law start at 0 in their
     last layer.
     """
-    return scattered(cost, (cost.row(candidate.system(seed + i)) for i in range(number)), seed)
+    systems = (candidate.system(seed + i) for i in range(number))
+    rows = (ParameterVector(system, cost.vector.places).row.numpy() for system in systems)
+    return scattered(cost, rows, seed)
 
 
-def decay(cost: TangentCost) -> tuple[np.ndarray, np.ndarray] | None:
+def decay(cost: ResidualProblem) -> tuple[np.ndarray, np.ndarray] | None:
     """Centre and weights of the penalty on a network's weights; None where there is none."""
     free = ~(np.isfinite(cost.low) & np.isfinite(cost.high))
     return (np.zeros(len(free)), DECAY * free) if free.any() else None

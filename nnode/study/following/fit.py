@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton.method import Fit, TangentCost, pooled
-from nnode.calibrate.gauss_newton.pooling import best_alone
+from nnode.calibrate.least_squares import Minimum
+from nnode.calibrate.pooling import best_alone
+from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
 from nnode.model.build import build_model
@@ -28,15 +29,15 @@ STEPS, TOLERANCE = 60, 1e-7
 TOUCHES = 1e-6
 
 
-def costs_of(candidate: Candidate, batch: Batch, objective: str = "spacing") -> TangentCost:
+def costs_of(candidate: Candidate, batch: Batch, objective: str = "spacing") -> ResidualProblem:
     """A candidate's cost on pairs; the usual steps of its law."""
-    return TangentCost(candidate.system(), batch, FusedSolver(), Convention(objective))
+    return ResidualProblem(candidate.system(), batch, FusedSolver(), Convention(objective))
 
 
 def calibrated(
-    candidate: Candidate, cost: TangentCost, restarts: int, seed: int,
+    candidate: Candidate, cost: ResidualProblem, restarts: int, seed: int,
     weights: np.ndarray | None = None,
-) -> tuple[Fit, list[float]]:  # fmt: skip
+) -> tuple[Minimum, list[float]]:  # fmt: skip
     """The best of several starts, and the costs of all, penalty included."""
     fits = [
         pooled(cost, row, weights, penalty=decay(cost), steps=STEPS, tolerance=TOLERANCE)
@@ -46,16 +47,16 @@ def calibrated(
     return fits[int(np.argmin(found))], found
 
 
-def named(cost: TangentCost, row: np.ndarray) -> dict[str, float]:
+def named(cost: ResidualProblem, row: np.ndarray) -> dict[str, float]:
     """Parameters by name; one that a term before has as well bears its own term's before it."""
     found: dict[str, float] = {}
-    for symbol, value in zip(cost.names, row, strict=True):
-        owner, name = symbol.split("__", 1)
-        found[f"{owner}.{name}" if name in found else name] = float(value)
+    for address, value in zip(cost.names, row, strict=True):
+        name = address.split(".", 1)[1]
+        found[address if name in found else name] = float(value)
     return found
 
 
-def at_limits(cost: TangentCost, row: np.ndarray) -> list[str]:
+def at_limits(cost: ResidualProblem, row: np.ndarray) -> list[str]:
     """Names of the parameters that ended at a limit."""
     span = np.where(np.isfinite(cost.high - cost.low), cost.high - cost.low, 0.0)
     near = (row - cost.low <= TOUCHES * span) | (cost.high - row <= TOUCHES * span)
@@ -143,6 +144,6 @@ def reproduced(folder: str) -> Result:
             system = build_model(
                 {"term": "formula", "name": law, "leader": "measured", "law": described}
             )
-            cost = TangentCost(system, batch, FusedSolver(), Convention.spacing)
+            cost = ResidualProblem(system, batch, FusedSolver(), Convention.spacing)
             found[f"{law} {objective}"] = (cost.costs(cost.start) * first).tolist()
     return found

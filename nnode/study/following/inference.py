@@ -1,4 +1,4 @@
-"""How sure the parameters of one candidate are: sandwich, profiles, and drivers who differ."""
+"""How sure the parameters of one candidate are: clusters, profiles, and drivers who differ."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate.gauss_newton import pooling
-from nnode.calibrate.gauss_newton.method import TangentCost, pooled, sandwich
+from nnode.calibrate import pooling
+from nnode.calibrate.intervals import influence
+from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import collate
 from nnode.study.following import data
@@ -22,26 +23,27 @@ PROFILE = tuple(float(f) for f in np.geomspace(0.25, 4, 17))
 
 
 def precision(folder: str, name: str, row: list[float]) -> Result:
-    """Standard errors from clusters, correlations, and a profile of every parameter."""
+    """Half widths of intervals from clusters, correlations, and a profile of every parameter."""
     batch = data.batch(folder)
     label = data.labels(data.pairs(folder))
     cost = costs_of(EVERY[name], batch)
     best = np.array(row)
     free = np.array([n not in at_limits(cost, best) for n in named(cost, best)])
-    weights = np.full(len(batch), 1 / len(batch))
-    covariance = sandwich(cost(best), weights, label, free)
-    error = np.sqrt(np.diag(covariance))
-    scale = np.where(error > 0, error, 1.0)
+    found = influence(cost, best, label, free)
+    covariance, half = np.zeros((len(best), len(best))), np.zeros(len(best))
+    covariance[np.ix_(free, free)], half[free] = found.covariance(), found.half_widths()
+    scale = np.sqrt(np.diag(covariance))
+    scale = np.where(scale > 0, scale, 1.0)
     return {
         "names": list(named(cost, best)),
         "row": row,
-        "error": error.tolist(),
+        "half": half.tolist(),
         "correlation": (covariance / np.outer(scale, scale)).tolist(),
         "profiles": {one: profile(cost, best, i, label) for i, one in enumerate(named(cost, best))},
     }
 
 
-def profile(cost: TangentCost, best: np.ndarray, place: int, label: np.ndarray) -> Result:
+def profile(cost: ResidualProblem, best: np.ndarray, place: int, label: np.ndarray) -> Result:
     """Costs with one parameter held at other values, all others calibrated again.
 
     Returns:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate.gauss_newton.method import pooled
+from nnode.calibrate.problem import pooled
 from nnode.data.sequence import collate
 from nnode.study.following import data
 from nnode.study.following.candidates import EVERY, starts

@@ -72,13 +72,13 @@ def _precision(study: Study, name: str) -> list[Block]:
     one = study.one("precision", name)
     names = one["names"]
     own = study.one("cv", name)
-    row, error = np.array(one["row"]), np.array(one["error"])
+    row, half = np.array(one["row"]), np.array(one["half"])
     correlation = pd.DataFrame(one["correlation"], index=names, columns=names)
     table = pd.DataFrame(
         {
             "value": row,
-            "from": row - 1.96 * error,
-            "to": row + 1.96 * error,
+            "from": row - half,
+            "to": row + half,
             "unit": [UNITS.get(n, "1") for n in names],
             "at a limit": [n in own["limits"] for n in names],
             **{f"r({n})": correlation[n].to_numpy() for n in names},
@@ -97,7 +97,7 @@ def _precision(study: Study, name: str) -> list[Block]:
     open_ = [n for n in names if not _closed(one["profiles"][n], own["parameters"][n])]
     strongest = float(np.abs(away).max()) if away.size else 0.0
     text = (
-        f"*{name}*: intervals from how gradients differ between clusters (sandwich). "
+        f"*{name}*: intervals from how gradients differ between clusters (CR2). "
         + (f"Strongly correlated: {', '.join(pairs)}. " if pairs else "")
         + (
             f"The strongest correlation is {strongest:.2f}. " if not pairs else ""

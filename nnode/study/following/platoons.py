@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton.method import TangentCost
-from nnode.calibrate.gauss_newton.pooling import best_alone
+from nnode.calibrate.pooling import best_alone
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
@@ -50,11 +50,11 @@ def followers(folder: str, run: str | None = None) -> list[Sequence]:
 
 def own_rows(
     candidate: Candidate, batch: Batch, restarts: int, seed: int
-) -> tuple[TangentCost, np.ndarray, np.ndarray]:
+) -> tuple[ResidualProblem, np.ndarray, np.ndarray]:
     """Every pair by itself: the cost, ``(B, P)`` best rows of several starts, ``(B,)`` costs."""
     cost = costs_of(candidate, batch)
     begin = starts(candidate, cost, restarts, seed)
-    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=1e-7, pool=decay(cost))
+    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=1e-7, penalty=decay(cost))
     return cost, rows, cost.costs(rows)
 
 
@@ -70,7 +70,7 @@ def reproduced(folder: str) -> Result:
             {"term": "formula", "name": "ovm", "leader": "measured", "law": described}
         )
         rest = pair.part(printed.FIRST, 1.0)
-        cost = TangentCost(system, collate([rest]), FusedSolver(), Convention.spacing)
+        cost = ResidualProblem(system, collate([rest]), FusedSolver(), Convention.spacing)
         found["law"][make] = float(cost.costs(cost.start)[0])
         found["stopped"][make] = collided(rest, values)
     return found

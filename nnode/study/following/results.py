@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
-from nnode.calibrate.gauss_newton.method import TangentCost
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.model.system import System
@@ -79,9 +78,8 @@ class Study:
     def system(self, name: str) -> System:
         """A candidate with its parameters from all training pairs."""
         system = EVERY[name].system()
-        cost = TangentCost(system, collate(self.pairs()[:1]), FusedSolver())
-        with torch.no_grad():
-            return cost.fill_(system, np.array(self.one("cv", name)["row"]))
+        vector = ResidualProblem(system, collate(self.pairs()[:1]), FusedSolver()).vector
+        return vector.fill_(np.array(self.one("cv", name)["row"]))
 
 
 def _paired(first: np.ndarray, second: np.ndarray, group: np.ndarray, seed: int) -> Paired:

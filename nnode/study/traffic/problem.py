@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.bfgs import Minima, minimise
 from nnode.calibrate.ensemble import EnsembleCost
-from nnode.calibrate.quasi_newton import Minima, minimise
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import GAP, clusters
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
@@ -87,18 +88,20 @@ class Problem:
         the other; laws anywhere in a plausible range.
         """
         cost = self.cost(COARSE, torch.float64)
-        rows = torch.stack([cost.row(self.system(1000 * seed + r)) for r in range(number)])
+        rows = torch.stack(
+            [ParameterVector(self.system(1000 * seed + r)).row for r in range(number)]
+        )
         draw = torch.Generator().manual_seed(seed)
         share = torch.rand(number, 2, generator=draw, dtype=torch.float64)
         if not wide:
             return rows
         if self.options["term"] != "network_speed":
-            place = {name.rsplit(".")[-1]: i for i, name in enumerate(cost.names)}
+            place = {name.rsplit(".")[-1]: i for i, name in enumerate(cost.vector.names)}
             for i, (name, (low, high)) in enumerate((("v0", SPEEDS), ("L", LENGTHS))):
                 rows[1:, place[name]] = low + (high - low) * share[1:, i]
         elif self.options["box"] is None:
             inner = torch.ones(rows.shape[1], dtype=torch.bool)
-            inner[cost.names.index("terms.0.v0")] = False
+            inner[cost.vector.names.index("terms.0.v0")] = False
             factor = torch.where(torch.arange(number) < number // 2, 1.0, WIDEN ** share[:, 0])
             rows[:, inner] *= factor[:, None]
         return rows
@@ -159,5 +162,5 @@ def named(cost: EnsembleCost, row: Tensor) -> dict[str, Any]:
     """A row as nested lists by parameter; names without the term they belong to."""
     return {
         name.removeprefix("terms.0."): value[0].double().tolist()
-        for name, value in cost.parameters(row[None]).items()
+        for name, value in cost.vector.runs(row[None]).items()
     }

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nnode.calibrate.bfgs import minimise, optimality_residual
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.evaluate import best_common_speed, constant_velocity, no_interaction
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
-from nnode.calibrate.quasi_newton import minimise, optimality_residual
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.simulate.fused import FusedSolver
 from nnode.study.statistics import group_weights
@@ -54,7 +55,7 @@ def fit(
         "groups": groups(folder, recording_name).tolist(),
         "parameters": named(cost, best),
         "residual": float(residual),
-        "speeds": speeds(cost.fill_(problem.system(), best)),
+        "speeds": speeds(ParameterVector(problem.system()).fill_(best)),
         "steps": {
             f"{step:g}": float(problem.cost(step, torch.float64).costs(best[None]).mean())
             for step in steps
@@ -84,11 +85,11 @@ def _bootstrap(
         iterations=iterations, inverse=inverse,
     )  # fmt: skip
     rows = refits.rows[torch.isfinite(refits.costs)]
-    system, exact = problem.system(), problem.cost(step, torch.float64)
-    curves = [speeds(exact.fill_(system, one)) for one in rows]
+    vector = ParameterVector(problem.system())
+    curves = [speeds(vector.fill_(one)) for one in rows]
     values = {
         name.removeprefix("terms.0."): value.double().tolist()
-        for name, value in cost.parameters(rows).items()
+        for name, value in cost.vector.runs(rows).items()
         if value.ndim == 1
     }
     return {
@@ -242,7 +243,7 @@ def scan(folder: str, recording_name: str, model: str, points: int, dt: float) -
     by more than its spacing."""
     problem = Problem(recording(folder, recording_name), model)
     cost = problem.cost(dt, torch.float32)
-    names = [name.rsplit(".")[-1] for name in cost.names]
+    names = [name.rsplit(".")[-1] for name in cost.vector.names]
     axes = {
         "v0": torch.linspace(10, 40, points, dtype=torch.float64),
         "L": torch.linspace(2, 12, points, dtype=torch.float64),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import product
 from typing import Any
@@ -11,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.ensemble import EnsembleCost
-from nnode.calibrate.least_squares import Residuals, least_squares
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.least_squares import Quadratic, least_squares
+from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch
-from nnode.errors import SimulationError
 from nnode.model.scene import Scene, wanted
 from nnode.model.system import System
 from nnode.simulate.fused import FusedSolver
@@ -38,25 +38,37 @@ def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
     """
     system = new_system(law, desired)
     train = chosen(folders, held, test=False)
-    costs = [EnsembleCost(system, batch, FusedSolver()) for batch in train]
-    first = costs[0]
+    problems = [ResidualProblem(system, batch, FusedSolver(), Convention.sum) for batch in train]
+    first = problems[0]
     names = [name for name, _ in system.terms[0].named_parameters()]
-    own = dict(zip(names, first.row(system).tolist(), strict=True))
+    own = dict(zip(names, first.vector.row.tolist(), strict=True))
     grid = [dict(zip(GRID[law], each, strict=True)) for each in product(*GRID[law].values())]
     starts = [np.array(list({**own, **more}.values())) for more in [{}, *grid]]
-    away = residuals(costs)
-    starts.sort(key=lambda row: _square(away(row)))
+    share = 2 / sum(int(batch.valid[1:].sum()) for batch in train)
+
+    def costs(trials: np.ndarray) -> np.ndarray:
+        """Mean squared distance over people and samples, m²."""
+        return np.array([[share * sum(p.costs(row).sum() for p in problems)] for (row,) in trials])
+
+    def quadratic(rows: np.ndarray) -> Quadratic:
+        each = [problem(rows[0]) for problem in problems]
+        parts = zip(*((one.cost, one.gradient, one.hessian) for one in each), strict=True)
+        return Quadratic(*(share * np.concatenate(part).sum(0)[None] for part in parts))
+
+    starts.sort(key=lambda row: float(costs(row[None, None])[0, 0]))
     minima = [
-        least_squares(away, row, first.low.numpy(), first.high.numpy(), steps=STEPS)
+        least_squares(
+            quadratic, costs, row[None], first.low, first.high, steps=STEPS, tolerance=1e-6
+        )
         for row in starts[:BEST]
     ]
-    found = min(minima, key=lambda one: one.cost)
-    first.fill_(system, torch.from_numpy(found.row))
+    found = min(minima, key=lambda one: float(one.cost[0]))
+    ParameterVector(system).fill_(found.row[0])
     return {
-        "row": dict(zip(names, found.row.tolist(), strict=True)),
-        "train": found.cost,
-        "starts": [one.cost for one in minima],
-        "evaluations": len(starts) + sum(one.evaluations for one in minima),
+        "row": dict(zip(names, found.row[0].tolist(), strict=True)),
+        "train": float(found.cost[0]),
+        "starts": [float(one.cost[0]) for one in minima],
+        "evaluations": first.simulations,
         "errors": _of_runs(simulated(system), folders, held),
     }
 
@@ -71,31 +83,6 @@ def baselines(folders: list[str], held: list[str]) -> Result:
 
 def _of_runs(x: Predict, folders: list[str], runs: list[str]) -> Result:
     return {run: _errors(x, chosen(folders, [run], test=True)) for run in runs}
-
-
-def _square(values: Tensor | None) -> float:
-    return math.inf if values is None else float(values.square().sum())
-
-
-def residuals(costs: list[EnsembleCost]) -> Residuals:
-    """Residuals whose sum of squares is the mean squared distance over people and samples."""
-    number = sum(int(cost.batch.valid[1:].sum()) for cost in costs)
-
-    def found(row: np.ndarray) -> Tensor | None:
-        parts = []
-        for cost in costs:
-            batch = cost.batch
-            system = cost.fill_(cost.system, torch.from_numpy(row))
-            seen = batch.valid[1:]
-            try:
-                with torch.no_grad():
-                    away = cost.solver(system, batch).x[1:][seen] - batch.x[1:][seen]
-            except SimulationError:
-                return None
-            parts.append(away.flatten())
-        return torch.cat(parts) / number**0.5
-
-    return found
 
 
 def simulated(system: System) -> Predict:

@@ -12,13 +12,13 @@ import pytest
 from benchmarks.truths.laws.case import LawCase, measured
 from nnode.app.nearest_law import LAWS, candidates
 from nnode.app.python.inputs import model_options, table_options
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
 from nnode.discover.compare.laws import Nearer, compare_laws, imitated, with_effects
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import Search, Step, begun, settled, without_steps
 from nnode.discover.options import DiscoverOptions
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import refine
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
@@ -51,11 +51,11 @@ def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
 
 def test_what_cannot_be_simulated_is_told(platoons_of_lin: list[Sequence]) -> None:
     models = {"lin": law("lin"), "newell": law("newell")}
-    before = row_of(models["lin"])
+    before = ParameterVector(models["lin"]).row
     found, _ = compare_laws(models, platoons_of_lin, DiscoverOptions())
     assert [one.name for one in found.ranking] == ["lin"]
     assert "step by step" in found.refused["newell"]
-    assert row_of(models["lin"]).tolist() == before.tolist()
+    assert ParameterVector(models["lin"]).row.tolist() == before.tolist()
 
 
 @pytest.fixture(scope="module")

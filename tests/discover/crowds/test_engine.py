@@ -10,21 +10,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.windows import Windows
 from nnode.discover.locate.curves import columns_of
-from nnode.discover.residuals.engine import row_of, runs_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.model import Crowd, make_law
 from nnode.model.effects import CATALOGUE, Effect
-from nnode.model.effects.crowd_motion import Drift
-from nnode.model.effects.crowd_pairs import Alignment, PairRepulsion
+from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
-from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law, without_walls
+from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import State
 from nnode.simulate.alone import PersonAlone
+from nnode.study.walking.laws import without_walls
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)
@@ -50,9 +50,10 @@ def model(force: type[InteractionForce] = InteractionForce, **options: float | b
     return Crowd([make_law("relaxation", tau=walkers.TAU), law])
 
 
-def paths(windows: Windows, system: Crowd, rows: Tensor, *, compiled: bool) -> Tensor:
-    """``(F, R, P, 4)`` of the real people."""
-    rhs = PersonAlone(windows.around(system), system, runs_of(system, rows))
+def paths(windows: Windows, system: Crowd, rows: Tensor | None = None, *, compiled: bool) -> Tensor:
+    """``(F, R, P, 4)`` of the real people, by default with the model's own parameters."""
+    rows = ParameterVector(system).row[None] if rows is None else rows
+    rhs = PersonAlone(windows.around(system), system, ParameterVector(system).runs(rows))
     assert rhs.compiled is compiled
     start = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
     return rhs.simulated(start, windows.steps)[:, :, *windows.person.T]
@@ -94,8 +95,7 @@ def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
     for law in (PEDESTRIAN_LAWS["esf"], without_walls(PEDESTRIAN_LAWS["esf"])):
         for kind in (Law, Coded):
             system = Crowd([kind(law, "esf")], desired="direction").double()
-            compiled = kind is Law
-            found.append(paths(windows, system, row_of(system)[None], compiled=compiled))
+            found.append(paths(windows, system, compiled=kind is Law))
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)
     assert float((found[0] - found[2]).abs().max()) > 0.01
 
@@ -109,7 +109,12 @@ def test_effects_of_a_compiled_law_are_those_of_one_that_is_code(
     for force in (InteractionForce, Same):
         system, _ = extended(model(force), effect)
         found.append(
-            paths(windows, system, row_of(system)[None], compiled=force is InteractionForce)
+            paths(
+                windows,
+                system,
+                ParameterVector(system).row[None],
+                compiled=force is InteractionForce,
+            )
         )
     bare = paths(windows, model(), ROW[None], compiled=True)
     assert float((found[1] - bare).square().mean().sqrt()) > 0.02
@@ -118,7 +123,7 @@ def test_effects_of_a_compiled_law_are_those_of_one_that_is_code(
 
 def test_rows_are_independent_of_each_other(engine: CrowdEngine) -> None:
     system, _ = extended(model(), Alignment(c=0.2))
-    rows = row_of(system) + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
+    rows = ParameterVector(system).row + torch.tensor([[0.0] * 4, [3.0, 10.0, 1.0, 0.2]])
     together = engine.residuals(system, rows)
     for k in range(2):
         alone = engine.residuals(system, rows[k : k + 1])[0]
@@ -180,7 +185,7 @@ def alike(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
 
 def test_tangents_are_those_of_simulations(plain: list[Sequence]) -> None:
     system, _ = extended(model(), PairRepulsion(A_2=0.2, B_2=0.8))
-    row = row_of(system)
+    row = ParameterVector(system).row
     row[1] = 50.0
     engine = CrowdEngine(plain)
     engine.settle(system, row)
@@ -206,7 +211,7 @@ def test_traces_are_those_of_simulations(engine: CrowdEngine, name: str) -> None
     for column, (strength, step) in zip(found, probe.steps.items(), strict=True):
         options = {**probe.options, strength: effect.strengths[strength].neutral + step}
         system, _ = extended(model(), effect(**options))
-        changed = engine.residuals(system, row_of(system)[None])[0]
+        changed = engine.residuals(system, ParameterVector(system).row[None])[0]
         cosine, ratio = alike(column, (changed - plain) / step)
         assert cosine > 0.98
         assert ratio == pytest.approx(1.0, abs=0.05)
@@ -235,7 +240,7 @@ def test_sine_and_cosine_of_the_gait(engine: CrowdEngine) -> None:
     phase = effect.person(np.array([0.3, 0.4]), {})  # type: ignore[attr-defined]
     people = {name: [phase] * 6 for name in engine.names}
     system, _ = extended(model(), effect(people=people, a=0.05, f=0.9))
-    row = row_of(system)
+    row = ParameterVector(system).row
     change = engine.residuals(system, row[None])[0] - engine.residuals(model(), ROW[None])[0]
     agreement, ratio = alike(change, 0.05 * (0.6 * sine + 0.8 * cosine))
     assert agreement > 0.97
@@ -288,7 +293,7 @@ def test_a_hidden_effect_scores_best_and_is_measured(
     start = model()
     engine.settle(start, ROW)
     fit = refine(engine, start)
-    engine.settle(fit.system, row_of(fit.system))
+    engine.settle(fit.system, ParameterVector(fit.system).row)
     fit = refine(engine, fit.system)
     screen = Screen(fit, engine.cluster)
     effects = [

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds import indirect_inference as module
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.indirect_inference import unbiased
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.errors import SimulationError
 from nnode.model import Crowd, make_law
-from nnode.model.effects.crowd_motion import PreferredSpeed
+from nnode.model.effects.crowd import PreferredSpeed
 from tests.discover import walkers
 
 C, SPEED = 0.8, 1.3
@@ -46,7 +46,7 @@ def calibrated(
         [make_law("relaxation", tau=walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)]
     )
     engine = CrowdEngine(data)
-    engine.settle(system, row_of(system))
+    engine.settle(system, ParameterVector(system).row)
     return refine(engine, system), data, engine
 
 
@@ -59,8 +59,8 @@ def test_a_bias_by_disturbances_is_taken_out() -> None:
         place = fit.names.index("terms.2.c")
         before.append(abs(fit.row[place] - C))
         after.append(abs(found.row[place] - C))
-        assert np.array_equal(row_of(found.system).numpy(), found.row)
-        assert np.array_equal(row_of(fit.system).numpy(), fit.row)
+        assert np.array_equal(ParameterVector(found.system).row.numpy(), found.row)
+        assert np.array_equal(ParameterVector(fit.system).row.numpy(), fit.row)
         # what the simulations leave uncertain is part of the errors
         wider = found.errors(engine.sequence)[fit.free] >= fit.errors(engine.sequence)[fit.free]
         assert wider.all()

@@ -18,8 +18,7 @@ from nnode.discover.statistics.power import Way
 from nnode.discover.statistics.score import Evidence, Score
 from nnode.discover.statistics.standard import standardised as scaled
 from nnode.model.effects import CATALOGUE
-from nnode.model.effects.following import ReactionDelay, RelativeSpeed
-from nnode.model.effects.traffic import FreeFlowSpeed
+from nnode.model.effects.lane import FreeFlowSpeed, ReactionDelay, RelativeSpeed
 
 
 def curves(heights: list[float], errors: list[float], removed: float, name: str = "gap") -> Curves:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, drawn_in
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
 from nnode.discover.locate.curves import curves, weighed
 from nnode.discover.name.search import search, settled
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import Fit, refine, sums
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import traces
@@ -53,7 +53,7 @@ def test_noise_is_recognised_and_smoothed_away() -> None:
 
 def test_a_right_model_leaves_only_noise(plain: list[Sequence]) -> None:
     engine = TrafficEngine(platoons(noise=0.0))
-    errors = engine.squares(model(), row_of(model()))
+    errors = engine.squares(model(), ParameterVector(model()).row)
     assert np.sqrt(errors.means().max()) < 2e-3
     # nothing that a vehicle did before it forgot its start is compared
     assert len(errors.value) == len(engine.sequence) < sum(s.x[1:, 1:].size for s in plain)
@@ -97,7 +97,7 @@ def test_linear_response_agrees_with_differences(
     plain: list[Sequence], effects: list[dict[str, object]]
 ) -> None:
     engine, system = TrafficEngine(plain[:4]), model(*effects)
-    row = row_of(system)
+    row = ParameterVector(system).row
     found = engine.tangents(system, row)
     step = 1e-4 * row.abs().clamp(min=0.1)
     rows = torch.cat([row[None], row + torch.diag(step)])
@@ -124,9 +124,9 @@ def test_a_delay_is_simulated_precisely() -> None:
     sequences = delayed(0.6)
     engine = TrafficEngine(sequences)
     right = model({"name": "reaction_delay", "T": 0.6})
-    error = engine.squares(right, row_of(right)).means().mean()
+    error = engine.squares(right, ParameterVector(right).row).means().mean()
     assert np.sqrt(error) < 0.03
-    assert error < 0.05 * engine.squares(model(), row_of(model())).means().mean()
+    assert error < 0.05 * engine.squares(model(), ParameterVector(model()).row).means().mean()
 
 
 # -- naming ----------------------------------------------------------------------------------

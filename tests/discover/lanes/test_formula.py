@@ -12,17 +12,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes import along, response, runs
 from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System
 from nnode.model.arrays import computed, numpy_function
 from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.effects.traffic import DriverHeterogeneity
+from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.parse import parse
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 from tests.model.test_tensors import FORMULAS
@@ -102,7 +102,7 @@ def same(found: Tensor, expected: Tensor, close: float = 1e-9) -> None:
 
 
 def rows_of(system: System) -> Tensor:
-    row = row_of(system)
+    row = ParameterVector(system).row
     return torch.stack([row, 1.01 * row, row + 0.01])
 
 
@@ -130,7 +130,7 @@ def test_runs_and_tangents(
 @pytest.mark.parametrize("effects", [(), ("relative_speed",), ("inertia",)])
 def test_screens(sequences: list[Sequence], leader: str, effects: tuple[str, ...]) -> None:
     system = model(LIN, leader, effects)
-    row = row_of(system)
+    row = ParameterVector(system).row
 
     def ask(engine: TrafficEngine) -> Tensor:
         found = [
@@ -146,14 +146,14 @@ def test_screens(sequences: list[Sequence], leader: str, effects: tuple[str, ...
 
 def test_individual_effects(sequences: list[Sequence]) -> None:
     system = model(LIN, "measured", ("relative_speed",))
-    row = row_of(system)
+    row = ParameterVector(system).row
     same(*both(sequences, lambda e: e.individual(system, row, DriverHeterogeneity, {})), close=1e-8)
 
 
 def test_a_model_with_a_memory_starts_where_it_is(sequences: list[Sequence]) -> None:
     system = model(LIN, "measured", ("inertia",))
     found = TrafficEngine(sequences).near(system)
-    assert row_of(found).tolist() == row_of(system).tolist()
+    assert ParameterVector(found).row.tolist() == ParameterVector(system).row.tolist()
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_curves(sequences: list[Sequence], leader: str) -> None:
                 way = variable.direction(state)
                 return [w[..., None] * way for w in variable.weights(state).unbind(-1)]
 
-            return engine.response(system, row_of(system), rates)
+            return engine.response(system, ParameterVector(system).row, rates)
 
         same(*both(sequences, ask))
         bent = model(LIN, leader, ("relative_speed",))

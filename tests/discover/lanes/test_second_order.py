@@ -11,16 +11,15 @@ import torch
 from torch import Tensor
 
 from nnode.app.python.inputs import model_options
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.able import not_offered
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.residuals.engine import names_of, row_of
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System, build_model
 from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE
-from nnode.model.effects.following import Memory, RelativeSpeed
-from nnode.model.effects.traffic import DriverHeterogeneity, SpeedZone
+from nnode.model.effects.lane import DriverHeterogeneity, Memory, RelativeSpeed, SpeedZone
 from nnode.model.extend import extended
 from nnode.simulate import TorchdiffeqSolver
 from tests.discover.platoons import platoons
@@ -46,7 +45,7 @@ def sequences() -> list[Sequence]:
 
 def differences(engine: TrafficEngine, system: System, k: int) -> Tensor:
     """``(n,)`` central differences of the residuals by the k-th parameter."""
-    row = row_of(system)
+    row = ParameterVector(system).row
     step = 1e-4 * max(float(row[k].abs()), 0.1)
     both = row.repeat(2, 1)
     both[0, k] += step
@@ -71,7 +70,7 @@ def near(found: Tensor, expected: Tensor, share: float) -> None:
 )
 def test_runs_are_those_of_small_steps(sequences: list[Sequence], law: str, close: float) -> None:
     system, engine = model(law), TrafficEngine(sequences, np.inf)
-    found = engine.simulate(system, row_of(system)[None])[0][..., 0]
+    found = engine.simulate(system, ParameterVector(system).row[None])[0][..., 0]
     exact = TorchdiffeqSolver("rk4", dt=0.01)(system, collate(sequences_smoothed(engine))).x[..., 0]
     away = torch.where(engine.follows, found - exact, 0.0)
     assert float(away.abs().max()) < close
@@ -92,8 +91,8 @@ def sequences_smoothed(engine: TrafficEngine) -> list[Sequence]:
 @pytest.mark.parametrize("law", LAWS)
 def test_tangents_are_differences(sequences: list[Sequence], law: str) -> None:
     system, engine = model(law), TrafficEngine(sequences)
-    found = engine.tangents(system, row_of(system))
-    for k, name in enumerate(names_of(system)):
+    found = engine.tangents(system, ParameterVector(system).row)
+    for k, name in enumerate(ParameterVector(system).names):
         expected = differences(engine, system, k)
         if float(expected.norm()) > 1e-2:  # else a bound of the formula holds everywhere
             # the trapezoidal rule at the samples against Runge and Kutta's between them
@@ -105,14 +104,14 @@ def test_tangents_are_differences(sequences: list[Sequence], law: str) -> None:
 def test_tangents_with_effects_and_what_they_remember(sequences: list[Sequence]) -> None:
     effects = ({"name": "memory", "tau_m": 8.0}, {"name": "relative_speed", "kappa": 0.2})
     system, engine = model("idm", *effects), TrafficEngine(sequences)
-    found = engine.tangents(system, row_of(system))
+    found = engine.tangents(system, ParameterVector(system).row)
     for k in range(len(found)):
         near(found[k], differences(engine, system, k), 0.02)
 
 
 def test_weak_effects_are_seen_as_they_act(sequences: list[Sequence]) -> None:
     system, engine = model("idm"), TrafficEngine(sequences)
-    row = row_of(system)
+    row = ParameterVector(system).row
     now = engine.residuals(system, row[None])[0]
     for effect in (RelativeSpeed, SpeedZone):
         probe = effect.probes(engine.batch, system)[len(effect.probes(engine.batch, system)) // 2]
@@ -120,7 +119,7 @@ def test_weak_effects_are_seen_as_they_act(sequences: list[Sequence]) -> None:
         ((name, step),) = probe.steps.items()
         value = effect.strengths[name].neutral + step
         changed, _ = extended(system, effect(**{**probe.options, name: value}))
-        whole = (engine.residuals(changed, row_of(changed)[None])[0] - now) / step
+        whole = (engine.residuals(changed, ParameterVector(changed).row[None])[0] - now) / step
         # an effect of this size bends the paths that its trace is taken along
         assert torch.nn.functional.cosine_similarity(column, whole, dim=0) > 0.99
         near(column, whole, 0.1)
@@ -128,13 +127,15 @@ def test_weak_effects_are_seen_as_they_act(sequences: list[Sequence]) -> None:
 
 def test_drivers_numbers_are_seen_as_they_act(sequences: list[Sequence]) -> None:
     system, engine = model("idm"), TrafficEngine(sequences)
-    row = row_of(system)
+    row = ParameterVector(system).row
     columns = engine.individual(system, row, DriverHeterogeneity, {})
     people = {name: [0.0, 1e-4] for name in engine.names}
     changed, _ = extended(system, DriverHeterogeneity(people=people, sigma=0.1))
     now = engine.residuals(system, row[None])[0]
-    held = [k for k, name in enumerate(names_of(changed)) if not name.endswith("sigma")]
-    own = row_of(changed)
+    held = [
+        k for k, name in enumerate(ParameterVector(changed).names) if not name.endswith("sigma")
+    ]
+    own = ParameterVector(changed).row
     own[held] = row
     near(columns[1], (engine.residuals(changed, own[None])[0] - now) / 1e-4, 0.03)
 
@@ -145,8 +146,8 @@ def test_a_curve_bends_the_acceleration(sequences: list[Sequence], what: str) ->
     variable = next(one for one in engine.variables() if one.name == what)
     amounts = 0.1 * np.sin(np.linspace(0, np.pi, len(variable.knots)))
     system.terms.append(Curve(variable, amounts))
-    found = engine.tangents(system, row_of(system))
-    for k, name in enumerate(names_of(system)):
+    found = engine.tangents(system, ParameterVector(system).row)
+    for k, name in enumerate(ParameterVector(system).names):
         if "v0" not in name:  # of which these data hardly tell
             near(found[k], differences(engine, system, k), 0.05)
 
@@ -164,6 +165,6 @@ def test_what_is_offered_depends_on_the_law() -> None:
 def test_a_start_near_the_measured_accelerations() -> None:
     system = model("helly")
     engine = TrafficEngine(platoons(number=4, noise=0.01))
-    before = engine.squares(system, row_of(system)).means().mean()
+    before = engine.squares(system, ParameterVector(system).row).means().mean()
     found = engine.near(system)
-    assert engine.squares(found, row_of(found)).means().mean() < before
+    assert engine.squares(found, ParameterVector(found).row).means().mean() < before

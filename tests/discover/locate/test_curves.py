@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import columns_of, curves, weighed, with_curve
 from nnode.discover.name.search import search, settled
-from nnode.discover.residuals.engine import row_of, square_of
+from nnode.discover.residuals.engine import square_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Variable, hats, lengths_of
 from nnode.model.effects import CATALOGUE
@@ -57,7 +58,7 @@ def test_a_curve_as_a_term_does_what_its_trace_says(wavy: tuple[TrafficEngine, F
     (one,) = (curve for curve in found if curve.variable.name == "gap")
     one = replace(one, amounts=1e-3 * one.amounts, shift=0 * one.shift)
     system = with_curve(fit, one)
-    moved = engine.residuals(system, row_of(system)[None])[0].numpy() - fit.residual
+    moved = engine.residuals(system, ParameterVector(system).row[None])[0].numpy() - fit.residual
     expected = columns_of(engine, fit, one.variable) @ one.amounts
     assert np.corrcoef(moved, expected)[0, 1] > 0.999
     assert np.std(moved) == pytest.approx(np.std(expected), rel=0.05)

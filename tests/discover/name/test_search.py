@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name import search as searching
 from nnode.discover.name.search import search, settled
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.rules import rules
 from nnode.discover.statistics.score import Score, Screen, Trace
 from nnode.model import build_model
@@ -50,7 +50,7 @@ def test_what_a_curve_outdoes_leaves_nothing_behind(monkeypatch: pytest.MonkeyPa
     assert not found.steps
     assert not effects_of(found.fit.system)
     system = found.fit.system
-    now = engine.residuals(system, row_of(system)[None])[0].numpy()
+    now = engine.residuals(system, ParameterVector(system).row[None])[0].numpy()
     np.testing.assert_allclose(found.fit.residual, now, atol=1e-9)
     assert found.screen is not None
     assert found.screen.fit is found.fit

@@ -38,7 +38,7 @@ from nnode.discover.result import (
 )
 from nnode.model import build_model
 from nnode.model.build import add_effects
-from nnode.model.effects.traffic import SpeedZone
+from nnode.model.effects.lane import SpeedZone
 from nnode.model.extend import effects_of, extended
 from tests.discover.conftest import Case
 

@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from scipy import stats
 
 from nnode.discover.residuals.fit import Fit
 from nnode.model import System
 
 
-def test_intervals_are_those_of_the_jackknife() -> None:
+def test_intervals_are_those_of_clusters() -> None:
     rng = np.random.default_rng(3)
-    sequence = np.repeat(np.arange(6), 40)
-    jacobian = rng.normal(size=(240, 2))
-    jacobian[sequence == 0] *= 4  # one sequence tells most
-    truth = np.array([2.0, -1.0])
-    noise = rng.normal(size=240)
-
-    def least(kept: np.ndarray) -> np.ndarray:
-        target = jacobian[kept] @ truth + noise[kept]
-        return np.linalg.lstsq(jacobian[kept], target, rcond=None)[0]
-
-    row = least(np.ones(240, dtype=bool))
-    residual = jacobian @ (row - truth) - noise
-    fit = Fit(System([]), ["a", "b"], row, residual, jacobian, np.ones(2, dtype=bool))
-    without = np.stack([least(sequence != k) for k in range(6)])
-    spread = np.sqrt(5 / 6 * ((without - row) ** 2).sum(0))
-    half = stats.t.ppf(0.975, 5) * spread
-    np.testing.assert_allclose(
-        fit.intervals(sequence), np.stack([row - half, row + half], 1), rtol=1e-9
-    )
+    cluster = np.repeat(np.arange(6), 40)
+    jacobian, residual = rng.normal(size=(240, 2)), rng.normal(size=240)
+    jacobian[cluster == 0] *= 4  # one sequence tells most
+    residual -= jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+    free = np.array([True, False, True])
+    wide = np.insert(jacobian, 1, 0.0, axis=1)
+    fit = Fit(System([]), ["a", "b", "c"], np.array([2.0, 7.0, -1.0]), residual, wide, free)
+    half = fit.influence(cluster).half_widths()
+    low, high = fit.intervals(cluster).T
+    np.testing.assert_allclose((high - low)[free] / 2, half)
+    np.testing.assert_allclose((high + low)[free] / 2, fit.row[free])
+    assert np.isnan([low[1], high[1]]).all()
+    assert np.isnan(fit.intervals(np.repeat([0, 1], 120))).all()  # too few clusters
+    simulated = replace(fit, simulated=np.array([0.3, 0.0, 0.4]))
+    wanted = np.hypot(fit.errors(cluster), simulated.simulated)
+    np.testing.assert_allclose(simulated.errors(cluster), wanted)
 
 
 def test_what_one_sequence_alone_tells_of_has_no_interval() -> None:

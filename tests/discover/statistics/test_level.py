@@ -16,8 +16,7 @@ from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.score import Screen, Trace, traces
 from nnode.model import System
 from nnode.model.effects import Probe
-from nnode.model.effects.following import RelativeSpeed
-from nnode.model.effects.traffic import TimeGap, VehicleClass
+from nnode.model.effects.lane import RelativeSpeed, TimeGap, VehicleClass
 from tests.discover.lanes.test_engine import model
 from tests.discover.platoons import streams
 

@@ -13,7 +13,7 @@ from nnode.discover.statistics.power import RUNS, Way
 from nnode.discover.statistics.score import Score, Screen, Trace
 from nnode.model import System
 from nnode.model.effects import Probe
-from nnode.model.effects.following import RelativeSpeed
+from nnode.model.effects.lane import RelativeSpeed
 
 OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, Rules().level
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import better, clusters, index_of
 from nnode.data.sequence import Sequence
 from nnode.discover.judge.held_out import MODELS, Later, later
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import settled
-from nnode.discover.residuals.engine import row_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.random_effects import Individuals, individuals, numbers
-from nnode.model.effects.traffic import DriverHeterogeneity
+from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.extend import extended
 from tests.discover.lanes.test_engine import model
 from tests.discover.platoons import DT, platoons, relative_speed, streams
@@ -71,12 +71,12 @@ def test_numbers_act_where_they_stand_in_the_sum() -> None:
     """What a driver's own pace does comes before the reaction to the speed ahead."""
     engine = TrafficEngine(platoons(relative_speed(0.4), number=3, driver=0.1))
     plain = model({"name": "relative_speed", "kappa": 0.4})
-    found = engine.individual(plain, row_of(plain), DriverHeterogeneity, {})[0]
+    found = engine.individual(plain, ParameterVector(plain).row, DriverHeterogeneity, {})[0]
     moved = []
     for pace in (0.0, 1e-3):
         own = DriverHeterogeneity(people={name: [pace, *[0.0] * 4] for name in engine.names})
         system, _ = extended(plain, own)
-        moved.append(engine.residuals(system, row_of(system)[None])[0])
+        moved.append(engine.residuals(system, ParameterVector(system).row[None])[0])
     expected = (moved[1] - moved[0]) / 1e-3
     assert float((found - expected).norm() / expected.norm()) < 0.06
 

@@ -73,7 +73,7 @@ def system(name: str) -> Crowd:
 def state(model: Crowd, x: torch.Tensor | None = None, v: torch.Tensor | None = None) -> State:
     x = BATCH.x[0] if x is None else x
     v = BATCH.v[0] if v is None else v
-    return State(torch.tensor(0.2), x, v, Scene.of(BATCH), system=model)
+    return State(torch.tensor(0.2), x, v, Scene.of(BATCH), terms=list(model.terms))
 
 
 def effect_of(name: str) -> tuple[Effect, Crowd]:
@@ -278,7 +278,9 @@ def test_turning_and_moving_everything_turns_the_acceleration(name: str) -> None
         )
     other = collate(items)
     effect, model = effect_of(name)
-    there = State(torch.tensor(0.2), other.x[0], other.v[0], Scene.of(other), system=model)
+    there = State(
+        torch.tensor(0.2), other.x[0], other.v[0], Scene.of(other), terms=list(model.terms)
+    )
     found, here = effect(there).detach().numpy(), effect(state(model)).detach().numpy()
     real = BATCH.agent.numpy()
     np.testing.assert_allclose(found[real], turn(here[real]), rtol=1e-8, atol=1e-9)

@@ -20,7 +20,7 @@ from tests.model.following import DT, accelerations, behind, model, numbers
 
 LONG, TRUCK = 4.0, 10.0
 GAPS, SPEEDS = [20.0, 31.0, 27.0], [14.0, 11.0, 13.0, 12.0]
-SECOND = [e.name for e in CATALOGUE.of("traffic", every=True) if e.second is not None]
+SECOND = [e.name for e in CATALOGUE.of("traffic", every=True) if 2 in e.rules]
 LIN = {"term": "lin", "name": "lin", "leader": "measured", "v0": 30.0, "L": 6.0, "L_min": 1.0}
 
 

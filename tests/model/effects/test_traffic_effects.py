@@ -120,15 +120,12 @@ def test_a_delayed_driver_sees_the_gap_of_before() -> None:
     """With both paths given the delayed gap of a steady ramp is exact after the start."""
     system = model({"name": "reaction_delay", "T": 0.8})
     data = ramp(2.0)
-    scene, term = system.scene(data), system.terms[1]
-    z = term.remember(data.x[0], torch.tensor([[[10.0], [12.0]]]).double(), system).detach()
-    from nnode.model.term import State
-
+    scene, z = system.scene(data), system.initial(data).detach()[..., 1:]
     h = 0.005
     for i in range(1400):
         t = torch.tensor(i * h).double()
-        state = State(t, scene.measured_at(t), None, scene, system, None, z)
-        z = z + h * term.memory_rate(state).detach()
+        y = torch.cat([scene.measured_at(t), z], -1)
+        z = z + h * system(t, y, scene).detach()[..., 1:]
     gap = 40 + 2.0 * 7.0
     seen = gap - float(z[0, 0, 1])
     assert seen == pytest.approx(gap - 2.0 * 0.8, abs=0.02)

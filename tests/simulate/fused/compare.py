@@ -9,7 +9,7 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import System
 from nnode.simulate import Solver, Trajectory
-from nnode.simulate.rates import Rates
+from nnode.simulate.ode import Rates
 
 
 class RungeKutta:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nnode.errors import ConfigError
 from nnode.model import Crowd, Traffic, make_law
 from nnode.simulate import FusedSolver
-from nnode.simulate.kernels.lanes import runs as lanes
+from nnode.simulate.kernels import lanes
 from tests.simulate.fused.compare import difference, single
 from tests.simulate.fused.test_fallback import Sway
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +16,19 @@ from torch import Tensor
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import Crowd, InteractionForce, Traffic, make_law
+from nnode.model.formula import crowd_of
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from nnode.simulate.kernels.crowds import cells as neighbours
-from nnode.simulate.kernels.crowds import runs as crowds
+from nnode.simulate.kernels import crowds
 from tests.simulate.fused.compare import difference
 from tests.simulate.fused.test_crowd import gradient
+
+
+@cache
+def neighbours() -> Any:
+    """The functions of cell lists, of a module that holds them."""
+    law = crowd_of([make_law("social_force")])
+    assert law is not None
+    return crowds.compiled(crowds.CrowdSource(law, near=True))
 
 
 def arrangement(name: str, n: int = 300) -> np.ndarray:
@@ -53,16 +63,16 @@ def near(a: np.ndarray, b: np.ndarray, cutoff: float) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("name", PLACES)
 def test_all_pairs_once(name: str, cutoff: float) -> None:
     x = arrangement(name)
-    cells = neighbours.grid(x[:, 0], x[:, 1], cutoff)
+    cells = neighbours().grid(x[:, 0], x[:, 1], cutoff)
     assert cells[4] * cells[5] <= 4 * len(x) + 16
-    order, cell, start = neighbours.sort(x[:, 0], x[:, 1], cells)
+    order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
     assert sorted(order) == list(range(len(x)))
     y, room = x[order], np.empty((2, 1), np.int32)
-    pairs, number = neighbours.people_near(y[:, 0], y[:, 1], cells, cell, start, cutoff, room)
+    pairs, number = neighbours().people_near(y[:, 0], y[:, 1], cells, cell, start, cutoff, room)
     found = [tuple(sorted((order[i], order[j]))) for i, j in pairs[:, :number].T]
     assert len(set(found)) == len(found)
     assert set(found) == {pair for pair in near(x, x, cutoff) if pair[0] < pair[1]}
-    both, twice = neighbours.both_ways(pairs, number)
+    both, twice = neighbours().both_ways(pairs, number)
     assert twice == 2 * number
     assert {(j, i) for i, j in both[:, :twice].T} == {(i, j) for i, j in both[:, :twice].T}
 
@@ -71,10 +81,10 @@ def test_all_pairs_once(name: str, cutoff: float) -> None:
 @pytest.mark.parametrize("name", PLACES)
 def test_people_and_wall_points(name: str, points: str) -> None:
     x, wall, cutoff = arrangement(name), arrangement(points, 80) + np.array([1.0, 0.5]), 1.4
-    cells = neighbours.grid(wall[:, 0], wall[:, 1], cutoff)
-    order, _, start = neighbours.sort(wall[:, 0], wall[:, 1], cells)
+    cells = neighbours().grid(wall[:, 0], wall[:, 1], cutoff)
+    order, _, start = neighbours().sort(wall[:, 0], wall[:, 1], cells)
     there, room = wall[order], np.empty((2, 1), np.int32)
-    pairs, number = neighbours.points_near(
+    pairs, number = neighbours().points_near(
         x[:, 0], x[:, 1], there[:, 0], there[:, 1], cells, start, cutoff, room
     )
     found = [(i, int(order[p])) for i, p in pairs[:, :number].T]
@@ -87,10 +97,10 @@ def test_pairs_grow_with_people() -> None:
     shares = []
     for n in (500, 10_000):
         x = arrangement("square", n)
-        cells = neighbours.grid(x[:, 0], x[:, 1], 1.65)
-        order, cell, start = neighbours.sort(x[:, 0], x[:, 1], cells)
+        cells = neighbours().grid(x[:, 0], x[:, 1], 1.65)
+        order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
         y, room = x[order], np.empty((2, 1), np.int32)
-        _, number = neighbours.people_near(y[:, 0], y[:, 1], cells, cell, start, 1.65, room)
+        _, number = neighbours().people_near(y[:, 0], y[:, 1], cells, cell, start, 1.65, room)
         shares.append(number / n)
     assert shares[1] == pytest.approx(math.pi * 1.65**2 / 2, rel=0.05)
     assert shares[1] / shares[0] < 1.3
@@ -219,20 +229,20 @@ def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
     with torch.no_grad():
         law = crowds.supports(model, batch)
         assert law is not None
-        _, v = crowds.simulate(model, law, batch, 1)
-        _, exact = crowds.simulate(model, law, batch, 1, cutoff_error=0)
+        v = crowds.simulate(model, law, batch, 1)[..., 2:]
+        exact = crowds.simulate(model, law, batch, 1, cutoff_error=0)[..., 2:]
     away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
     assert away * n < 1e-6 * A
 
 
 def test_the_formula_of_the_bound() -> None:
     for reach, decay, error in ((0.5, 0.05, 1e-10), (0.25, 0.1, 1e-3)):
-        c = neighbours.cutoff_distance(reach, decay, error)
+        c = crowds.cutoff_distance(reach, decay, error)
         assert math.exp((reach - c) / decay) == pytest.approx(error, rel=1e-9)
         assert c > reach  # contacts are never left out
     for error in (0.0, 1.0, -1.0, math.nan):
         with pytest.raises(ConfigError, match="cutoff_error"):
-            neighbours.cutoff_distance(0.5, 0.1, error)
+            crowds.cutoff_distance(0.5, 0.1, error)
 
 
 @pytest.mark.parametrize("walls", [True, pytest.param(False, marks=pytest.mark.thorough)])
@@ -300,11 +310,11 @@ import resource
 import torch
 from tests.simulate.fused.test_neighbours import hall
 from nnode.model import Crowd, make_law
-from nnode.simulate.kernels.crowds import runs as crowds
+from nnode.simulate.kernels import crowds
 torch.set_num_threads(1)
 model = Crowd([make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0)])
 law = crowds.supports(model)
-crowds.simulate(model, law, hall(10_000, samples=26), 1)[0].square().sum().backward()
+crowds.simulate(model, law, hall(10_000, samples=26), 1)[..., :2].square().sum().backward()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 """
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import re
 from functools import cache
-from types import FunctionType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from nnode.simulate.kernels.lanes import rows
-from nnode.simulate.kernels.lanes.source import LaneSource
+from nnode.model.operations import LIBRARIES
+from nnode.simulate.kernels.lanes import LaneSource
 
 #: Rows are computed in multiples of this, so that they reach into the rows of the next vehicle.
 CHUNK = 8
@@ -23,21 +23,6 @@ CHUNK = 8
 
 def _copy(target: Any, source: Any, number: int) -> None:
     target[:number] = source[:number].copy()
-
-
-def _padded(number: int) -> int:
-    return (number + CHUNK - 1) // CHUNK * CHUNK
-
-
-def _logistic(x: float) -> float:
-    u = math.exp(-abs(x))
-    return (u if x < 0 else 1.0) / (1.0 + u)
-
-
-def _torch_softplus(x: float) -> tuple[float, float]:
-    if x > 20:
-        return x, 1.0
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x))), _logistic(x)
 
 
 def _undecorated(*_: Any, **__: Any) -> Any:
@@ -57,31 +42,24 @@ def _float(operation: Any, otherwise: float) -> Any:
     return found
 
 
-def _real(value: float, like: Any) -> float:
-    return float(value)
-
-
-#: The one function of rows that names a function which works only where it is compiled.
-_lead_places = FunctionType(rows.lead_places.py_func.__code__, {**vars(rows), "real": _real})
 #: What the generated source imports, for numbers in float64.
 _NAMES: dict[str, Any] = {
-    "njit": _undecorated, "INLINE": {}, "copy": _copy, "padded": _padded,
-    "real": _real, "lead_places": _lead_places, "add": lambda total, value: total + value,
+    **LIBRARIES["number"],
+    "njit": _undecorated, "INLINE": {}, "LOOP": {}, "copy": _copy,
+    "real": lambda value, like: float(value), "add": lambda total, value: total + value,
     "exp": _float(math.exp, math.inf), "log": _float(math.log, math.nan),
-    "sqrt": _float(math.sqrt, math.nan), "sin": math.sin, "cos": math.cos,
-    "logistic": _logistic, "torch_softplus": _torch_softplus,
-    **{name: getattr(rows, name).py_func
-       for name in ("collect", "masks", "place", "spread", "take")},
+    "sqrt": _float(math.sqrt, math.nan),
     # indices are Python's numbers, which are faster than NumPy's
     "np": SimpleNamespace(uint64=int, zeros=np.zeros, array=np.array),
 }  # fmt: skip
-#: Imports of the generated source, which may be longer than a line.
-_IMPORTS = re.compile(r"^(?:from \S+ )?import (?:\([^)]*\)|.*)$", re.MULTILINE)
+#: Imports of the generated source.
+_IMPORTS = re.compile(r"^(?:from \S+ )?import .*$", re.MULTILINE)
 
 
 @cache
 def interpreted(source: LaneSource) -> SimpleNamespace:
-    """The module of a source, in place of :func:`nnode.simulate.kernels.lanes.runs.compiled`."""
+    """The module of a source, in place of :func:`nnode.simulate.kernels.runs.compiled`."""
     names = dict(_NAMES)
     exec(_IMPORTS.sub("", source.text()), names)
-    return SimpleNamespace(forward=names["forward"], backward=names["backward"])
+    names["CHUNK"] = CHUNK
+    return SimpleNamespace(forward=names["forward"], backward=names.get("backward"))

@@ -20,7 +20,6 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS
 from nnode.simulate import TorchdiffeqSolver, Trajectory
 from nnode.simulate.kernels import lanes
-from nnode.simulate.kernels.lanes import runs
 from tests.model.following import model
 from tests.simulate.fused.compare import RungeKutta
 from tests.simulate.kernels.interpreted import interpreted
@@ -239,7 +238,7 @@ def with_effects() -> list[Any]:
     found = []
     for law, order in (("lin", 1), ("idm", 2)):
         for effect in CATALOGUE.of("traffic", every=True):
-            if (effect.rule if order == 1 else effect.second) is None:
+            if order not in effect.rules:
                 continue
             for method in METHODS:
                 if method == "rk4" and _is_map(law, effect.name):
@@ -252,7 +251,7 @@ def with_effects() -> list[Any]:
 
 @pytest.fixture
 def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs, "compiled", interpreted)
+    monkeypatch.setattr(lanes, "compiled", interpreted)
 
 
 @pytest.mark.usefixtures("without_compiler")

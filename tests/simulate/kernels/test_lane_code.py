@@ -16,13 +16,13 @@ import pytest
 import torch
 
 from nnode.errors import ConfigError
-from nnode.model import Traffic, make_law
-from nnode.model.effects.following import RelativeSpeed
+from nnode.model import Crowd, Traffic, make_law
+from nnode.model.effects.lane import RelativeSpeed
 from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from nnode.simulate.kernels import functions, source
+from nnode.simulate.kernels import functions, lanes, source
 from nnode.simulate.kernels.cache import digest
-from nnode.simulate.kernels.lanes import runs as lanes
-from nnode.simulate.kernels.lanes.source import LaneSource
+from nnode.simulate.kernels.lanes import LaneSource
+from nnode.simulate.kernels.runs import COMPILED_IN
 from tests.simulate.fused.compare import difference, gradient, single
 from tests.simulate.kernels import saturation
 
@@ -121,24 +121,24 @@ def test_a_law_from_elsewhere(ragged) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_an_edit_of_what_is_compiled_in_changes_the_name(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    before = digest(b"text", lanes._COMPILED_IN)
-    assert digest(b"other", lanes._COMPILED_IN) != before
-    for module in lanes._COMPILED_IN:
+    before = digest(b"text", COMPILED_IN)
+    assert digest(b"other", COMPILED_IN) != before
+    for module in COMPILED_IN:
         assert module.__file__ is not None
         file = tmp_path / Path(module.__file__).name
         file.write_bytes(Path(module.__file__).read_bytes() + b"\n# edited\n")
         with monkeypatch.context() as patch:
             patch.setattr(module, "__file__", str(file))
-            assert digest(b"text", lanes._COMPILED_IN) != before
+            assert digest(b"text", COMPILED_IN) != before
 
 
-def test_everything_that_is_compiled_into_a_lane_counts() -> None:
-    # whatever a compiled file imports from the package must be part of the digest
-    counted = {module.__name__ for module in lanes._COMPILED_IN}
-    lane = Traffic([make_law("lin")]).lane
-    assert lane is not None
-    texts = [Path(str(module.__file__)).read_text("utf-8") for module in lanes._COMPILED_IN]
-    for text in [*texts, LaneSource(lane).text()]:
+def test_everything_that_is_compiled_in_counts() -> None:
+    # whatever compiled text imports from the package must be part of the digest
+    counted = {module.__name__ for module in COMPILED_IN}
+    texts = [Path(str(module.__file__)).read_text("utf-8") for module in COMPILED_IN]
+    crowd = Crowd([make_law("relaxation"), make_law("social_force")])
+    texts += [source(model) for model in (Traffic([make_law("lin")]), crowd)]
+    for text in texts:
         for line in text.splitlines():
             if line.startswith("from nnode."):
                 assert line.split()[1] in counted, line
@@ -170,8 +170,8 @@ batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
 model = Traffic([make_law("network_speed")])
 from nnode.simulate import FusedSolver
 FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulate.kernels.lanes import runs as lanes
-from nnode.simulate.kernels.lanes.source import LaneSource
+from nnode.simulate.kernels import lanes
+from nnode.simulate.kernels.lanes import LaneSource
 module = lanes.compiled(LaneSource(model.lane))
 hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
 print(json.dumps({"hits": hits}))

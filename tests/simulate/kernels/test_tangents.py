@@ -12,7 +12,7 @@ from torch import Tensor
 from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, build_model
 from nnode.model.arrays import computed
-from nnode.model.effects.following import ReactionDelay
+from nnode.model.effects.lane import ReactionDelay
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.steps import METHODS
 from nnode.model.tangent import with_tangents

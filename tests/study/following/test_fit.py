@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.gauss_newton.method import TangentCost
+from nnode.calibrate.problem import ResidualProblem
 from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
@@ -110,7 +110,9 @@ def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_profile_is_least_at_the_best_value(known: list[Sequence]) -> None:
-    cost = TangentCost(EVERY["helly"].system(), collate(known), FusedSolver(), Convention.spacing)
+    cost = ResidualProblem(
+        EVERY["helly"].system(), collate(known), FusedSolver(), Convention.spacing
+    )
     best = np.array([HELLY[n] for n in fit.named(cost, cost.start)])
     before = cost.low.copy()
     found = inference.profile(cost, best, 2, np.arange(6))
@@ -123,9 +125,9 @@ def test_a_profile_is_least_at_the_best_value(known: list[Sequence]) -> None:
 
 def test_networks_are_penalised_and_laws_are_not() -> None:
     batch = collate(driven(2))
-    law = TangentCost(EVERY["helly"].system(), batch, FusedSolver())
+    law = ResidualProblem(EVERY["helly"].system(), batch, FusedSolver())
     assert decay(law) is None
-    beside = TangentCost(EVERY["idm + network 4"].system(), batch, FusedSolver())
+    beside = ResidualProblem(EVERY["idm + network 4"].system(), batch, FusedSolver())
     penalty = decay(beside)
     assert penalty is not None
     assert (penalty[1] == 0).sum() == 5

@@ -36,7 +36,7 @@ def invented() -> dict[str, dict[str, Any]]:
     for name, (held, test) in ERRORS.items():
         system = EVERY[name].system()
         row = [float(p.detach()) for p in system.parameters()]
-        cost = cast(Any, SimpleNamespace(names=[f"x__{n.split('.')[-1]}" for n, _ in
+        cost = cast(Any, SimpleNamespace(names=[f"x.{n.split('.')[-1]}" for n, _ in
                                                 system.named_parameters()]))  # fmt: skip
         values = named(cost, np.array(row))
         noise = 0.1 * np.arange(6)
@@ -54,7 +54,7 @@ def invented() -> dict[str, dict[str, Any]]:
         factors = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
         rise = np.log(factors) ** 2
         found[f"precision-{key(name)}"] = {
-            "names": list(values), "row": row, "error": [0.1] * len(row),
+            "names": list(values), "row": row, "half": [0.2] * len(row),
             "correlation": np.eye(len(row)).tolist(),
             "profiles": {
                 n: {"values": (factors * v).tolist(), "rise": rise.tolist(),

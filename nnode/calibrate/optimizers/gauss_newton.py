@@ -11,8 +11,8 @@ import numpy as np
 from torch.optim import Optimizer
 
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.least_squares import damped_step
 from nnode.calibrate.options import StartSpeeds
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.model.system import System
@@ -47,7 +47,7 @@ class GaussNewton(Optimizer):
         first = {"damping": damping, "converged": False, "starts": {}, "begun": False}
         super().__init__(trained, first)
         self.system, self.tolerance = system, tolerance
-        self._cost: Any = None
+        self._problem: Any = None
         self._batch: Batch | None = None
 
     @property
@@ -70,12 +70,17 @@ class GaussNewton(Optimizer):
             return
         self._batch = batch
         # compiled code takes a second to import
-        from nnode.calibrate.gauss_newton.start_speeds import cost_of
+        from nnode.calibrate.problem import ResidualProblem
         from nnode.simulate.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
-        self._cost = cost_of(starts, self.system, self.started(batch), solver, convention)
+        self._problem = ResidualProblem(self.system, batch, solver, convention, starts)
+        if self._problem.lane is None and not self._problem.physical.all():
+            raise ConfigError(
+                "optimizer=gauss_newton needs a model of people whose terms are formulas without "
+                "networks, as model=sf; take another optimizer"
+            )
 
     def started(self, batch: Batch) -> Batch:
         """A batch with the first speeds that were fitted to its sequences, if any were."""
@@ -94,22 +99,20 @@ class GaussNewton(Optimizer):
         Raises:
             SimulationError: the model cannot be simulated with its present parameters.
         """
-        cost, group = self._cost, self.param_groups[0]
-        row = np.clip(cost.row(self.system), cost.low, cost.high)
+        from nnode.calibrate.problem import pooled
+
+        problem, group = self._problem, self.param_groups[0]
+        vector = ParameterVector(self.system, problem.vector.places)
+        row = np.clip(vector.row.numpy(), problem.low, problem.high)
         if not group.get("begun", True):  # states of earlier versions have begun
-            row, group["begun"] = cost.begin(row), True
-        curved = cost(row)
-        now = float(curved.cost.mean())
+            row, group["begun"] = problem.begin(row), True
+        found = pooled(problem, row, steps=1, damping=group["damping"])
+        now, value = float(found.before[0]), float(found.cost)
         if not math.isfinite(now):
-            cost.complain(curved.cost)
-        gradient, hessian = curved.gradient.mean(0), curved.hessian.mean(0)
-        end, value, damping = damped_step(
-            lambda trial: float(cost.costs(trial).mean()),
-            now, row, gradient, hessian, group["damping"], cost.low, cost.high,
-        )  # fmt: skip
-        cost.fill_(self.system, end)
+            problem.complain(problem.costs(row))
+        vector.fill_(found.row)
         if value < now:
-            group["damping"] = damping
-        group["starts"] = cost.starts(end)
+            group["damping"] = float(found.damping[0])
+        group["starts"] = problem.start_speeds(found.row)
         group["converged"] = not now - value > self.tolerance * now
         return now

@@ -12,13 +12,13 @@ A person is a number p; his surroundings are tables:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
 
 from nnode.model.crowd_dynamics import OTHERS, POINTS, SEEN, WALLS, CrowdDynamics
-from nnode.model.expression import Expr, symbols, topological
+from nnode.model.expression import Expr, symbols
 from nnode.model.names import check_symbols
 from nnode.model.text import plain
 from nnode.simulate.kernels import functions
@@ -36,7 +36,7 @@ import numpy as np
 from numba import njit
 
 from nnode.simulate.kernels.functions import (
-    exp, log, logistic, real, recip, softplus, softplus_slope, tanh, torch_softplus, where,
+    exp, log, logistic, real, recip, softplus, softplus_slope, tanh, where,
 )
 
 # sums may be reordered: they are over a handful of neighbours
@@ -131,16 +131,12 @@ class WalkSource:
     def _function(self, name: str, takes: Sequence[str], outputs: Sequence[Expr]) -> str:
         """Formulas of numbers."""
         loop = Loop(self.parameters)
-        names: Mapping[Expr, str] = loop.names(outputs)
-        lines, _ = loop.lines(
-            topological(outputs), dict.fromkeys(topological(outputs), False), names
-        )
+        names = loop.names(outputs)
         used = symbols(outputs)
         text = f"\n\n@njit(**OPTIONS)\ndef {name}({', '.join(takes)}, have, q):\n"
-        text += "    dt = zero = 0.0\n" + loop.given(outputs)
-        for i, field in enumerate(FIELDS):
-            text += f"    {field} = have[{i}]\n" if field in used else ""
-        text += "".join(f"    {line}\n" for line in lines)
+        lines = ["dt = zero = 0.0", *loop.given(outputs)]
+        lines += [f"{field} = have[{i}]" for i, field in enumerate(FIELDS) if field in used]
+        text += "".join(f"    {line}\n" for line in [*lines, *loop.lines(names).values()])
         return text + f"    return {_tuple([names[node] for node in outputs])}\n"
 
 

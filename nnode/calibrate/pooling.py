@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.calibrate.gauss_newton.intervals import at_bounds
-from nnode.calibrate.gauss_newton.method import TangentCost, alone, pooled
+from nnode.calibrate.intervals import at_bounds
 from nnode.calibrate.options import Pooling
+from nnode.calibrate.problem import ResidualProblem, alone, pooled
 from nnode.data.clusters import clusters, folds, index_of
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
@@ -39,7 +39,7 @@ FOLDS = 5
 LEAST = 5
 
 
-def scattered(cost: TangentCost, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
+def scattered(cost: ResidualProblem, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
     """``(R, P)`` starts: the first row, then rows times random factors where there are limits."""
     rng = np.random.default_rng(seed)
     limited = np.isfinite(cost.low) & np.isfinite(cost.high)
@@ -53,12 +53,12 @@ def scattered(cost: TangentCost, rows: Iterable[np.ndarray], seed: int) -> np.nd
 
 
 def best_alone(
-    cost: TangentCost, starts: Iterable[np.ndarray], **options: Any
+    cost: ResidualProblem, starts: Iterable[np.ndarray], **options: Any
 ) -> tuple[np.ndarray, np.ndarray]:
     """Every sequence by itself, the best of several starts.
 
     Args:
-        options: of :func:`nnode.calibrate.gauss_newton.method.alone`.
+        options: of :func:`nnode.calibrate.problem.alone`.
 
     Returns:
         ``(B, P)`` parameters, ``(B,)`` costs with what a pool adds to them.
@@ -95,7 +95,7 @@ class Halves:
 
 
 def halves(
-    first: TangentCost, second: TangentCost, row: np.ndarray, others: Iterable[np.ndarray],
+    first: ResidualProblem, second: ResidualProblem, row: np.ndarray, others: Iterable[np.ndarray],
     fold: np.ndarray, strengths: ListLike[float] = STRENGTHS,
 ) -> Halves:  # fmt: skip
     """Pooled, alone and in between: calibrated on first halves, judged on second ones.
@@ -113,7 +113,7 @@ def halves(
     spread = np.sqrt(_lasting(*own))
     scale = np.maximum(spread, LEAST_SPREAD * np.where(centre == 0, 1.0, np.abs(centre)))
     tried = [
-        alone(first, centre, pool=(centre, s / scale**2)).row if s else own[0] for s in strengths
+        alone(first, centre, penalty=(centre, s / scale**2)).row if s else own[0] for s in strengths
     ]
     costs = np.stack([second.costs(one) for one in tried])
     shrunk, chosen = np.zeros(len(fold)), []
@@ -163,7 +163,7 @@ class Own:
 
 def own_parameters(
     kind: Pooling, system: System, sequences: list[Sequence],
-    cost: Callable[[System, Batch], TangentCost], seed: int,
+    cost: Callable[[System, Batch], ResidualProblem], seed: int,
 ) -> Own:  # fmt: skip
     """Parameters of every sequence's own, of a model with the pool's.
 
@@ -197,10 +197,10 @@ def own_parameters(
     found = halves(first, second, row, starts[1:], fold, strengths)
     strength = strengths[int(np.argmin(found.by_strength))]
     pool = (row, strength / found.scale**2) if strength else None
-    rows, _ = best_alone(whole, starts if pool is None else starts[:1], pool=pool)
+    rows, _ = best_alone(whole, starts if pool is None else starts[:1], penalty=pool)
     costs = whole.costs(rows)
-    known = short_names([name.replace("__", ".") for name in whole.names])
-    names = [known[name.replace("__", ".")] for name in whole.names]
+    known = short_names(whole.names)
+    names = [known[name] for name in whole.names]
     table = pd.DataFrame(
         {
             "sequence": [s.name for s in sequences],

@@ -10,7 +10,7 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
-from nnode.calibrate.quasi_newton import minimise, optimality_residual
+from nnode.calibrate.bfgs import minimise, optimality_residual
 
 FREE = torch.full((2,), math.inf, dtype=torch.float64)
 

@@ -1,1 +1,0 @@
-"""Gauss and Newton's method on exact tangents: pooled, alone or shrunk, with intervals."""

@@ -1,1 +1,0 @@
-"""People in the plane, in compiled code."""
