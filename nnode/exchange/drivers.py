@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -14,9 +14,10 @@ from nnode.model import System, Traffic
 from nnode.model.arrays import numpy_function
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.lane import VehicleClass
-from nnode.model.expression import Expr, symbol, symbols, topological
+from nnode.model.expression import symbol, symbols, topological
 from nnode.model.formula import own_values, values_of
 from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.lane_rates import Rates
 from nnode.model.steps import stepped
 from nnode.model.term import Term
 
@@ -93,7 +94,7 @@ class Drivers:
         self._states = {state: np.empty(0) for state in self._added}
         self._inputs = {name: np.empty(0) for name in lane.inputs}
         self._begun, self._fresh = np.empty(0), np.empty(0, bool)
-        self._rates = _Rates(self.lane)
+        self._rates = self._formulas()
         if far is None:
             self._check_empty(lane)
 
@@ -103,7 +104,9 @@ class Drivers:
     @property
     def names_places(self) -> bool:
         """Whether places matter, not only distances."""
-        return self._rates.places
+        outputs = [*self._rates.after.outputs, *self.lane.starts.values()]
+        named = {part.value for part in topological(outputs, set(_GAPS))}
+        return not {"x", "x_1", "x_2"}.isdisjoint(named)
 
     @property
     def looks_twice(self) -> bool:
@@ -160,10 +163,32 @@ class Drivers:
         given = self._given(time, seen)
         if self._fresh.any():
             self._begin(time, seen, given)
-        top, *others = self._rates(given, len(self))
+        top, *others = self._said(given)
         for state, rate in zip(self._added, others, strict=True):
             self._states[state] = self._states[state] + self.dt * rate
         found: np.ndarray = top if self.lane.order == 1 else given["v"] + self.dt * top
+        return found
+
+    def _formulas(self) -> Rates:
+        """That of the law, then those of added states."""
+        return Rates([self.lane.rates[s] for s in (self.lane.top, *self._added)], _GAPS)
+
+    def _said(self, given: dict[str, Any]) -> list[np.ndarray]:
+        """``(n,)`` each: the rates; who depends on that of the vehicle ahead comes after it."""
+        n, lead = len(self), given["lead"]
+        ready = [np.broadcast_to(part, n) for part in self._rates.at_once(given, given["gaps"])]
+        if not self._rates.chained:
+            return ready
+        found: list[np.ndarray] = []
+        ahead = np.array(given["dx_1"])
+        for who in one_behind_the_other(lead):
+            led = who[lead[who] >= 0]
+            if found:
+                ahead[led] = np.maximum(found[0][lead[led]], 0.0)
+            rates = self._rates.after({"dx_1": ahead[who]}, [part[who] for part in ready])
+            found = found or [np.empty(n) for _ in rates]
+            for every, rate in zip(found, rates, strict=True):
+                every[who] = rate
         return found
 
     def _given(self, time: float, seen: Seen) -> dict[str, Any]:
@@ -209,7 +234,8 @@ class Drivers:
         said = []
         for far in EMPTY:
             trial = copy.copy(self)
-            trial._far, trial.lane, trial._rates = far, lane, _Rates(lane)
+            trial._far, trial.lane = far, lane
+            trial._rates = trial._formulas()
             trial._states, trial._inputs = dict(self._states), dict(self._inputs)
             trial._rng = np.random.default_rng(0)
             trial.enter([()] * len(v))
@@ -227,50 +253,6 @@ class Drivers:
                 "at which a vehicle ahead counts as none, and none as a vehicle there with one's "
                 "own speed"
             )
-
-
-class _Rates:
-    """The rate of the law, then those of added states, of many vehicles.
-
-    A vehicle whose rate depends on that of the vehicle ahead (``dx_1``, of laws of first order) is
-    computed after that one.
-    """
-
-    def __init__(self, lane: LaneDynamics) -> None:
-        outputs = tuple(lane.rates[s] for s in (lane.top, *list(lane.rates)[lane.order :]))
-        parts = topological([*outputs, *lane.starts.values()], set(_GAPS))
-        named = {part.value for part in parts if part.op == "symbol"}
-        self.places = not named.isdisjoint(("x", "x_1", "x_2"))
-        self._all = numpy_function(outputs, _GAPS)
-        chain: set[Expr] = set()
-        for part in parts:
-            if part.value == "dx_1" or any(a in chain for a in part.args):
-                chain.add(part)
-        self._chained = bool(lane.chained) and any(node in chain for node in outputs)
-        if self._chained:
-            inside = [part for part in parts if part in chain]
-            ready = {a for part in inside for a in part.args if a not in chain}
-            ready |= {node for node in outputs if node not in chain}
-            known = tuple(a for a in (*_GAPS, *parts) if a in ready and a.op != "const")
-            self._before = numpy_function(known, _GAPS)
-            self._after = numpy_function(outputs, known)
-
-    def __call__(self, given: Mapping[str, Any], n: int) -> list[np.ndarray]:
-        if not self._chained:
-            return [np.broadcast_to(r, n) for r in self._all(given, given["gaps"])]
-        known = [np.broadcast_to(k, n) for k in self._before(given, given["gaps"])]
-        found: list[np.ndarray] = []
-        ahead = np.array(given["dx_1"])
-        lead = given["lead"]
-        for who in one_behind_the_other(lead):
-            led = who[lead[who] >= 0]
-            if found:
-                ahead[led] = np.maximum(found[0][lead[led]], 0.0)
-            rates = self._after({**given, "dx_1": ahead[who]}, tuple(k[who] for k in known))
-            found = found or [np.empty(n) for _ in rates]
-            for every, rate in zip(found, rates, strict=True):
-                every[who] = rate
-        return found
 
 
 def one_behind_the_other(lead: np.ndarray) -> list[np.ndarray]:

@@ -45,8 +45,8 @@ def _straight_line(
         else:
             lines.append(f"{label[node]} = {OPERATIONS[node.op].code.format(*args)}")
     given = [f"{', '.join(numbers)}, = c"] if numbers else []
-    found = ", ".join(label[node] for node in outputs)
-    body = "".join(f"    {line}\n" for line in [*given, *lines, f"return [{found}]"])
+    results = ", ".join(label[node] for node in outputs)
+    body = "".join(f"    {line}\n" for line in [*given, *lines, f"return [{results}]"])
     names = dict(LIBRARIES[library])
     exec(f"def run(c, g, k, code=None):\n{body}", names)
     return names["run"], list(numbers.values())

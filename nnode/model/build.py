@@ -14,36 +14,31 @@ from nnode.errors import ConfigError
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
 from nnode.model.effects.own import VARIABLE, load_own
-from nnode.model.laws import Law, entries, law_from, make_law, takes_options
+from nnode.model.laws import Law, entries, law_from, make_law
 from nnode.model.system import Crowd, System, Traffic
 
 Options = Mapping[str, Any]
 
 
-def _formula(options: Options, generator: torch.Generator) -> list[Law]:
-    return [
-        law_from(
-            str(options["name"]),
-            options["law"],
-            network=options.get("network"),
-            box=options.get("box"),
-            generator=generator,
+def _laws(options: Options, generator: torch.Generator) -> list[Law]:
+    """A user's own law, or those of the package's entries with their options."""
+    if options["term"] == "formula":
+        network, box = options.get("network"), options.get("box")
+        own = law_from(
+            str(options["name"]), options["law"], network=network, box=box, generator=generator
         )
-    ]
-
-
-def _of_entries(options: Options, generator: torch.Generator) -> list[Law]:
-    """The terms of a model of the package's entries, each with its options."""
+        return [own]
     v0 = options.get("v0", 1.0)
     if not (math.isfinite(v0) and v0 > 0):
         raise ConfigError(f"model.v0={v0} must be a positive speed in m/s")
     # checkpoints from before there was an option do not name it
-    given = {**options, "preferred": _desired(options) != "last", "generator": generator}
-    every, found = entries(), []
-    for name in every[str(options["term"])]["model"]:
-        takes = takes_options(every[name])
-        found.append(make_law(name, **{key: given[key] for key in takes if key in given}))
-    return found
+    given, every = {**options, "preferred": _desired(options) != "last"}, entries()
+    return [
+        make_law(
+            name, generator=generator, **{k: given[k] for k in every[name]["options"] if k in given}
+        )
+        for name in every[str(options["term"])]["model"]
+    ]
 
 
 def _lane(found: Law, options: Options) -> Traffic:
@@ -79,7 +74,7 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}{hint}")
     try:
-        laws = (_formula if term == "formula" else _of_entries)(options, generator)
+        laws = _laws(options, generator)
         model: System
         if laws[0].domain == "crowd":
             model = Crowd(laws, options.get("wall_spacing", 0.25), desired=_desired(options))

@@ -38,26 +38,26 @@ def vjp(seeds: Mapping[Expr, Expr], ends: Callable[[Expr], bool]) -> dict[Expr, 
         seeds: weights of the outputs.
         ends: nodes that are not followed further.
     """
-    bar, found = dict(seeds), {}
+    bar, adjoints = dict(seeds), {}
     for node in reversed(topological(seeds)):
         if node not in bar or node.op == "const":
             continue
         if node.op == "symbol" or ends(node):
-            found[node] = bar[node]
+            adjoints[node] = bar[node]
             continue
         for part, slope in zip(node.args, slopes(node), strict=True):
             if part.op == "const" or slope.is_number(0):
                 continue
             share = _weighted(bar[node], slope)
             bar[part] = bar[part] + share if part in bar else share
-    return found
+    return adjoints
 
 
 def derivatives(node: Expr, names: list[str]) -> dict[str, Expr]:
     """Of one formula by symbols; those that it does not contain are left out."""
-    found = vjp({node: _ONE}, lambda part: False)
-    known = {part.value: bar for part, bar in found.items() if not bar.is_number(0)}
-    return {name: known[name] for name in names if name in known}
+    adjoints = vjp({node: _ONE}, lambda part: False)
+    gradient = {part.value: bar for part, bar in adjoints.items() if not bar.is_number(0)}
+    return {name: gradient[name] for name in names if name in gradient}
 
 
 def shift_slopes(outputs: Sequence[Expr], moved: Collection[str]) -> list[Expr]:
@@ -65,17 +65,17 @@ def shift_slopes(outputs: Sequence[Expr], moved: Collection[str]) -> list[Expr]:
 
     What depends on differences of these symbols alone has the number 0.
     """
-    found: dict[Expr, Expr] = {}
+    shifted: dict[Expr, Expr] = {}
     for node in topological(outputs):
         if node.op == "symbol":
-            found[node] = _ONE if node.value in moved else _ZERO
-        elif all(found[part].is_number(0) for part in node.args):
-            found[node] = _ZERO
+            shifted[node] = _ONE if node.value in moved else _ZERO
+        elif all(shifted[part].is_number(0) for part in node.args):
+            shifted[node] = _ZERO
         elif node.op == "call":  # code, whose slope is not known
-            found[node] = node
+            shifted[node] = node
         else:
             total = _ZERO
             for part, slope in zip(node.args, slopes(node), strict=True):
-                total = total + _weighted(found[part], slope)
-            found[node] = total
-    return [found[node] for node in outputs]
+                total = total + _weighted(shifted[part], slope)
+            shifted[node] = total
+    return [shifted[node] for node in outputs]

@@ -109,9 +109,9 @@ _NODES: WeakValueDictionary[bytes, Expr] = WeakValueDictionary()
 def _made(op: str, args: tuple[Expr, ...], value: Any = None) -> Expr:
     text = f"{op}|{value!r}|".encode() + b"".join(a.key for a in args)
     key = hashlib.blake2b(text, digest_size=16).digest()
-    known = _NODES.get(key)
-    if known is not None:
-        return known
+    existing = _NODES.get(key)
+    if existing is not None:
+        return existing
     node = object.__new__(Expr)
     node.op, node.args, node.value, node.key = op, args, value, key
     _NODES[key] = node
@@ -213,18 +213,18 @@ def topological(outputs: Iterable[Expr], known: Container[Expr] = ()) -> list[Ex
     Args:
         known: nodes that are left out, with what only they are made of.
     """
-    found: dict[Expr, None] = {}
+    ordered: dict[Expr, None] = {}
     stack = [(node, False) for node in reversed(list(outputs))]
     while stack:
         node, done = stack.pop()
-        if node in found or node in known:
+        if node in ordered or node in known:
             continue
         if done:
-            found[node] = None
+            ordered[node] = None
         else:
             stack.append((node, True))
-            stack += [(a, False) for a in reversed(node.args) if a not in found]
-    return list(found)
+            stack += [(a, False) for a in reversed(node.args) if a not in ordered]
+    return list(ordered)
 
 
 def symbols(outputs: Iterable[Expr]) -> list[str]:

@@ -14,11 +14,11 @@ from torch import Tensor
 from nnode.errors import ConfigError
 from nnode.model.crowd_formula import rates_of as crowd_rates
 from nnode.model.expression import const, symbol
+from nnode.model.lane_rates import LaneRates
 from nnode.model.laws import Law, parameters_of
 from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
-from nnode.model.tensors import LaneRates
 from nnode.model.term import State, Term
 from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, own_values, values_of
 
@@ -103,26 +103,47 @@ def owners(terms: Sequence[Term]) -> list[str]:
     return found
 
 
+def symbols_of(
+    terms: Sequence[Term],
+    lane: LaneDynamics,
+    scene: Scene,
+    parameters: Mapping[str, Tensor] | None = None,
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Values of a lane's symbols that do not change: those that are the same for all vehicles,
+    and ``(N, B)`` of what vehicles have from the data.
+
+    Args:
+        parameters: by their symbols; None: the terms' own.
+    """
+    values = dict(parameters or {})
+    if parameters is None:
+        values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
+    values |= {"start": scene.start, "dt": scene.start.new_tensor(scene.step)}
+    return values, {name: value.T for name, value in inputs_of(terms, lane, scene).items()}
+
+
 def rates_of(
     terms: Sequence[Term], lane: LaneDynamics, y: Tensor, t: Tensor, scene: Scene, measured: bool,
-    more: Mapping[str, Tensor] | None = None,
+    more: Mapping[str, Tensor] | None = None, parameters: Mapping[str, Tensor] | None = None,
 ) -> Tensor:  # fmt: skip
     """``(B, N, M)`` rates of a lane's states, by PyTorch.
 
     Args:
         measured: whether leaders drive as they were measured.
-        more: further symbols' values.
+        more: further symbols' values ``(B, N)``.
+        parameters: see :func:`symbols_of`.
     """
-    values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
-    values |= inputs_of(terms, lane, scene) | dict(more or {})
-    values["t"], values["start"] = t, scene.start[:, None].expand(y.shape[:2])
-    values["dt"] = y.new_tensor(scene.step)
+    values, inputs = symbols_of(terms, lane, scene, parameters)
+    inputs |= {name: value.T for name, value in (more or {}).items()}
+    code = terms[0].code() if isinstance(terms[0], Law) else None
+    law, masks = stepped(lane, scene.method), (scene.follower.T, scene.leader.T)
+    rates, states = LaneRates(law, values, inputs, *masks, code), y.movedim((-1, 1), (0, 1))
     lead = None
     if measured or "measured" in lane.symbols:
-        values["measured"] = scene.measured_rate_at(t)[..., 0]
-        lead = values["measured"] if measured else None
-    code = terms[0].code() if isinstance(terms[0], Law) else None
-    return _rates(stepped(lane, scene.method))(y, values, scene.follower, scene.leader, lead, code)
+        lead = scene.measured_rate_at(t)[..., 0].T
+    symbols = rates.symbols(t, states, lead)
+    found: Tensor = rates(states, symbols, lead if measured else None)
+    return found.movedim((0, 1), (-1, 1))
 
 
 def effect_alone(law: Term, term: Term) -> LaneDynamics:
@@ -201,26 +222,14 @@ def starts_of(
     """
     if not lane.starts:
         return {}
-    rates = _starts(lane)
     y = torch.cat([x, v, x.new_zeros(*x.shape[:2], len(lane.starts))], -1)
-    values = dict(parameters or {})
-    if parameters is None:
-        values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
-    values |= inputs_of(terms, rates.lane, scene)
-    values["t"], values["start"] = y.new_tensor(0.0), scene.start[:, None].expand(y.shape[:2])
-    values["dt"] = y.new_tensor(scene.step)
-    code = terms[0].code() if isinstance(terms[0], Law) else None
-    found = rates(y, values, scene.follower, scene.leader, None, code)
+    zero = y.new_tensor(0.0)
+    found = rates_of(terms, _starts(lane), y, zero, scene, False, parameters=parameters)
     return {name: found[..., i] for i, name in enumerate(lane.starts, start=2)}
 
 
 @cache
-def _starts(lane: LaneDynamics) -> LaneRates:
-    """Starts in the place of rates; positions and speeds are measured."""
+def _starts(lane: LaneDynamics) -> LaneDynamics:
+    """Starts in the place of rates, also those of leaders; positions and speeds are measured."""
     rates = {"x": const(0), "v": const(0), **lane.starts}
-    return LaneRates(replace(lane, rates=rates, leader=const(0), leads={}, chained={}))
-
-
-@cache
-def _rates(lane: LaneDynamics) -> LaneRates:
-    return LaneRates(lane)
+    return replace(lane, rates=rates, leader=const(0), leads={}, chained={})

@@ -75,9 +75,9 @@ def parse(
         at = max(int(getattr(error, "offset", 1) or 1) - 1, 0)
         raise FormulaError(text.strip(), at, f"this cannot be read; {_LISTED}") from error
     reader = _Reader(text.strip(), names, laws or {})
-    found = reader.read(tree.body, 0)
-    reader.count(tree.body, found)
-    return found
+    formula = reader.read(tree.body, 0)
+    reader.count(tree.body, formula)
+    return formula
 
 
 class _Reader:
@@ -124,8 +124,8 @@ class _Reader:
                 if self.names is None:
                     return symbol(name)
                 if name not in self.names:
-                    known = ", ".join(sorted(self.names))
-                    raise self.fail(node, f"{name} is unknown; there are {known}")
+                    listed = ", ".join(sorted(self.names))
+                    raise self.fail(node, f"{name} is unknown; there are {listed}")
                 return self.names[name]
             case ast.Call(func=ast.Name(id=name)):
                 return self.call(node, name, depth)

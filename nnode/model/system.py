@@ -16,7 +16,7 @@ from nnode.model.formula import crowd_of, effect_alone, lane_of, rates_of, start
 from nnode.model.laws import Law
 from nnode.model.scene import DESIRED, Scene, wanted
 from nnode.model.term import Interval, State, Term, physical_parameters, short_names
-from nnode.model.terms import CrowdDynamics, LaneDynamics
+from nnode.model.terms import CrowdDynamics, Dynamics, LaneDynamics
 
 T = TypeVar("T", bound=Term)
 
@@ -54,10 +54,15 @@ class System(nn.Module):
         return "euler"
 
     @property
+    def formula(self) -> Dynamics | None:
+        """The model's formula; None where a term is code without one."""
+        return None
+
+    @property
     def names_places(self) -> bool:
         """Whether rates depend on where the origin of positions lies, as with a speed zone; also
         where this is not known, since a term is code."""
-        return True
+        return self.formula is None or self.formula.names_places
 
     def scene(self, batch: Batch) -> Scene:
         """The fixed surroundings of a batch.
@@ -195,9 +200,8 @@ class Traffic(System):
         return lane_of(self._terms())
 
     @property
-    def names_places(self) -> bool:
-        lane = self.lane
-        return lane is None or lane.names_places
+    def formula(self) -> LaneDynamics | None:
+        return self.lane
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
         if not self.memory:
@@ -253,7 +257,7 @@ class Traffic(System):
         return torch.where(state.scene.leader[..., None], speed, rate)
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
-        x, v = y[..., :1], y[..., 1:2] if self.order > 1 else None
+        x, v = super().observe(y, batch)
         given = self.given(batch)
         if given is None:
             return x, v
@@ -300,13 +304,7 @@ class Crowd(System):
 
     @property
     def formula(self) -> CrowdDynamics | None:
-        """The model's formula; None where a term is code without one."""
         return crowd_of(self._terms())
-
-    @property
-    def names_places(self) -> bool:
-        law = self.formula
-        return law is None or law.names_places
 
     def scene(self, batch: Batch) -> Scene:
         return wanted(super().scene(batch), batch, self.desired)

@@ -273,6 +273,11 @@ class Dynamics:
         """Whether there is no code in it that is no formula."""
         return all(node.op != "call" for node in topological(self.outputs))
 
+    @property
+    def names_places(self) -> bool:
+        """Whether it depends on positions other than by differences of them."""
+        raise NotImplementedError  # pragma: no cover - of a lane or of a crowd
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LaneDynamics(Dynamics):

@@ -58,7 +58,7 @@ def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
 
 
 def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
-    found: dict[Expr, _Part] = {}
+    written: dict[Expr, _Part] = {}
     for part in topological([node]):
         args: tuple[Expr, ...] = part.args
         level = 5
@@ -66,8 +66,8 @@ def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
             text, level = number(part.value), 5 if part.value >= 0 else 3
         elif part.op == "symbol":
             # in plain text a parameter by its address
-            own = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
-            text = names.get(part.value, own)
+            name = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
+            text = names.get(part.value, name)
         elif part.op == "mul" and args[0] is args[1]:
             text, level = language.square
         elif part.op == "mul" and "recip" in (args[0].op, args[1].op):
@@ -78,13 +78,13 @@ def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
             text, level = notation
         else:
             name = part.value if part.op == "call" else part.op
-            text = language.call.format(name, ", ".join(found[a].text for a in args))
+            text = language.call.format(name, ", ".join(written[a].text for a in args))
             args = ()
-        text = text.format(*(found[a] for a in args)) if args else text
+        text = text.format(*(written[a] for a in args)) if args else text
         if len(text) > LONGEST:
             text, level = "(...)", 5
-        found[part] = _Part(text, level, language.brackets)
-    return found[node].text
+        written[part] = _Part(text, level, language.brackets)
+    return written[node].text
 
 
 def _notation(op: str, language: _Language) -> Notation | None:
@@ -99,8 +99,8 @@ _GREEK = {"alpha", "beta", "gamma", "kappa", "tau", "phi", "sigma", "lambda", "e
 
 
 def _subscript(name: str) -> str:
-    first, _, rest = name.partition("_")
+    first, _, index = name.partition("_")
     shown = (
         f"\\{first}" if first in _GREEK else first if len(first) == 1 else f"\\mathrm{{{first}}}"
     )
-    return shown + (f"_{{{rest}}}" if rest else "")
+    return shown + (f"_{{{index}}}" if index else "")

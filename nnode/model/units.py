@@ -74,12 +74,12 @@ def dimension(unit: str) -> Dimension | None:
     if not _readable(unit):
         raise ConfigError(f"{unit[:LONGEST]!r} is no unit; {_EXPECTED_UNIT}")
     try:
-        found = _registry().Unit("dimensionless" if unit == "1" else unit).dimensionality
+        powers = _registry().Unit("dimensionless" if unit == "1" else unit).dimensionality
     except Exception as error:
         raise ConfigError(f"{unit!r} is no unit; {_EXPECTED_UNIT}") from error
-    if set(found) - set(_BASE):
+    if set(powers) - set(_BASE):
         raise ConfigError(f"the unit {unit} is not made of metre, second and kilogram")
-    return _powers(found)
+    return _powers(powers)
 
 
 @cache
@@ -96,8 +96,8 @@ def in_si(value: str) -> tuple[float, str]:
     if not _readable(value):
         raise ConfigError(wrong)
     try:
-        found = _registry().Quantity(value)
-        size, unit = float(found.to_base_units().magnitude), _powers(found.dimensionality)
+        quantity = _registry().Quantity(value)
+        size, unit = float(quantity.to_base_units().magnitude), _powers(quantity.dimensionality)
     except Exception as error:
         raise ConfigError(wrong) from error
     if not math.isfinite(size):
@@ -105,15 +105,15 @@ def in_si(value: str) -> tuple[float, str]:
     return size, shown(unit)
 
 
-def _powers(found: Mapping[str, Any]) -> Dimension:
+def _powers(dimensionality: Mapping[str, Any]) -> Dimension:
     """Of metre, second and kilogram."""
-    length, time, mass = (Fraction(found.get(b, 0)).limit_denominator(8) for b in _BASE)
+    length, time, mass = (Fraction(dimensionality.get(b, 0)).limit_denominator(8) for b in _BASE)
     return length, time, mass
 
 
-def shown(found: Dimension) -> str:
+def shown(unit: Dimension) -> str:
     """A dimension as a unit, such as m/s²."""
-    powers = {"kg": found[2], "m": found[0], "s": found[1]}
+    powers = {"kg": unit[2], "m": unit[0], "s": unit[1]}
     over = [_raised(name, power) for name, power in powers.items() if power > 0]
     under = [_raised(name, -power) for name, power in powers.items() if power < 0]
     top = " ".join(over) or "1"
@@ -133,10 +133,10 @@ def unit_of(node: Expr, units: Mapping[str, str]) -> Dimension | None:
     Raises:
         ConfigError: parts whose units do not go together, with both of them.
     """
-    found: dict[Expr, Dimension | None] = {}
+    dimensions: dict[Expr, Dimension | None] = {}
     for part in topological([node]):
-        found[part] = _one(part, [found[a] for a in part.args], units)
-    return found[node]
+        dimensions[part] = _dimension_of(part, [dimensions[a] for a in part.args], units)
+    return dimensions[node]
 
 
 def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
@@ -145,12 +145,14 @@ def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
     Raises:
         ConfigError: it has not, or its parts do not go together.
     """
-    found, expected = unit_of(node, units), dimension(wanted)
-    if found is not None and expected is not None and found != expected and not node.is_number(0):
-        raise ConfigError(f"{name} = {plain(node)} has the unit {shown(found)}, expected {wanted}")
+    unit, expected = unit_of(node, units), dimension(wanted)
+    if unit is not None and expected is not None and unit != expected and not node.is_number(0):
+        raise ConfigError(f"{name} = {plain(node)} has the unit {shown(unit)}, expected {wanted}")
 
 
-def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Dimension | None:
+def _dimension_of(
+    part: Expr, of: list[Dimension | None], units: Mapping[str, str]
+) -> Dimension | None:
     match part.op:
         case "const":
             return NONE
@@ -161,14 +163,14 @@ def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Di
     operation = OPERATIONS[part.op]
     if operation.alike:
         return _same(part, [(part.args[i], of[i]) for i in operation.alike])
-    known = [one for one in of if one is not None]
+    dimensions = [d for d in of if d is not None]
     if operation.powers:
-        if len(known) < len(of):
+        if len(dimensions) < len(of):
             return None
         powers = [Fraction(power) for power in operation.powers]
         length, time, mass = (
-            sum((p * one for p, one in zip(powers, axis, strict=True)), Fraction(0))
-            for axis in zip(*known, strict=True)
+            sum((power * d for power, d in zip(powers, axis, strict=True)), Fraction(0))
+            for axis in zip(*dimensions, strict=True)
         )
         if max(abs(length), abs(time), abs(mass)) > _HIGHEST_POWER:
             raise ConfigError(
@@ -176,21 +178,21 @@ def _one(part: Expr, of: list[Dimension | None], units: Mapping[str, str]) -> Di
                 "scale of the same unit first"
             )
         return length, time, mass
-    if any(one != NONE for one in known):
+    if wrong := [d for d in dimensions if d != NONE]:
         argument = plain(part.args[0])
         raise ConfigError(
-            f"{plain(part)}: the argument {argument} of {part.op} has the unit {shown(known[0])}, "
+            f"{plain(part)}: the argument {argument} of {part.op} has the unit {shown(wrong[0])}, "
             "expected a number without one; divide by a scale of the same unit"
         )
     return NONE
 
 
 def _same(part: Expr, pairs: list[tuple[Expr, Dimension | None]]) -> Dimension | None:
-    known = [(a, own) for a, own in pairs if own is not None and not a.is_number(0)]
-    for a, own in known[1:]:
-        if own != known[0][1]:
+    carried = [(a, unit) for a, unit in pairs if unit is not None and not a.is_number(0)]
+    for a, unit in carried[1:]:
+        if unit != carried[0][1]:
             raise ConfigError(
-                f"{plain(part)} puts together {plain(known[0][0])}, which has the unit "
-                f"{shown(known[0][1])}, and {plain(a)}, which has the unit {shown(own)}"
+                f"{plain(part)} puts together {plain(carried[0][0])}, which has the unit "
+                f"{shown(carried[0][1])}, and {plain(a)}, which has the unit {shown(unit)}"
             )
-    return known[0][1] if known else (None if any(o is None for _, o in pairs) else NONE)
+    return carried[0][1] if carried else (None if any(unit is None for _, unit in pairs) else NONE)

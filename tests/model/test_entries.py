@@ -21,7 +21,7 @@ from tests.model.test_forces import people
 FILES = sorted(Path(laws.__file__).parent.glob("*.yaml"))
 #: Everything that an entry may say.
 KEYS = {
-    "about", "formula", "source", "rank", "model", "parameters", "settings", "constants",
+    "about", "formula", "source", "rank", "model", "options", "parameters", "settings", "constants",
     "networks", "hidden", "step", "states", "delayed", "remembered", "where", "rate", "force",
     "drive", "variants", *REDUCED,
 }  # fmt: skip
@@ -48,6 +48,7 @@ def test_entries_are_in_the_order_of_their_ranks() -> None:
 def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = {
         "about": "Exponential saturation.", "source": "none", "model": ["saturated"],
+        "options": ["reach", "reach_min"],
         "parameters": {"v0": "30 m/s", "reach": {"value": "12 m", "low": "1 m"}},
         "rate": {"x": "v0*(1 - exp(-gap/reach))"},
     }  # fmt: skip

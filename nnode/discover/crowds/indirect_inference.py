@@ -24,10 +24,11 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.paths import Path, Smoother
-from nnode.discover.residuals.engine import Rate, runge_kutta
+from nnode.discover.residuals.engine import Rate
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
 from nnode.errors import SimulationError
 from nnode.model.system import Crowd, System
+from nnode.simulate.numpy import runge_kutta
 
 log = logging.getLogger(__name__)
 

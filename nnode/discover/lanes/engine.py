@@ -17,20 +17,19 @@ from torch import Tensor, nn
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Simulation
-from nnode.discover.lanes.along import Along
-from nnode.discover.lanes.motion import formula_of
 from nnode.discover.lanes.paths import noise_variance, smooth, velocity
-from nnode.discover.lanes.response import Response
-from nnode.discover.lanes.runs import side_by_side
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
-from nnode.discover.residuals.engine import Squares, of_residuals, runge_kutta
+from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of, extended, without
 from nnode.model.system import System
 from nnode.model.term import State, Term
+from nnode.simulate.linear import LinearResponse
+from nnode.simulate.numpy import simulated, strides
+from nnode.simulate.rhs import RightHandSide, formula_of, rates_along
 
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.
@@ -93,7 +92,7 @@ class TrafficEngine:
         self.seen = self.follows & (time > torch.tensor(first))[..., None]
         self.filter = PlatoonFilter.none()
         self._last: tuple[System, Tensor, Tensor] | None = None
-        self._response: tuple[System, Tensor, Response] | None = None
+        self._response: tuple[System, Tensor, LinearResponse] | None = None
         k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
         self.sequence = owner[b]
         self.cluster = of_residuals(clusters, self.sequence)
@@ -113,31 +112,23 @@ class TrafficEngine:
     @np.errstate(all="ignore")
     def simulate(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N, W)`` states; their first component are positions, m."""
-        batch = self.smoothed
-        stride, steps = self._steps(system, rows)
-        h = batch.dt * stride / steps
-        runs = side_by_side(system, rows, replace(system.scene(batch), step=h))
-        y = runs.start(batch)
-        slope, found = runs.rate(0.0, y), [y]
-        number = math.ceil((batch.n_samples - 1) / stride) * steps
-        for step in range(number):
-            t = step * h
-            after = runge_kutta(runs.rate, t, y, h, slope)
-            then = runs.rate(t + h, after)
-            found += _between(y, slope, after, then, h, stride)
-            if (step + 1) % steps == 0:
-                found.append(after)
-            y, slope = after, then
-        return runs.states(found[: batch.n_samples])
+        batch, longest = self.smoothed, self._longest(system, rows)
+        scene = replace(system.scene(batch), step=self._step(longest))
+        rhs = RightHandSide(system, scene, ParameterVector(system).runs(rows))
+        found = simulated(rhs, rhs.start(batch), batch.dt, batch.n_samples, longest)
+        return torch.from_numpy(found).permute(3, 0, 4, 2, 1).contiguous()
 
-    def _steps(self, system: System, rows: Tensor) -> tuple[int, int]:
-        """Samples in a step, or steps in a sample."""
+    def _longest(self, system: System, rows: Tensor) -> float:
+        """Longest step, s."""
         longest = min(STEP[system.order], fastest(system, rows))
         lane = formula_of(system)
         if lane is not None and "dt" in symbols([lane.law or lane.rates[lane.top]]):
             longest = min(longest, MAPPED)
-        stride = max(1, math.floor(longest / self.batch.dt + 1e-9))
-        return stride, max(1, math.ceil(self.batch.dt / longest - 1e-9))
+        return longest
+
+    def _step(self, longest: float) -> float:
+        stride, steps = strides(self.batch.dt, longest)
+        return self.batch.dt * stride / steps
 
     def deviations(self, system: System, rows: Tensor) -> Tensor:
         """``(R, K, B, N)`` measured minus simulated positions, m; 0 for leaders and outside of
@@ -156,7 +147,7 @@ class TrafficEngine:
         """``(K, n)`` derivatives of the residuals, by linear response."""
         response = self.linear(system, row)
         with torch.no_grad():
-            return self._columns(response, response.parameters())
+            return self._columns(response, response.parameters(ParameterVector(system).places))
 
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
@@ -166,18 +157,18 @@ class TrafficEngine:
         response = self.linear(system, row)
         if effect.remembers():
             return self._whole(response, effect, probe)
-        base = response.along.rates(response.system)
+        base = response.rates(response.system)
         sources = []
         if not probe.steps:
             changed, _ = extended(response.system, effect(**probe.options))
-            sources.append(response.along.rates(changed) - base)
+            sources.append(response.rates(changed) - base)
         for name, step in probe.steps.items():
             value = effect.strengths[name].neutral + step
             changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
-            sources.append((response.along.rates(changed) - base) / step)
-        return self._columns(response, response.moved(torch.stack(sources)))
+            sources.append((response.rates(changed) - base) / step)
+        return self._columns(response, response.response(torch.stack(sources)))
 
-    def _whole(self, response: Response, effect: type[Effect], probe: Probe) -> Tensor:
+    def _whole(self, response: LinearResponse, effect: type[Effect], probe: Probe) -> Tensor:
         """``(1, n)`` change of the residuals by an effect of finite strength; zero where vehicles
         would be moved by more than all the road that was seen: that is no small change."""
         values, amount = dict(probe.options), 1.0
@@ -202,19 +193,17 @@ class TrafficEngine:
         """
         linear = self.linear(system, row)
         k, b, n = linear.states.shape[:3]
-        found = [
-            one.reshape(k, b, n).transpose(1, 2) for one in rates(linear.along.state(linear.system))
-        ]
+        found = [one.reshape(k, b, n).transpose(1, 2) for one in rates(linear.state())]
         size = max(1, BLOCK // b)
         columns = []
         for first in range(0, len(found), size):
             source = torch.stack(found[first : first + size], 2).permute(2, 0, 3, 1)[..., None]
             # rates of places, or of speeds, before which those of places do not change
             source = nn.functional.pad(source, (system.order - 1, 0))
-            columns.append(self._columns(linear, linear.moved(source)))
+            columns.append(self._columns(linear, linear.response(source)))
         return torch.cat([one.T for one in columns], 1).T
 
-    def linear(self, system: System, row: Tensor) -> Response:
+    def linear(self, system: System, row: Tensor) -> LinearResponse:
         """The linear response of a run, kept until another one is asked for."""
         known = self._response
         if known is not None and known[0] is system and torch.equal(known[1], row):
@@ -224,14 +213,14 @@ class TrafficEngine:
             self.deviations(system, row[None])
         assert self._last is not None
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
-        stride, steps = self._steps(system, row[None])
-        scene = replace(fixed.scene(self.smoothed), step=self.batch.dt * stride / steps)
+        step = self._step(self._longest(system, row[None]))
+        scene = replace(fixed.scene(self.smoothed), step=step)
         with torch.no_grad():
-            found = Response(fixed, self.smoothed, scene, self._last[2])
+            found = LinearResponse(fixed, self.smoothed, scene, self._last[2])
         self._response = system, row.clone(), found
         return found
 
-    def _columns(self, response: Response, moved: Tensor) -> Tensor:
+    def _columns(self, response: LinearResponse, moved: Tensor) -> Tensor:
         """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
         away = self.batch.x[..., 0] - response.states[..., 0]
         residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
@@ -252,10 +241,11 @@ class TrafficEngine:
         if system.order > 1 and batch.n_samples > 1:
             states = torch.cat([batch.x, batch.v], -1)
             wanted = torch.from_numpy(velocity(batch.v[..., 0].numpy(), batch.dt))
-        along = Along(found.scene(batch), states)
+        scene = found.scene(batch)
 
         def missed(row: np.ndarray) -> np.ndarray:
-            rate = along.rates(vector.fill_(row))[..., system.order - 1]
+            rates = rates_along(vector.fill_(row), scene, states)
+            rate = rates[..., system.order - 1]
             away: np.ndarray = (wanted - rate)[self.follows].numpy()
             return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
 
@@ -299,11 +289,11 @@ class TrafficEngine:
             for own in people.values():
                 if place is not None:
                     own[place] += number * SMALL
-            return linear.along.rates(extended(plain, effect(people=people, **values))[0])
+            return linear.rates(extended(plain, effect(people=people, **values))[0])
 
         base = rates(None)
         sources = [(rates(place) - base) / SMALL for place in range(size)]
-        return self._columns(linear, linear.moved(torch.stack(sources)))
+        return self._columns(linear, linear.response(torch.stack(sources)))
 
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""
@@ -339,17 +329,6 @@ def fastest(system: System, rows: Tensor) -> float:
         if name in factors
     ]
     return min(found, default=math.inf)
-
-
-def _between(before: Any, start: Any, after: Any, end: Any, h: float, stride: int) -> list[Any]:
-    """States at the samples within a step of ``h`` s, by Hermite's cubic interpolation."""
-    x0, v0, x1, v1 = before, start, after, end
-    found = []
-    for part in range(1, stride):
-        s = part / stride
-        away = h * (s * (1 - s) ** 2 * v0 - s**2 * (1 - s) * v1)
-        found.append((1 + 2 * s) * (1 - s) ** 2 * x0 + s**2 * (3 - 2 * s) * x1 + away)
-    return found
 
 
 def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:

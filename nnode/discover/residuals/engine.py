@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from torch import Tensor
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 
 Rate = Callable[[Tensor, Tensor], Tensor]
-_Time = TypeVar("_Time", float, Tensor)
-_States = TypeVar("_States", np.ndarray, Tensor)
 
 
 @dataclass
@@ -148,14 +146,3 @@ def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
 def square_of(engine: Engine, system: System) -> float:
     """Mean square error of positions, m², every sequence alike."""
     return float(engine.squares(system, ParameterVector(system).row).means().mean())
-
-
-def runge_kutta(
-    rate: Callable[[_Time, _States], _States], t: _Time, y: _States, h: float, k1: _States
-) -> _States:
-    """The states after a step of ``h`` s by the classical method of fourth order, from those
-    and their rates ``k1`` before."""
-    k2 = rate(t + h / 2, y + h / 2 * k1)
-    k3 = rate(t + h / 2, y + h / 2 * k2)
-    k4 = rate(t + h, y + h * k3)
-    return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nnode.discover.residuals.comparison import Comparison
 from nnode.model.term import Interval, State, Term
@@ -58,16 +58,17 @@ class Variable:
         knots = tuple(first + float(s) * length for s in np.linspace(0, WAVES, WAVE_KNOTS))
         return replace(self, lengths=(length,), knots=knots)
 
-    def curve(self, value: np.ndarray, amounts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A curve by the amounts ``(M,)`` of its weights, and its slope, at values of any shape."""
+    def curve(self, value: Tensor, amounts: Tensor) -> Tensor:
+        """A curve by the amounts ``(M,)`` of its weights, at values of any shape."""
         if self.lengths:
-            turn = 2 * np.pi / np.array(self.lengths)
+            turn = 2 * torch.pi / torch.tensor(self.lengths, dtype=value.dtype)
             angle = value[..., None] * turn
-            sine, cosine = np.sin(angle), np.cos(angle)
-            a, b = amounts[::2], amounts[1::2]
-            return sine @ a + cosine @ b, cosine @ (turn * a) - sine @ (turn * b)
-        slope = np.concatenate([[0.0], np.diff(amounts) / np.diff(self.knots), [0.0]])
-        return np.interp(value, self.knots, amounts), slope[np.searchsorted(self.knots, value)]
+            return angle.sin() @ amounts[::2] + angle.cos() @ amounts[1::2]
+        knots = torch.tensor(self.knots, dtype=value.dtype)
+        slope = nn.functional.pad(amounts.diff() / knots.diff(), (1, 1))
+        part = torch.bucketize(value.detach().contiguous(), knots)
+        left = (part - 1).clamp(min=0)
+        return amounts[left] + slope[part] * (value - knots[left])
 
     def heights(self, amounts: np.ndarray) -> np.ndarray:
         """``(knots, ...)`` a curve at the knots by the amounts ``(M, ...)`` of its weights."""
@@ -94,8 +95,8 @@ class Curve(Term):
         self.scale: Tensor
 
     def forward(self, state: State) -> Tensor:
-        amount = self.variable.weights(state) @ self.amounts
-        return self.scale * amount[..., None] * self.variable.direction(state)
+        height = self.variable.curve(self.variable.value(state), self.amounts)
+        return self.scale * height[..., None] * self.variable.direction(state)
 
 
 def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:

@@ -63,12 +63,12 @@ def entries() -> dict[str, dict[str, Any]]:
     """The package's laws by name, in the order of their ranks, as their files describe them.
 
     Beside the entries of a user's own law: ``about``, one line; ``formula`` as it is printed;
-    ``model``, the entries that make a model of this name, each with options of its own; absent:
-    the law is given as ``model.law``. ``settings``, quantities that options give; ``networks``,
-    submodule to the functions in formulas that are its outputs; ``hidden``, neurons of their
-    hidden layer; ``force``, ``drive``, see :class:`nnode.model.terms.Rule`; ``variants``, option to
-    the entries that it changes where it is true. A parameter whose value is a list starts uniform
-    between both.
+    ``model``, the entries that make a model of this name, and ``options``, those that a law takes
+    from the options of the model; absent: the law is given as ``model.law``. ``settings``,
+    quantities that options give; ``networks``, submodule to the functions in formulas that are its
+    outputs; ``hidden``, neurons of their hidden layer; ``force``, ``drive``, see
+    :class:`nnode.model.terms.Rule`; ``variants``, option to the entries that it changes where it is
+    true. A parameter whose value is a list starts uniform between both.
     """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     found = {
@@ -589,16 +589,6 @@ _FORCE: dict[str, Any] = {
     },
     "force": ["pair_x", "pair_y"],
 }
-
-
-def takes_options(entry: Mapping[str, Any]) -> list[str]:
-    """The options of the laws of an entry; see :class:`Law` for what they do."""
-    parameters = entry["parameters"]
-    found = [*parameters, *(f"{name}_min" for name in parameters), *entry.get("settings", ())]
-    found += [*entry.get("variants", ()), "generator"]
-    found += ["hidden", "box"] if "networks" in entry else []
-    found += ["walls"] if "points" in entry else []
-    return found + (["self_interaction"] if "networks" in entry and "force" in entry else [])
 
 
 def make_law(entry: str, **options: Any) -> Law:

@@ -29,11 +29,11 @@ from nnode.data.sequence import Batch
 from nnode.model.expression import Expr, apply, const, symbol, symbols
 from nnode.model.formula import inputs_of, starts_of
 from nnode.model.lane_dynamics import LaneDynamics
+from nnode.model.lane_rates import SAFE
 from nnode.model.names import check_symbols
 from nnode.model.steps import STAGES, stepped
 from nnode.model.system import System, Traffic, initial_with
 from nnode.model.tangent import with_tangents
-from nnode.model.tensors import SAFE
 from nnode.model.term import Term
 from nnode.model.text import plain
 from nnode.simulate.kernels.loops import Loop

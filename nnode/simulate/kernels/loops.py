@@ -33,11 +33,11 @@ class Loop:
     def varies(self, nodes: Sequence[Expr]) -> dict[Expr, bool]:
         """Node to whether it varies along a row."""
         same = {*self.uniform, *self.scalars}
-        found: dict[Expr, bool] = {}
+        varying: dict[Expr, bool] = {}
         for node in topological(nodes):
-            own = node.op == "symbol" and node.value not in same
-            found[node] = own or any(found[a] for a in node.args)
-        return found
+            uneven = node.op == "symbol" and node.value not in same
+            varying[node] = uneven or any(varying[a] for a in node.args)
+        return varying
 
     def function(
         self,
@@ -96,16 +96,18 @@ class Loop:
         stored, ends = self.adjoints(seeds, rows)
         stored.update({row: symbol(row) + stored[row] for row in onto})
         sums = {str(i): total for i, total in enumerate(ends.values())}
-        rest = vjp({node: symbol(f"sum_{i}") for i, node in enumerate(ends)}, lambda node: False)
-        found = {
+        adjoints = vjp(
+            {node: symbol(f"sum_{i}") for i, node in enumerate(ends)}, lambda node: False
+        )
+        gradient = {
             n.value: b
-            for n, b in rest.items()
+            for n, b in adjoints.items()
             if n.value in self.uniform and n.value not in self.fixed
         }
         # what the chain behind the loop needs is computed there
-        names = self.names(found.values(), "u")
-        after = [*self.given(found.values()), *self.lines(names).values()]
-        after += [f"total[{self.uniform.index(p)}] += {names[b]}" for p, b in found.items()]
+        names = self.names(gradient.values(), "u")
+        after = [*self.given(gradient.values()), *self.lines(names).values()]
+        after += [f"total[{self.uniform.index(p)}] += {names[b]}" for p, b in gradient.items()]
         return self.function(name, stored, sums, after)
 
     def adjoints(
@@ -115,7 +117,7 @@ class Loop:
         vary in it."""
         varies = self.varies([*seeds, *seeds.values()])
         bar = vjp(seeds, lambda node: not varies[node])
-        stored = {row: bar.get(symbol(own), const(0)) for row, own in rows.items()}
+        stored = {row: bar.get(symbol(quantity), const(0)) for row, quantity in rows.items()}
         still = {*self.fixed, *self.scalars}
         ends = {n: b for n, b in bar.items() if not varies[n] and not set(symbols([n])) <= still}
         return stored, ends
@@ -132,11 +134,11 @@ class Loop:
 
     def lines(self, names: Mapping[Expr, str]) -> dict[Expr, str]:
         """Lines that compute nodes."""
-        found = {}
+        lines = {}
         for node, name in names.items():
             if node.op == "const":
-                found[node] = f"{name} = real({node.value!r}, dt)"
+                lines[node] = f"{name} = real({node.value!r}, dt)"
             elif node.op != "symbol":
                 code = OPERATIONS[node.op].code.format(*(names[a] for a in node.args))
-                found[node] = f"{name} = {code}"
-        return found
+                lines[node] = f"{name} = {code}"
+        return lines

@@ -14,8 +14,6 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.discover.lanes import along, response, runs
-from nnode.discover.lanes.bent import motion_of
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System
@@ -24,6 +22,7 @@ from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.parse import parse
+from nnode.simulate import rhs
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 from tests.model.test_tensors import FORMULAS
 
@@ -85,8 +84,7 @@ def model(law: dict[str, Any], leader: str, effects: tuple[str, ...]) -> System:
 def as_code() -> Iterator[None]:
     """Every model is taken for one with terms that are code."""
     with pytest.MonkeyPatch.context() as patch:
-        for part in (along, response, runs):
-            patch.setattr(part, "motion_of", lambda *args: None)
+        patch.setattr(rhs, "formula_of", lambda *args: None)
         yield
 
 
@@ -120,7 +118,7 @@ def test_runs_and_tangents(
     sequences: list[Sequence], law: dict[str, Any], leader: str, effects: tuple[str, ...]
 ) -> None:
     system = model(law, leader, effects)
-    assert motion_of(system, system.scene(TrafficEngine(sequences).batch)) is not None
+    assert rhs.formula_of(system) is not None
     rows = rows_of(system)
     same(*both(sequences, lambda engine: engine.residuals(system, rows)))
     same(*both(sequences, lambda engine: engine.tangents(system, rows[0])))

@@ -165,12 +165,10 @@ def test_of_effects_and_of_what_they_remember(effect: dict[str, Any]) -> None:
     compared(system, platoons(), names)
 
 
-def test_a_start_that_is_no_formula_is_refused() -> None:
-    system, batch = linear({"name": ReactionDelay.name, "T": 0.4}), platoons()
-    lane = lanes.supports(system, batch)
-    assert lane is not None
-    with pytest.raises(ValueError, match="start of every added state that is a formula"):
-        lanes.tangents(system, lane, batch, 2, ["lin__v0"])
+def test_of_starts_that_depend_on_the_law_and_on_measured_speeds() -> None:
+    """Of first order: the gap opens at the start as the law says; a leader's speed is measured."""
+    system = linear({"name": ReactionDelay.name, "T": 0.4})
+    compared(system, platoons(), owned(system))
 
 
 def test_their_formulas_are_the_slopes_of_the_rate() -> None:

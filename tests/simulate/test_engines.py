@@ -1,7 +1,8 @@
-"""Gradients of every method, law, leader, and engine of lanes, against float64 autograd.
+"""Laws, effects, methods and engines: states and gradients against float64 autograd.
 
-Most cases run the generated source in Python's interpreter, which takes less time than to compile
-it; those that are compiled are a selection here, and all of them among the thorough tests.
+Of lanes most cases run the generated source in Python's interpreter, which takes less time than
+to compile it. The compiled ones are a selection here, and all of them are among the thorough tests.
+Crowds are always compiled.
 """
 
 from __future__ import annotations
@@ -9,17 +10,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import Traffic, build_model
+from nnode.model import System, Traffic, build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.laws import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 from nnode.model.steps import METHODS
-from nnode.simulate import TorchdiffeqSolver, Trajectory
+from nnode.simulate import FusedSolver, TorchdiffeqSolver, Trajectory
 from nnode.simulate.kernels import lanes
+from tests.model.effects.test_crowd_effects import VALUES
 from tests.model.following import model
 from tests.simulate.fused.compare import RungeKutta
 from tests.simulate.kernels.interpreted import interpreted
@@ -74,7 +78,55 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "pure_delay": {"T": 0.13},
 }
 #: Laws that are compiled in the thorough tests: one of each kind.
-COMPILED = ("lin", "speed_ahead", "state", "beside", "idm", "ovm", "fvdm", "helly", "gipps", "a2")
+COMPILED = ("lin", "speed_ahead", "state", "beside", "ovm", "fvdm", "helly", "gipps", "a2")
+
+#: Forces of the paper, as options of the model.
+FORCES: dict[str, dict[str, Any]] = {
+    "sf": {"term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1},
+    "sf_opposing": {
+        "term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1, "r": 0.3,
+        "mass": 2.0, "tau": 0.7, "opposing_wall_friction": True,
+    },
+    "sf_open": {
+        "term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1, "walls": False,
+    },
+    "nn": {"term": "network_force"},
+    "nn_open": {"term": "network_force", "hidden": 3, "mass": 2.0, "walls": False},
+    "nn_self": {"term": "network_force", "self_interaction": True},
+}  # fmt: skip
+#: What a user's law of people may have: sums, smallest and largest values that name each other.
+OWN_FORCES: dict[str, dict[str, Any]] = {
+    "sums": {
+        "parameters": {"A": "2 m/s²", "B": "40 cm", "tau": "0.7 s"},
+        "where": {"push": "A*exp((2*r - d)/B)"},
+        "others": {"push_x": "push*n_x", "push_y": "push*n_y"},
+        "rate": {
+            "vx": "(speed*way_x - vx)/tau + push_x", "vy": "(speed*way_y - vy)/tau + push_y",
+        },
+    },
+    "smallest": {
+        "parameters": {"A": "0.6 1/s", "B": "0.5 m", "C": "0.3 1/s²", "tau": "0.7 s"},
+        "where": {
+            "crowded": "1 + number", "near": "d*crowded", "push": "A*max(2*B - closest, 0)/tau",
+        },
+        "others": {"number": "exp(-d/B)"},
+        "smallest": {"closest": "near", "slow": "sqrt(dvx**2 + dvy**2 + small_v**2)"},
+        "largest": {"right": "choose(2.5*B - d, dx, -nobody)"},
+        "rate": {
+            "vx": "(speed*way_x - vx)/tau + push + C*max(right, -B)",
+            "vy": "(speed*way_y - vy)/tau + 0.1*A*min(slow, speed)",
+        },
+    },
+}  # fmt: skip
+#: Values of effects on people that are not neutral.
+CROWD_EFFECTS: dict[str, dict[str, Any]] = {
+    **VALUES,
+    "walker_heterogeneity": {"people": {"6": [0.1, -0.2, 0.0, 0.3, 0.1, -0.1], "2": [0.2, 0.1]}},
+}
+#: Laws of people that are compiled every time; the others take seconds each and are thorough.
+OFTEN = ("sf", "nn", "nn_self", "cfsm", "sums")
+#: Two sides of a room, and a wall in it; x1, y1, x2, y2 in m.
+WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
 
 
 def platoons() -> Batch:
@@ -131,7 +183,7 @@ def weights(batch: Batch, states: int) -> Tensor:
     return torch.where(batch.valid[..., None], found, 0.0)
 
 
-def exact(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+def exact(system: System, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
     """States at the samples, and the gradient of their weighted sum, by autograd."""
     scene, x, v = moving(batch)
     dt = batch.dt / SUBSTEPS
@@ -145,7 +197,7 @@ def _states(path: Trajectory) -> Tensor:
 
 
 def _slopes(
-    system: Traffic, batch: Batch, states: Tensor, x: Tensor, v: Tensor
+    system: System, batch: Batch, states: Tensor, x: Tensor, v: Tensor
 ) -> dict[str, Tensor]:
     own = {name: p for name, p in system.named_parameters() if p.requires_grad}
     total = (weights(batch, states.shape[-1]) * states).sum()
@@ -154,20 +206,26 @@ def _slopes(
         name: torch.zeros_like(p) if slope is None else slope
         for (name, p), slope in zip({**own, "x": x, "v": v}.items(), found, strict=True)
     }
-    if system.leader == "measured":  # the leader's places and speeds are data
+    if getattr(system, "leader", "") == "measured":  # the leader's places and speeds are data
         follower = system.scene(batch).follower[..., None]
         named |= {name: torch.where(follower, named[name], 0.0) for name in ("x", "v")}
     return named
 
 
-def compiled(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+def compiled(
+    system: System, batch: Batch, method: str, threads: int = 1
+) -> tuple[Tensor, dict[str, Tensor]]:
     """The same by the generated code."""
-    lane = lanes.supports(system, batch)
-    assert lane is not None
     scene, x, v = moving(batch)
-    y = lanes.simulate(system, lane, scene, SUBSTEPS, method=method)[:, 0]
-    found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
+    solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
+    found = _states(solver(system, scene))
+    assert not solver.uncompiled
     return found, _slopes(system, batch, found, x, v)
+
+
+def threaded(system: System, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same by two threads."""
+    return compiled(system, batch, method, 2)
 
 
 def ensemble(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
@@ -199,9 +257,8 @@ def by_tangents(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dic
     return found, own
 
 
-def check(system: Traffic, method: str, *engines: Any) -> None:
+def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
     """Compare states, and every part of the gradient by itself."""
-    batch = platoons()
     states, wanted = exact(system, batch, method)
     assert wanted["x"].abs().max() > 0
     for engine in engines:
@@ -227,6 +284,13 @@ def cases(laws: Iterable[str]) -> list[Any]:
     return found
 
 
+#: Effects that act on each other, and several memories.
+TOGETHER = (
+    ("lin", "reaction_delay+relative_speed+speed_zone"), ("lin", "reaction_delay+inertia"),
+    ("idm", "memory+relative_speed"),
+)  # fmt: skip
+
+
 def _is_map(law: str, *effects: str) -> bool:
     lane = lane_of(law, "measured", *effects).lane
     assert lane is not None
@@ -246,7 +310,7 @@ def with_effects() -> list[Any]:
                 often = method in ("rk4", "ballistic" if effect.name == "pure_delay" else "")
                 marks = [] if often else [pytest.mark.thorough]
                 found.append(pytest.param(law, effect.name, method, marks=marks))
-    return found
+    return found + [(law, effects, "euler") for law, effects in TOGETHER]
 
 
 @pytest.fixture
@@ -258,34 +322,86 @@ def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("leader", LEADERS)
 @pytest.mark.parametrize(("law", "method"), cases([*PAPER, *OWN, *CAR_FOLLOWING_LAWS]))
 def test_every_law_and_method(law: str, method: str, leader: str) -> None:
-    check(lane_of(law, leader), method, compiled, ensemble, by_tangents)
+    check(lane_of(law, leader), platoons(), method, compiled, ensemble, by_tangents)
 
 
 @pytest.mark.usefixtures("without_compiler")
 @pytest.mark.parametrize("leader", LEADERS)
 @pytest.mark.parametrize(("law", "effect", "method"), with_effects())
 def test_every_effect(law: str, effect: str, method: str, leader: str) -> None:
-    system = lane_of(law, leader, effect)
+    system = lane_of(law, leader, *effect.split("+"))
     lane = system.lane
     assert lane is not None
     exact_start = set(list(lane.rates)[lane.order :]) <= set(lane.starts)
-    check(system, method, compiled, *([by_tangents] if exact_start else []))
+    check(system, platoons(), method, compiled, *([by_tangents] if exact_start else []))
 
 
 @pytest.mark.parametrize(
-    "law", ["n4", *(pytest.param(n, marks=pytest.mark.thorough) for n in COMPILED)]
+    "law", ["n4", "idm", *(pytest.param(n, marks=pytest.mark.thorough) for n in COMPILED)]
 )
 def test_compiled_stages(law: str) -> None:
     """A leader that drives by itself, in vehicles side by side and in vehicles one after the
     other."""
-    check(lane_of(law, "constant"), "rk4", compiled)
+    check(lane_of(law, "constant"), platoons(), "rk4", compiled)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("law", ["lin", "idm", "speed_ahead"])
 @pytest.mark.parametrize("method", METHODS)
 def test_compiled_runs_and_tangents(law: str, method: str) -> None:
-    check(lane_of(law, "constant"), method, ensemble, by_tangents)
+    check(lane_of(law, "constant"), platoons(), method, ensemble, by_tangents)
+
+
+def room() -> Batch:
+    """Crowds of one to nine people, of different duration, with none to three walls."""
+    found = []
+    for n, walls, samples in ((6, 1, 6), (9, 2, 4), (1, 3, 6), (2, 0, 6)):
+        draw, time = np.random.default_rng(n), 0.04 * np.arange(samples)
+        x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
+        found.append(
+            Sequence(
+                name=f"{n}", recording="r", time=time, x=x + time[:, None, None] * v,
+                v=np.broadcast_to(v, (samples, n, 2)), walls=WALLS[:walls],
+                preferred=draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1],
+                group=tuple("ab"[i % 2] for i in range(n)),
+            )
+        )  # fmt: skip
+    return collate(found)
+
+
+def crowd_of(law: str, *effects: str) -> System:
+    chosen = [{"name": e, **CROWD_EFFECTS[e]} for e in effects]
+    if law in FORCES:
+        return build_model({**model_options({"name": law, **FORCES[law]}), "effects": chosen}, 3)
+    own = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
+    options = model_options({"term": "formula", "name": law, "law": own})
+    found = build_model({**options, "desired": "direction", "effects": chosen})
+    if law == "ttc":  # milder, so that nobody is thrown out of the room
+        with torch.no_grad():
+            found.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
+    return found
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        pytest.param(law, marks=() if law in OFTEN else pytest.mark.thorough)
+        for law in (*FORCES, *OWN_FORCES, *PEDESTRIAN_LAWS)
+    ],
+)
+def test_every_law_of_people(law: str) -> None:
+    check(crowd_of(law).double(), room(), "euler", compiled, threaded)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        pytest.param(effect, marks=() if effect == "drift" else pytest.mark.thorough)
+        for effect in CROWD_EFFECTS
+    ],
+)
+def test_every_effect_on_people(effect: str) -> None:
+    check(crowd_of("sf", effect).double(), room(), "euler", compiled)
 
 
 @pytest.mark.parametrize("leader", LEADERS)
