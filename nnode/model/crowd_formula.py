@@ -1,14 +1,16 @@
-"""The accelerations of a crowd by PyTorch, from the formula of its model."""
+"""The right-hand side of a crowd, from the formula of its model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.model.arrays import Code, computed
+from nnode.model.arrays import Code, computed, numpy_function
+from nnode.model.expression import Expr
 from nnode.model.scene import Scene
 from nnode.model.term import State, Term
 from nnode.model.terms import (
@@ -36,76 +38,131 @@ def people_of(terms: Sequence[Any], law: CrowdDynamics, scene: Scene) -> dict[st
     return {name: value.to(scene.destination.dtype) for name, value in found.items()}
 
 
+class CrowdRates:
+    """The right-hand side of a crowd's formula, by PyTorch or NumPy.
+
+    Arrays of people are ``(B, N)``, those of what people see ``(M, B, N)``: M others, wall points
+    or walls. An axis has length 1 where all values along it are the same.
+
+    Args:
+        terms: of the model.
+        law: their formula.
+        scene: surroundings of the B simulations.
+        parameters: by name; None: those of the terms.
+        code: what calls stand for.
+        numpy: whether to compute by NumPy; a formula with code cannot be.
+    """
+
+    def __init__(
+        self,
+        terms: Sequence[Term],
+        law: CrowdDynamics,
+        scene: Scene,
+        parameters: Mapping[str, Tensor] | None = None,
+        code: Mapping[str, Code] | None = None,
+        numpy: bool = False,
+    ) -> None:
+        self.law, self._code, self._numpy = law, code, numpy
+        values = values_of(law, {**own_values(terms, law), **(parameters or {})})
+        known = dict(zip(law.owned, values, strict=True))
+        like = scene.destination
+        known |= {name: like.new_tensor(value) for name, value in settings_of(terms, law).items()}
+        known |= dict(zip(("goal_x", "goal_y"), like.unbind(-1), strict=True))
+        known |= people_of(terms, law, scene)
+        self._known = self._arrays(known)
+        self._places: dict[str, dict[str, Any]] = {}
+        self._real: dict[str, Any] = {}
+        for over, sums in law.sums.items():
+            if sums:
+                places, real = _PLACES[over](scene)
+                self._places[over] = self._arrays(places)
+                self._real[over] = self._arrays({over: real.to(like.dtype)})[over]
+
+    def __call__(self, t: Any, states: Any, others: Any) -> list[Any]:
+        """Both components of the rates, ``(B, N)``, m/s² or m/s.
+
+        Args:
+            t: s, a number or ``(B, 1)``.
+            states: ``(4, B, N)`` positions and velocities.
+            others: ``(4, B, N)`` of those whom people see.
+        """
+        own = dict(zip(("x", "y", "vx", "vy"), states, strict=True)) | self._known | {"t": t}
+        sums: dict[str, Any] = {}
+        for over, found in self.law.sums.items():
+            if not found:
+                continue
+            places, seen = self._places[over], {}
+            if over in (OTHERS, SMALLEST):
+                places = dict(zip(("x", "y", "vx", "vy"), map(_of_each, others), strict=True))
+                seen = {f"{name}_j": _of_each(own[name]) for name in self.law.inputs}
+            for name, value in places.items():
+                seen |= {f"d{name}": own[name] - value} if name in own else {name: value}
+            known = own | sums if over == SMALLEST else own
+            each = self._computed(found.values(), known | seen)
+            real = self._real[over]
+            for name, value in zip(found, each, strict=True):
+                sums[name] = _smallest(value, real) if over == SMALLEST else (value * real).sum(0)
+        return self._computed(self.law.rate, own | sums)
+
+    def _computed(self, formulas: Iterable[Expr], values: Mapping[str, Any]) -> list[Any]:
+        if self._numpy:
+            return numpy_function(tuple(formulas))(values, ())
+        return computed(list(formulas), values, code=self._code)
+
+    def _arrays(self, values: Mapping[str, Tensor]) -> dict[str, Any]:
+        if not self._numpy:
+            return dict(values)
+        return {name: np.ascontiguousarray(value.detach()) for name, value in values.items()}
+
+
 def rates_of(
     terms: Sequence[Term], law: CrowdDynamics, state: State, code: Mapping[str, Code] | None = None
 ) -> Tensor:
     """``(B, N, 2)`` m/s² of a crowd's formula, m/s where it is of first order."""
-    x, scene = state.x, state.scene
-    v = state.v
+    x, v = state.x, state.v
     if v is None:
         v = torch.zeros_like(x) if law.order == 1 else state.others[1]
-    given: dict[str, Tensor] = {"t": state.t.to(x.dtype)}
-    given |= dict(zip(law.owned, values_of(law, own_values(terms, law)), strict=True))
-    given |= {name: x.new_tensor(value) for name, value in settings_of(terms, law).items()}
-    own = dict(zip(("x", "y", "vx", "vy"), (*x.unbind(-1), *v.unbind(-1)), strict=True))
-    own |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
-    own |= people_of(terms, law, scene)
-    sums: dict[str, Tensor] = {}
-    for over, found in law.sums.items():
-        if not found:
-            continue
-        seen, real = _SEEN[over](state, x, v)
-        if over in (OTHERS, SMALLEST):
-            seen |= {f"{name}_j": own[name][:, None] for name in law.inputs}
-        known = own | sums if over == SMALLEST else own
-        values = given | {name: value[:, :, None] for name, value in known.items()} | seen
-        each = computed(list(found.values()), values, code=code)
-        reduced = _least if over == SMALLEST else _sum
-        sums |= {
-            name: reduced(value, real).expand(x.shape[:2])
-            for name, value in zip(found, each, strict=True)
-        }
-    rate = computed(law.rate, given | own | sums, code=code)
-    return torch.stack([part.expand(x.shape[:2]) for part in rate], -1)
+    states = torch.cat([x, v], -1)
+    others = states if state.seen is None else torch.cat(state.seen, -1)
+    found = CrowdRates(terms, law, state.scene, code=code)(
+        state.t.to(x.dtype).reshape(-1, 1), states.movedim(-1, 0), others.movedim(-1, 0)
+    )
+    return torch.stack([part.expand(x.shape[:2]) for part in found], -1)
 
 
-def _sum(value: Tensor, real: Tensor) -> Tensor:
-    """Over the third axis, of what exists."""
-    return (value * real).sum(2)
+def _of_each(values: Any) -> Any:
+    """``(M, B, 1)`` of the values ``(B, M)`` of others."""
+    return values.T[..., None]
 
 
-def _least(value: Tensor, real: Tensor) -> Tensor:
-    """The smallest over the third axis, of what exists; the slope is that of the first of them."""
+def _smallest(value: Any, real: Any) -> Any:
+    """Over the first axis, of what exists; the slope is that of the first of them."""
+    if isinstance(value, np.ndarray):
+        return np.where(real > 0, value, NOBODY).min(0, initial=NOBODY)
     value = torch.where(real > 0, value, NOBODY)
-    nobody = value.new_full((*value.shape[:2], 1), NOBODY)
-    value = torch.cat([value, nobody], 2)
-    return value.gather(2, value.detach().argmin(2, keepdim=True))[..., 0]
+    value = torch.cat([value, value.new_full((1, *value.shape[1:]), NOBODY)])
+    return value.gather(0, value.detach().argmin(0, keepdim=True))[0]
 
 
-_Seen = tuple[dict[str, Tensor], Tensor]
+_Places = tuple[dict[str, Tensor], Tensor]
 
 
-def _others(state: State, x: Tensor, v: Tensor) -> _Seen:
-    """What everybody (second axis) sees of the others (third), and 1 where they are others."""
-    other, speed = state.seen or (x, v)
-    dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
-    apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
-    seen = {"dx": dx[..., 0], "dy": dx[..., 1], "dvx": dv[..., 0], "dvy": dv[..., 1]}
-    return seen, (state.scene.agent[:, None, :] & apart).to(x.dtype)
+def _others(scene: Scene) -> _Places:
+    """Nothing that is fixed, and ``(N, B, N)`` whom (first axis) a person (third) sees."""
+    apart = ~torch.eye(scene.agent.shape[1], dtype=torch.bool, device=scene.agent.device)
+    return {}, (scene.agent[:, None, :] & apart).movedim(2, 0)
 
 
-def _points(state: State, x: Tensor, v: Tensor) -> _Seen:
-    wall, normal, real = state.scene.walls_of_each()
-    dx = x[:, :, None] - wall
-    seen = {"dx": dx[..., 0], "dy": dx[..., 1]}
-    return seen | {"normal_x": normal[..., 0], "normal_y": normal[..., 1]}, real.to(x.dtype)
+def _points(scene: Scene) -> _Places:
+    wall, normal, real = (part.movedim(2, 0) for part in scene.walls_of_each())
+    axes = zip("xy", wall.unbind(-1), normal.unbind(-1), strict=True)
+    return {k: v for c, x, n in axes for k, v in ((c, x), (f"normal_{c}", n))}, real
 
 
-def _walls(state: State, x: Tensor, v: Tensor) -> _Seen:
-    ends, real = walls_of(state.scene)
-    dx, along = x[:, :, None] - ends[:, None, :, :2], ends[:, None, :, 2:]
-    seen = {"dx": dx[..., 0], "dy": dx[..., 1]}
-    return seen | {"along_x": along[..., 0], "along_y": along[..., 1]}, real[:, None].to(x.dtype)
+def _walls(scene: Scene) -> _Places:
+    ends, real = walls_of(scene)
+    parts = ends.movedim(1, 0)[..., None].unbind(2)
+    return dict(zip(("x", "y", "along_x", "along_y"), parts, strict=True)), real.T[..., None]
 
 
 def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -116,4 +173,4 @@ def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
     return torch.cat([ends[..., :2], ends[..., 2:] - ends[..., :2]], -1), real
 
 
-_SEEN = {OTHERS: _others, POINTS: _points, WALLS: _walls, SMALLEST: _others}
+_PLACES = {OTHERS: _others, POINTS: _points, WALLS: _walls, SMALLEST: _others}

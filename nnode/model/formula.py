@@ -183,19 +183,31 @@ def effect_increment(term: Term, state: State) -> Tensor:
     return torch.cat([change[..., None], found[..., 1:]], -1)
 
 
+def added_to(laws: Sequence[Term], effects: Sequence[Term], called: bool = False) -> CrowdDynamics:
+    """The formula of what effects add to a crowd's laws.
+
+    Args:
+        called: whether networks of laws stay functions.
+    """
+    terms = [*laws, *effects]
+    key = ("added", len(laws), called, *(t.shape for t in terms))
+    if key not in _KNOWN:
+        model, names = CrowdDynamics(), owners(terms)
+        for i, law in enumerate(laws):
+            model = with_term(model, law, names[i], i, called)
+        model = replace(model, rate=(const(0), const(0)))
+        for i, effect in enumerate(effects, start=len(laws)):
+            model = with_term(model, effect, names[i], i)
+        _KNOWN[key] = model.flat()
+    found: CrowdDynamics = _KNOWN[key]
+    return found
+
+
 def contribution(term: Term, state: State) -> Tensor:
     """``(B, N, 2)`` m/s²: what one effect adds to the accelerations, by its rule."""
-    bases = [t for t in state.terms if isinstance(t, Law)]
-    terms = [term, *bases]
-    key = ("contribution", *(t.shape for t in terms))
-    if key not in _KNOWN:
-        law, names = CrowdDynamics(), owners(terms)
-        for i, base in enumerate(bases, start=1):
-            law = with_term(law, base, names[i], i, called=True)
-        law = replace(law, rate=(const(0), const(0)))
-        _KNOWN[key] = with_term(law, term, names[0], 0).flat()
-    code = {name: call for base in bases for name, call in base.code().items()}
-    return crowd_rates(terms, _KNOWN[key], state, code)
+    laws = [t for t in state.terms if isinstance(t, Law)]
+    code = {name: call for law in laws for name, call in law.code().items()}
+    return crowd_rates([*laws, term], added_to(laws, [term], called=True), state, code)
 
 
 def starts_of(

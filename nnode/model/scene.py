@@ -33,6 +33,8 @@ class Scene:
         wall_count: ``(B, 1, 1)`` number of real wall points, at least 1.
         segment: ``(B, W, 4)`` walls x1, y1, x2, y2, m; NaN in the padding.
         start: ``(B,)`` clock time of the first sample, s.
+        near: wall points, normals and mask as of :meth:`walls_of_each`, where people feel a part of
+            the points; None: they feel all.
         step: s, of the solver; method: what becomes of a law in it, see :mod:`nnode.model.steps`.
         preferred: ``(B, N, D)`` velocities before the sequence, m/s; the first measured ones where
             nothing was measured before.
@@ -56,6 +58,7 @@ class Scene:
     segment: Tensor
     start: Tensor
     preferred: Tensor
+    near: tuple[Tensor, Tensor, Tensor] | None = None
     step: float = 0.1
     method: str = "euler"
     names: tuple[str, ...] = ()
@@ -95,6 +98,8 @@ class Scene:
     def walls_of_each(self) -> tuple[Tensor, Tensor, Tensor]:
         """Wall points ``(B, N or 1, P, 2)`` that each person feels, their normals, and the mask
         ``(B, N or 1, P)`` of real ones."""
+        if self.near is not None:
+            return self.near
         return self.wall[:, None], self.wall_normal[:, None], self.wall_point[:, None]
 
     def measured_at(self, t: Tensor) -> Tensor:

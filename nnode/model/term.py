@@ -21,7 +21,7 @@ class State:
     """What the terms of a model see at one moment.
 
     Attributes:
-        t: seconds since the first sample, a scalar tensor.
+        t: seconds since the first sample, a scalar tensor, or ``(B,)``.
         x: ``(B, N, D)`` positions, m.
         v: ``(B, N, D)`` velocities, m/s; None in first-order models.
         scene: everything that does not change during the simulation.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,36 +15,22 @@ from torch import Tensor
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.able import check_model
-from nnode.discover.crowds.response import Frames, propagate
 from nnode.discover.crowds.variables import crowd_variables
-from nnode.discover.crowds.walk import Tables, Walk
 from nnode.discover.crowds.whitening import Whitening
-from nnode.discover.crowds.windows import Windows, WindowScene
+from nnode.discover.crowds.windows import Windows
 from nnode.discover.found import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
+from nnode.simulate.alone import PersonAlone, RunAlone, Surroundings
 
 #: A simulated person is never further than this from the measured one, m: contacts may throw
 #: somebody far away, and the rest of the run still counts.
 LIMIT = 3.0
-
-
-@dataclass
-class Linearised:
-    """A model at one row of parameters.
-
-    Attributes:
-        system: the model.
-        row: ``(K,)`` its parameters.
-        frames: the moments along its paths.
-    """
-
-    system: System
-    row: Tensor
-    frames: Frames
+#: Pairs of people in the largest intermediate result.
+CHUNK = 100_000
 
 
 class CrowdEngine:
@@ -89,10 +75,9 @@ class CrowdEngine:
         self.people = [[(int(b), int(i))] for b, i in pairs]
         self.names = [item.name for item in sequences]
         self._label(1)
-        self._scene: WindowScene | None = None
-        self._tables: Tables | None = None
+        self._around: Surroundings | None = None
         self._whitening: Whitening | None = None
-        self._now: Linearised | None = None
+        self._run: tuple[System, Tensor, RunAlone] | None = None
 
     # -- what every engine has -------------------------------------------------------------
 
@@ -139,13 +124,11 @@ class CrowdEngine:
 
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""
-        scene = self.windows.scene(Crowd([]))
-        frames = scene.frames(2, self.windows.step * torch.arange(self.windows.steps + 1).double())
-        assert frames.speed is not None
-        zero = torch.zeros((), dtype=frames.speed.dtype)
-        state = State(zero, frames.measured[0], frames.speed[0], frames)
+        windows, nothing = self.windows, Crowd([])
+        x, v = windows.batch.x[::2], windows.batch.v[::2]
+        run = RunAlone(windows.around(nothing), nothing, x, v)
         first = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
-        return crowd_variables(state, first)
+        return crowd_variables(run.state, first)
 
     def noise_floor(self) -> float:
         """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed
@@ -159,22 +142,16 @@ class CrowdEngine:
         Called after a fit was accepted; residuals from before cannot be compared with later ones,
         and even their number may change.
         """
-        walk = self._walk(system)
-        x, v = walk.paths(row[None])
-        start, forced = propagate(Frames(walk, row, x[:, 0], v[:, 0]).jacobian(), walk.windows.step)
+        self._run = self._simulated(system, row)
+        start, forced = self._run[-1].unit_responses()
         every = self.windows.sub
-        difference = self._difference(x)[0].numpy()
-        turn = self._turns()
+        difference = self._differences(system, row[None])[0].numpy()
         self._whitening = Whitening.fit(
-            difference, start[:, ::every].numpy(), turn, self.windows.variance
+            difference, start[:, ::every].numpy(), self._turns(), self.windows.variance
         )
-        matrix = torch.as_tensor(self._whitening.matrix())
-        sampled = forced[:, ::every]
-        p, length = sampled.shape[:2]
-        self._response = matrix @ sampled.reshape(p, length * 2, -1)
-        self._matrix = matrix
-        self._label(matrix.shape[1])
-        self._now = None
+        self._matrix = torch.as_tensor(self._whitening.matrix())
+        self._response = self._matrix @ forced[:, ::every].flatten(1, 2)
+        self._label(self._matrix.shape[1])
 
     def _label(self, each: int) -> None:
         """Say whose ``each`` residuals of every person's window are."""
@@ -185,36 +162,39 @@ class CrowdEngine:
         self.component = np.tile(np.arange(each), len(which))
         self.unit = self._unit.repeat(each)
 
-    # -- what makes it fast ----------------------------------------------------------------
+    # -- linear response ----------------------------------------------------------------------
 
-    def linearised(self, system: System, row: Tensor) -> Linearised:
+    def linearised(self, system: System, row: Tensor) -> RunAlone:
         """A model along its own paths; the response is that of the model it was settled at."""
         self._settled(system, row)
-        now = self._now
-        if now is not None and now.system is system and torch.equal(now.row, row):
-            return now
-        walk = self._walk(copy.deepcopy(system))
-        ParameterVector(walk.system).fill_(row)
-        x, v = walk.paths(row[None])
-        self._now = Linearised(system, row.clone(), Frames(walk, row, x[:, 0], v[:, 0]))
-        return self._now
+        if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
+            self._run = self._simulated(system, row)
+        return self._run[-1]
+
+    def _simulated(self, system: System, row: Tensor) -> tuple[System, Tensor, RunAlone]:
+        states = self._states(system, row[None])[:, 0]
+        filled = ParameterVector(copy.deepcopy(system)).fill_(row)
+        assert self._around is not None
+        run = RunAlone(self._around, filled, states[..., :2], states[..., 2:])
+        return system, row.clone(), run
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)``: derivatives of the residuals with respect to the calibrated parameters.
 
         By linear response; a simulation for each parameter gives nearly the same.
         """
-        frames = self.linearised(system, row).frames
-        return torch.stack([self._respond(rate, frames) for rate in frames.parameter_tangents()])
+        run = self.linearised(system, row)
+        rates = run.parameters(_differences(system))
+        return torch.stack([self._respond(rate, run) for rate in rates])
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
     ) -> Tensor:
         """``(M, n)``: changes of the residuals by M weak additional accelerations, each a function
         of the states, ``(B, N, 2)`` m/s²."""
-        frames = self.linearised(system, row).frames
+        run = self.linearised(system, row)
         with torch.no_grad():
-            return torch.stack([self._respond(rate, frames) for rate in rates(frames.state())])
+            return torch.stack([self._respond(rate, run) for rate in rates(run.state)])
 
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
@@ -243,17 +223,15 @@ class CrowdEngine:
         As people walk alone, the derivative with respect to one person's amount is the same
         column, restricted to the residuals of this unit.
         """
-        frames = self.linearised(system, row).frames
-        state = frames.state()
-        names = set(frames.scene.names)
-        most = state.x.shape[1]
+        names, most = set(self.batch.names), self.windows.batch.x.shape[2]
 
-        def column(values: dict[str, Any], number: float) -> Tensor:
-            people = {name: [number] * most for name in names}
-            return self._respond(effect(people=people, **values)(state), frames)
+        def rates(state: State) -> list[Tensor]:
+            return [
+                effect(people={name: [number] * most for name in names}, **values)(state)
+                for values, number in effect.directions(options)
+            ]
 
-        with torch.no_grad():
-            return torch.stack([column(*one) for one in effect.directions(options)])
+        return self.response(system, row, rates)
 
     # -- parts -----------------------------------------------------------------------------
 
@@ -263,31 +241,32 @@ class CrowdEngine:
         assert self._whitening is not None
         return self._whitening
 
-    def _respond(self, rate: Tensor, frames: Frames) -> Tensor:
-        """``(n,)``: change of the residuals by accelerations ``(W * F, N, 2)``."""
-        field = frames.of_people(rate)
-        moved = self._response @ field.reshape(len(field), -1, 1)
-        return -moved.reshape(-1)
+    def _respond(self, rate: Tensor, run: RunAlone) -> Tensor:
+        """``(n,)``: change of the residuals by accelerations of the people."""
+        return -(self._response @ run.of_people(rate)[..., None]).reshape(-1)
 
     def _differences(self, system: System, rows: Tensor) -> Tensor:
-        return self._difference(self._walk(system).paths(rows)[0])
-
-    def _difference(self, x: Tensor) -> Tensor:
-        """``(R, P, L, 2)`` m: measured minus simulated positions ``(F, R, P, 2)``."""
+        """``(R, P, L, 2)`` m: measured minus simulated positions."""
         which, who = self.windows.person.T
+        x = self._states(system, rows)[:: self.windows.sub, :, which, who, :2]
         measured = torch.from_numpy(self.windows.measured[:, which, who])
-        difference = (measured[:, None] - x[:: self.windows.sub]).permute(1, 2, 0, 3)
+        difference = (measured[:, None] - x).permute(1, 2, 0, 3)
         return difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
 
-    def _walk(self, system: System) -> Walk:
+    def _states(self, system: System, rows: Tensor) -> Tensor:
+        """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps."""
+        windows = self.windows
         # the systems of one diagnosis share walls, radii and masses: the first stands for all
-        if self._scene is None:
+        if self._around is None:
             check_model(system)
-            self._scene = self.windows.scene(system)
-        walk = Walk(self.windows, self._scene, system, self._tables)
-        if walk.compiled:
-            self._tables = walk.tables
-        return walk
+            self._around = windows.around(system)
+        w, n = windows.batch.agent.shape
+        first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
+        found = []
+        for part in rows.split(max(1, CHUNK // (w * n * n))):
+            rhs = PersonAlone(self._around, system, ParameterVector(system).runs(part))
+            found.append(rhs.simulated(first, windows.steps))
+        return torch.cat(found, 1)
 
     def _turns(self) -> np.ndarray:
         """``(P, 2, 2)``: rows along and across each person's way in his window."""
@@ -299,3 +278,15 @@ class CrowdEngine:
         way = np.where(slow[:, None], far, way)
         way = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
         return np.stack([way, np.stack([-way[:, 1], way[:, 0]], 1)], 1)
+
+
+def _differences(system: System) -> list[float]:
+    """``(K,)``: differences of the parameters by which derivatives are taken."""
+    found = []
+    for name, p in ParameterVector(system).parameters.items():
+        _, place, key = name.split(".", 2)
+        term = system.terms[int(place)]
+        strength = term.strengths.get(key) if isinstance(term, Effect) else None
+        size = 1e-3 * max(1.0, float(p.detach().abs().max()))
+        found += [size if strength is None else abs(strength.step)] * p.numel()
+    return found

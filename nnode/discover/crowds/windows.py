@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,8 @@ from nnode.data.sequence import PADDING_GAP, Batch, Sequence, collate
 from nnode.discover.crowds.paths import Smoother
 from nnode.errors import DataError
 from nnode.model.scene import Scene
-from nnode.model.system import Crowd, System
+from nnode.model.system import System
+from nnode.simulate.alone import Surroundings
 
 #: Longest step of a simulation, and about the interval of the residuals, s.
 STEP = 0.13
@@ -28,60 +27,6 @@ LEFT_OUT = 0.1
 CUT = 11.0
 #: How far a simulated person may stray from the measured path before walls are missed, m.
 STRAY = 0.5
-
-
-@dataclass
-class WindowScene(Scene):
-    """A scene of windows, with what only makes sense for people who walk alone.
-
-    Attributes:
-        speed: ``(K, B, N, 2)`` m/s: velocities of the others, at the times of ``measured``.
-        near: wall points, normals and mask of each person, ``(B, N, P, ...)``; None: all
-            points of the scene for everyone.
-    """
-
-    speed: Tensor | None = None
-    near: tuple[Tensor, Tensor, Tensor] | None = None
-
-    def measured_rate_at(self, t: Tensor) -> Tensor:
-        if self.speed is None:
-            return super().measured_rate_at(t)
-        position = t / self.dt
-        k = torch.floor(position + 1e-4).long().clamp(0, self.speed.shape[0] - 2)
-        weight = (position - k).clamp(0, 1).to(self.speed.dtype)
-        return torch.lerp(self.speed[k], self.speed[k + 1], weight)
-
-    def walls_of_each(self) -> tuple[Tensor, Tensor, Tensor]:
-        return super().walls_of_each() if self.near is None else self.near
-
-    def frames(self, every: int, t: Tensor) -> WindowScene:
-        """The scene of the single moments ``t`` (F,), each a simulation of its own.
-
-        Its ``B * F`` simulations are ordered by window, then time. ``every`` samples of
-        ``measured`` lie between the moments.
-        """
-        number = len(t)
-        chosen = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("measured", "speed"):
-                moments = value[::every][:number]
-                value = moments.transpose(0, 1).reshape(1, -1, *value.shape[2:])
-                value = value.expand(2, *value.shape[1:])
-            elif field.name == "near":
-                value = value and tuple(part.repeat_interleave(number, 0) for part in value)
-            elif field.name == "start":
-                value = (value[:, None] + t).reshape(-1)
-            elif isinstance(value, Tensor):
-                value = value.repeat_interleave(number, 0)
-            elif isinstance(value, tuple):
-                value = tuple(item for item in value for _ in range(number))
-            chosen[field.name] = value
-        scene = WindowScene(**chosen)
-        if self.group:
-            # found once for all moments
-            scene.__dict__["companies"] = self.companies.repeat_interleave(number, 0)
-        return scene
 
 
 class Windows:
@@ -152,24 +97,15 @@ class Windows:
         """Steps of the simulation of a window."""
         return self.sub * (self.length - 1)
 
-    def scene(self, system: System) -> WindowScene:
-        """The surroundings in which ``system`` simulates the windows."""
-        plain = system.scene(self.batch)
-        scene = WindowScene(**{f.name: getattr(plain, f.name) for f in fields(plain)})
-        scene.speed = self.batch.v
+    def around(self, system: System) -> Surroundings:
+        """What people walk among where ``system`` simulates them."""
+        scene = system.scene(self.batch)
         force: Any = system.find_law("social_force")
         if force is not None and scene.wall.shape[1]:
             reach = force.r + CUT * force.B + STRAY
             scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)
-        return scene
-
-
-def alone(system: System) -> Crowd:
-    """The same model, parameters included, of people among measured others."""
-    assert isinstance(system, Crowd)
-    view = copy.copy(system)
-    view.neighbours = "measured"
-    return view
+        window, person = torch.from_numpy(self.person).T
+        return Surroundings(scene, self.batch.x, self.batch.v, window, person, self.step)
 
 
 def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Sequence:

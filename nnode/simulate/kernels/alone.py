@@ -6,14 +6,15 @@ A person is a number p; his surroundings are tables:
 * ``window`` ``(P,)``: his window; ``meets`` ``(P, N)``: 1 for everyone he meets, else 0;
 * ``wall`` ``(P, 4, M)``: the wall points near him and their normals, the first ``points[p]`` of
   them real;
-* ``have`` ``(P, F)``: what he has besides his state; ``q`` ``(R, U)``: parameters of R runs.
+* ``have`` ``(P, F)``: what he has besides his state, see ``FIELDS``; ``q`` ``(R, U)``:
+  parameters of R runs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from types import ModuleType
 
 from nnode.model.expression import Expr, symbols
@@ -74,6 +75,8 @@ def accelerations(
         )
     return out
 '''
+#: What a person has besides his state.
+FIELDS = ("goal_x", "goal_y", "pace", "people", "points")
 _STATE = ("x", "y", "vx", "vy")
 _SUMS = (OTHERS, POINTS, WALLS)
 
@@ -92,12 +95,6 @@ class WalkSource:
     def parameters(self) -> list[str]:
         """Symbols of a row of ``q``."""
         return [*self.law.owned, *self.law.settings]
-
-    @cached_property
-    def fields(self) -> list[str]:
-        """What people have."""
-        names = ("goal_x", "goal_y", "pace", "people", "points")
-        return [n for n in names if n in self.law.symbols]
 
     def text(self) -> str:
         """The module's source.
@@ -138,7 +135,7 @@ class WalkSource:
         used = symbols(outputs)
         text = f"\n\n@njit(**OPTIONS)\ndef {name}({', '.join(takes)}, have, q):\n"
         lines = ["dt = zero = 0.0", *loop.given(outputs)]
-        lines += [f"{field} = have[{i}]" for i, field in enumerate(self.fields) if field in used]
+        lines += [f"{field} = have[{i}]" for i, field in enumerate(FIELDS) if field in used]
         text += "".join(f"    {line}\n" for line in [*lines, *loop.lines(names).values()])
         return text + f"    return {_tuple([names[node] for node in outputs])}\n"
 
