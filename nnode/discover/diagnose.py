@@ -186,8 +186,7 @@ def _diagnosed(
         for one, agent in both
         if not agent.found
     ]
-    changed = bool(found.steps or own)
-    extended = sealed.with_numbers(engine, final, own) if changed else base_system
+    extended = sealed.with_numbers(engine, final, own) if found.steps or own else base_system
     gap, each, simulated = sealed.gap(extended, own)
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)

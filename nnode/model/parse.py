@@ -103,15 +103,7 @@ class _Reader:
             raise self.fail(node, f"it is nested more than {DEPTH} deep; name parts under where")
         match node:
             case ast.BinOp() if type(node.op) in _BINARY:
-                a, b = self.read(node.left, depth + 1), self.read(node.right, depth + 1)
-                power = isinstance(node.op, ast.Pow) and b.op == "const"
-                if power and abs(b.value) > EXPONENT:
-                    raise self.fail(node.right, f"an exponent is at most {EXPONENT}")
-                negative = power and b.value < 0
-                divides = isinstance(node.op, ast.Div)
-                if (divides and b.is_number(0)) or (negative and a.is_number(0)):
-                    raise self.fail(node.right, "this divides by 0")
-                return _BINARY[type(node.op)](a, b)
+                return self.binary(node, depth)
             case ast.UnaryOp(op=ast.USub()):
                 return -self.read(node.operand, depth + 1)
             case ast.UnaryOp(op=ast.UAdd()):
@@ -120,16 +112,30 @@ class _Reader:
                 if not abs(value) <= sys.float_info.max:
                     raise self.fail(node, "this number is too large")
                 return const(value)
-            case ast.Name(id=name):
-                if self.names is None:
-                    return symbol(name)
-                if name not in self.names:
-                    listed = ", ".join(sorted(self.names))
-                    raise self.fail(node, f"{name} is unknown; there are {listed}")
-                return self.names[name]
+            case ast.Name():
+                return self.name(node)
             case ast.Call(func=ast.Name(id=name)):
                 return self.call(node, name, depth)
         raise self.fail(node, f"this is not allowed in a formula; {_LISTED}")
+
+    def name(self, node: ast.Name) -> Expr:
+        if self.names is None:
+            return symbol(node.id)
+        if node.id not in self.names:
+            listed = ", ".join(sorted(self.names))
+            raise self.fail(node, f"{node.id} is unknown; there are {listed}")
+        return self.names[node.id]
+
+    def binary(self, node: ast.BinOp, depth: int) -> Expr:
+        a, b = self.read(node.left, depth + 1), self.read(node.right, depth + 1)
+        power = isinstance(node.op, ast.Pow) and b.op == "const"
+        if power and abs(b.value) > EXPONENT:
+            raise self.fail(node.right, f"an exponent is at most {EXPONENT}")
+        negative = power and b.value < 0
+        divides = isinstance(node.op, ast.Div)
+        if (divides and b.is_number(0)) or (negative and a.is_number(0)):
+            raise self.fail(node.right, "this divides by 0")
+        return _BINARY[type(node.op)](a, b)
 
     def call(self, node: ast.Call, name: str, depth: int) -> Expr:
         if name in self.laws:

@@ -254,9 +254,7 @@ class Law(Term):
             setattr(self, module, FeedForward(sizes, generator))
         if added:
             assert self.network is not None
-            with torch.no_grad():
-                for weight in self.network.layers[-1].parameters():
-                    weight.zero_()
+            self.network.zero_output_()
 
     def _coded(self) -> None:
         """Say by ``rule`` what the class says: formulas, or calls of its own code."""

@@ -736,13 +736,7 @@ def split(
             continue
         features[over], sums = {}, {f"{over}_one": const(1)}
         for k, (g, (start, weights)) in enumerate(zip(inner, numbers, strict=True)):
-            own, other = start, const(0)
-            for part, weight in weights.items():
-                mine, its = parts[part.value]
-                own = own + weight * symbol(mine) if mine else own
-                if its:
-                    other = other + weight * symbol(its) if mine else other - weight * symbol(its)
-            features[over][f"{over}_z{k}"] = (own, other)
+            features[over][f"{over}_z{k}"] = _feature(parts, start, weights)
             sums[f"{over}_s{k}"] = apply(g.op, symbol(f"{over}_z{k}"))
         total = {}
         for name, (start, weights) in outer.items():
@@ -752,6 +746,19 @@ def split(
         x, y = (substitute(rate, total) for rate in law.rate)
         law = replace(law, rate=(x, y), sums={**law.sums, over: sums})
     return law, features
+
+
+def _feature(
+    parts: Mapping[str, tuple[str, str]], start: Expr, weights: Mapping[Expr, Expr]
+) -> tuple[Expr, Expr]:
+    """The share of a feature that a person has of himself, and that which he has of the other."""
+    own, other = start, const(0)
+    for part, weight in weights.items():
+        mine, its = parts[part.value]
+        own = own + weight * symbol(mine) if mine else own
+        if its:
+            other = other + weight * symbol(its) if mine else other - weight * symbol(its)
+    return own, other
 
 
 def _weights(node: Expr, same: Callable[[Expr], bool]) -> tuple[Expr, dict[Expr, Expr]]:
