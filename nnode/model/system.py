@@ -208,9 +208,17 @@ class Traffic(System):
             return []
         terms, lane, scene = self._terms(), self.lane, self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
+        if lane is None:  # code that remembers nothing does not matter at the start
+            rules = [term.rule_for(self.order) for term in terms]
+            added = [
+                term
+                for term, rule in zip(terms[1:], rules[1:], strict=True)
+                if rule is not None and rule.memory
+            ]
+            lane = lane_of([terms[0], *added])
+            terms = [terms[0], *added]
         models = [(terms, lane)]
         if lane is None:
-            added = [term for term in terms if (rule := term.rule_for(1)) and rule.memory]
             models = [([terms[0], term], effect_alone(terms[0], term)) for term in added]
         found: dict[tuple[int, str], Tensor] = {}
         for i, (own, formula) in enumerate(models):
