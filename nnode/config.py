@@ -46,6 +46,7 @@ from nnode.model.options import (
     NetworkSpeedOptions,
     SocialForceOptions,
 )
+from nnode.program import configuration
 from nnode.study.options import (
     CrowdStudyOptions,
     FollowingStudyOptions,
@@ -178,15 +179,12 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "formula_schema"): FormulaOptions(term="formula"),
+    # a law is chosen by its name; its file among the laws is all that it needs
     **{
-        ("model", f"{name}_schema"): FormulaOptions(
-            term="formula", law=law, network=NEURONS.get(name)
+        ("model", name): FormulaOptions(
+            name=name, term="formula", law=law, network=NEURONS.get(name)
         )
-        for name, law in CAR_FOLLOWING_LAWS.items()
-    },
-    **{
-        ("model", f"{name}_schema"): FormulaOptions(term="formula", law=law)
-        for name, law in PEDESTRIAN_LAWS.items()
+        for name, law in (CAR_FOLLOWING_LAWS | PEDESTRIAN_LAWS).items()
     },
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),
@@ -213,6 +211,13 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("study", "walking_study_schema"): WalkingStudyOptions,
     ("study", "following_study_schema"): FollowingStudyOptions,
 }
+
+
+def choices(group: str) -> list[str]:
+    """Names that a group of the configuration has: those of the files ``conf/GROUP/NAME.yaml``, and
+    of the laws."""
+    files = {path.stem for path in (configuration() / group).glob("*.yaml")}
+    return sorted(files | {n for own, n in SCHEMAS if own == group and not n.endswith("_schema")})
 
 
 def register() -> None:

@@ -69,11 +69,6 @@ def configuration() -> Path:
     return installed if installed.is_dir() else package.parent / "conf"
 
 
-def choices(group: str) -> list[str]:
-    """Names that a group of the configuration has: those of the files ``conf/GROUP/NAME.yaml``."""
-    return sorted(path.stem for path in (configuration() / group).glob("*.yaml"))
-
-
 def own_choices(group: str) -> list[str]:
     """The same of the user's own folder, which the command line names with ``--config-dir``."""
     found = [after for word, after in pairwise(sys.argv) if word in _CONFIG_DIR]

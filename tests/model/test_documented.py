@@ -51,7 +51,6 @@ def test_the_field_s_laws_stand_in_the_page_with_their_parameters(name: str) -> 
     shown = row[3].replace("κ", "kappa").replace("λ", "lam")
     names = {part.strip() for part in shown.split(",")}
     assert names == (set(CAR_FOLLOWING_LAWS[name]["parameters"]) or {"weights"})
-    assert Path(f"conf/model/{name}.yaml").is_file()
     assert f"`{name}`" in Path("README.md").read_text("utf-8")
 
 

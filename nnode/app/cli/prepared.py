@@ -10,10 +10,10 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.app.cli.recognised import with_recognised
 from nnode.app.cli.saved import in_hydra, keys_given, path_given, plain
 from nnode.app.cli.typed import written
+from nnode.config import choices
 from nnode.data.prepare import NOT_PREPARATION, made_by, refuse_others
 from nnode.data.store import Store
 from nnode.errors import ConfigError
-from nnode.program import choices
 
 
 def prepared_group(overrides: list[str]) -> list[str]:

@@ -10,9 +10,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.config import choices
 from nnode.errors import CheckpointError, ConfigError
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.program import choices, own_choices
+from nnode.program import own_choices
 
 GROUPS = ("model", "data", "optimizer", "solver")
 

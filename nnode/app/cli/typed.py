@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, make_absolute, plain
 from nnode.errors import ConfigError
-from nnode.program import choices, configuration
+from nnode.program import configuration
 
 
 def shell_override(key: str, value: object) -> str:
@@ -75,7 +75,7 @@ def written(section: str, group: str) -> tuple[type, DictConfig]:
     Raises:
         ConfigError: no such file.
     """
-    from nnode.config import SCHEMAS
+    from nnode.config import SCHEMAS, choices
 
     if group not in choices(section):
         raise ConfigError(

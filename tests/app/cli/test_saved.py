@@ -16,9 +16,9 @@ from nnode.app.cli.saved import GROUPS, merge_saved, refuse_changes, saved_group
 from nnode.app.cli.typed import group_defaults
 from nnode.app.export import groups_of_run
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
+from nnode.config import choices
 from nnode.errors import CheckpointError, ConfigError
 from nnode.model import build_model
-from nnode.program import choices, configuration
 from tests.app.conftest import composed
 
 UP = "../" * 12 + "proc/self/cwd/theirs"
@@ -42,7 +42,6 @@ def test_groups_are_files_of_the_configuration(tmp_path: Path) -> None:
     assert found == [f"{group}={name}" for group, name in own.items()]
     for group, name in own.items():
         assert name in choices(group)
-        assert (configuration() / group / f"{name}.yaml").is_file()
     assert saved_groups([f"resume={path}", "data=esimas"], "resume", ("data",)) == []
 
 

@@ -17,6 +17,7 @@ import nnode
 from nnode.app.python.inputs import named
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import evaluate
+from nnode.config import choices
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, NotFittedError
 from nnode.model import Traffic, make_law
@@ -290,9 +291,9 @@ def test_one_call_calibrates_with_some_held_out(tidy: pd.DataFrame) -> None:
 
 
 def test_models_bear_the_names_of_the_configuration() -> None:
-    files = {p.stem for p in (Path(__file__).parents[3] / "conf" / "model").glob("*.yaml")}
     own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
-    assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == files
-    assert all(named(name)["name"] == name for name in files)
+    known = choices("model")
+    assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == set(known)
+    assert all(named(name)["name"] == name for name in known)
     with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of lin, log"):
         named("lwr")
