@@ -78,20 +78,22 @@ class CrowdRates:
                 self._places[over] = self._arrays(places)
                 self._real[over] = self._arrays({over: real.to(like.dtype)})[over]
 
-    def __call__(self, t: Any, states: Any, others: Any) -> list[Any]:
+    def __call__(self, t: Any, states: Any, others: Any, part: slice = slice(None)) -> list[Any]:
         """Both components of the rates, ``(B, N)``, m/s² or m/s.
 
         Args:
             t: s, a number or ``(B, 1)``.
             states: ``(4, B, N)`` positions and velocities.
             others: ``(4, B, N)`` of those whom people see.
+            part: of the simulations, whose states these are.
         """
-        own = dict(zip(("x", "y", "vx", "vy"), states, strict=True)) | self._known | {"t": t}
+        own = dict(zip(("x", "y", "vx", "vy"), states, strict=True)) | {"t": t}
+        own |= {name: value[part] if value.ndim else value for name, value in self._known.items()}
         sums: dict[str, Any] = {}
         for over, found in self.law.sums.items():
             if not found:
                 continue
-            places, seen = self._places[over], {}
+            places, seen = {k: v[:, part] for k, v in self._places[over].items()}, {}
             if over in (OTHERS, SMALLEST):
                 places = dict(zip(("x", "y", "vx", "vy"), map(_of_each, others), strict=True))
                 seen = {f"{name}_j": _of_each(own[name]) for name in self.law.inputs}
@@ -99,7 +101,7 @@ class CrowdRates:
                 seen |= {f"d{name}": own[name] - value} if name in own else {name: value}
             known = own | sums if over == SMALLEST else own
             each = self._computed(found.values(), known | seen)
-            real = self._real[over]
+            real = self._real[over][:, part]
             for name, value in zip(found, each, strict=True):
                 sums[name] = _smallest(value, real) if over == SMALLEST else (value * real).sum(0)
         return self._computed(self.law.rate, own | sums)
@@ -112,7 +114,7 @@ class CrowdRates:
     def _arrays(self, values: Mapping[str, Tensor]) -> dict[str, Any]:
         if not self._numpy:
             return dict(values)
-        return {name: np.ascontiguousarray(value.detach()) for name, value in values.items()}
+        return {name: np.array(value.detach().numpy(), order="C") for name, value in values.items()}
 
 
 def rates_of(

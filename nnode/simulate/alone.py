@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import takewhile
 from typing import cast
@@ -29,9 +29,12 @@ from nnode.model.terms import CrowdDynamics, own_values, values_of
 from nnode.simulate.kernels.alone import FIELDS, WalkSource, compiled
 from nnode.simulate.linear import DenseSolver
 from nnode.simulate.numpy import simulated
+from nnode.simulate.rhs import side_by_side
 
 #: Differences of positions (m) and velocities (m/s) for derivatives.
 DIFFERENCE = 1e-4
+#: Pairs of people in an array that fits the cache; people whose response is computed at once.
+CACHED, PEOPLE = 8192, 512
 
 
 @dataclass
@@ -56,19 +59,7 @@ class Surroundings:
     def repeated(self, number: int) -> Scene:
         """The scene so many times; simulation w of run or time l is l W + w."""
         if number not in self._scenes:
-            found = {}
-            for part in fields(self.scene):
-                value = getattr(self.scene, part.name)
-                if part.name in ("measured", "measured_rate"):
-                    value = value[:2].repeat(1, number, 1, 1)
-                elif part.name == "near":
-                    value = value and tuple(torch.cat([one] * number) for one in value)
-                elif isinstance(value, Tensor):
-                    value = torch.cat([value] * number)
-                elif isinstance(value, tuple):
-                    value = value * number
-                found[part.name] = value
-            self._scenes[number] = type(self.scene)(**found)
+            self._scenes[number] = side_by_side(self.scene, number)
         return self._scenes[number]
 
     @cached_property
@@ -181,15 +172,18 @@ class PersonAlone:
         return torch.cat(found)
 
     def _add_effects(self, moment: np.ndarray, x: Tensor, v: Tensor, rate: Tensor) -> None:
-        """Add the accelerations by effects; one simulation after the other, for arrays that fit
-        the cache."""
+        """Add the accelerations by effects, in parts that fit the cache."""
         around, out = self.around, rate.numpy()
         states = torch.cat([x, v], -1).permute(0, 3, 1, 2).contiguous().numpy()
+        windows, people = states.shape[2:]
+        size = max(1, CACHED // people**2)
         for k, at in enumerate(moment):
             effects = self._effects[k if self.number > 1 else 0]
-            found = effects(at * around.step / 2, states[k], around.others[at])
-            for axis in range(2):
-                out[k, ..., axis] += found[axis]
+            for first in range(0, windows, size):
+                part = slice(first, first + size)
+                now, others = states[k][:, part], around.others[at][:, part]
+                for axis, found in enumerate(effects(at * around.step / 2, now, others, part)):
+                    out[k, part, :, axis] += found
 
     def simulated(self, start: Tensor, steps: int) -> Tensor:
         """``(F, R, W, N, 4)`` positions (m) and velocities (m/s) at the steps, from ``start``
@@ -302,16 +296,18 @@ class RunAlone:
             )
             slope = (higher - lower)[:, self.around.window, self.around.person]
             matrix[..., 2:, k] = slope.numpy() / (2 * DIFFERENCE)
-        times, people = matrix.shape[:2]
-        start = np.zeros((2, 2, 4 + 2 * times, people))
-        source = np.zeros((times, 2, 2, 4 + 2 * times, people))
+        times = len(matrix)
+        start = np.zeros((2, 2, 4 + 2 * times, 1))
+        source = np.zeros((times, 2, 2, 4 + 2 * times, 1))
         start[0, 0, 0] = start[0, 1, 1] = start[1, 0, 2] = start[1, 1, 3] = 1.0
-        curved = _curved(times)
         for axis in range(2):
-            source[:, 1, axis, 4 + axis :: 2] = curved[..., None]
-        solver = DenseSolver(matrix, 2, self.around.step)
-        found = torch.from_numpy(solver.response(source, start)).permute(3, 0, 1, 2)
-        return found[..., :4], found[..., 4:]
+            source[:, 1, axis, 4 + axis :: 2, 0] = _curved(times)
+        found = []
+        for part in np.split(matrix, range(PEOPLE, matrix.shape[1], PEOPLE), 1):
+            every = [np.repeat(unit, part.shape[1], -1) for unit in (source, start)]
+            found.append(DenseSolver(part, 2, self.around.step).response(*every))
+        responses = torch.from_numpy(np.concatenate(found, -1)).permute(3, 0, 1, 2)
+        return responses[..., :4], responses[..., 4:]
 
 
 def _curved(times: int) -> np.ndarray:

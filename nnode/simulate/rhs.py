@@ -208,7 +208,7 @@ class RightHandSide:
     def _state(self, t: Any, y: Tensor, speed: Tensor) -> State:
         time, key = torch.as_tensor(t, dtype=torch.float64), y.shape[2]
         if key not in self._every:
-            self._every[key] = _side_by_side(self.scene, key, at_samples=time.ndim > 0)
+            self._every[key] = side_by_side(self.scene, key, at_samples=time.ndim > 0)
         if time.ndim:
             time = time.expand(-1, y.shape[-1]).flatten()
         x, rate = (one.flatten(1).T[..., None] for one in (y[0], speed))
@@ -248,7 +248,7 @@ class _AtSamples(Scene):
         return samples[0]
 
 
-def _side_by_side(scene: Scene, number: int, at_samples: bool) -> Scene:
+def side_by_side(scene: Scene, number: int, at_samples: bool = False) -> Scene:
     """The surroundings of B sequences so many times, at one time or at the first samples."""
     found = {}
     for one in fields(Scene):
@@ -258,6 +258,8 @@ def _side_by_side(scene: Scene, number: int, at_samples: bool) -> Scene:
             value = value[:number].flatten(0, 1)[None] if at_samples else several
         elif isinstance(value, Tensor):
             value = torch.cat([value] * number)
+        elif one.name == "near":
+            value = value and tuple(torch.cat([part] * number) for part in value)
         elif isinstance(value, tuple):
             value = value * number
         found[one.name] = value

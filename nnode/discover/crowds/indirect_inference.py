@@ -18,17 +18,15 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.paths import Path, Smoother
-from nnode.discover.residuals.engine import Rate
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
 from nnode.errors import SimulationError
 from nnode.model.system import Crowd, System
-from nnode.simulate.numpy import runge_kutta
+from nnode.simulate.numpy import simulated
 
 log = logging.getLogger(__name__)
 
@@ -93,30 +91,19 @@ def _disturbances(system: System, batch: Batch, paths: list[Path]) -> list[np.nd
 def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np.ndarray]:
     """``(K, N, 2)`` positions of each sequence's people, all reacting to each other, m."""
     together = _with(system, "simulated")
-    scene, h = together.scene(batch), batch.dt / STEPS
-    samples, sequences, people, _ = batch.x.shape
-    push = torch.zeros(samples, sequences, people, 2, dtype=torch.float64)
+    scene, y = together.scene(batch), together.initial(batch)
+    push = torch.zeros(batch.n_samples, *y.shape, dtype=torch.float64)
     for b, kick in enumerate(kicks):
-        push[: len(kick), b, : kick.shape[1]] = torch.from_numpy(kick)
-    y = together.initial(batch)
-    rest = torch.zeros(*y.shape[:-1], y.shape[-1] - 4, dtype=torch.float64)
+        push[: len(kick), b, : kick.shape[1], 2:4] = torch.from_numpy(kick)
 
-    def rate_from(k: int) -> Rate:
-        def rate(t: Tensor, y: Tensor) -> Tensor:
-            kick = torch.lerp(push[k], push[k + 1], t / batch.dt - k)
-            return together(t, y, scene) + torch.cat([torch.zeros_like(kick), kick, rest], -1)
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        k = min(int(t / batch.dt + 1e-6), batch.n_samples - 2)
+        kick = torch.lerp(push[k], push[k + 1], t / batch.dt - k)
+        time = torch.tensor(t, dtype=torch.float64)
+        return (together(time, torch.from_numpy(y), scene) + kick).numpy()
 
-        return rate
-
-    found = [y]
-    for k in range(samples - 1):
-        rate = rate_from(k)
-        for step in range(STEPS):
-            t = torch.tensor(k * batch.dt + step * h, dtype=torch.float64)
-            y = runge_kutta(rate, t, y, h, rate(t, y))
-        found.append(y)
-    x = torch.stack(found)[..., :2].numpy()
-    return [x[: len(kick), b, : kick.shape[1]] for b, kick in enumerate(kicks)]
+    found = simulated(rate, y.numpy(), batch.dt, batch.n_samples, batch.dt / STEPS)
+    return [found[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
 
 
 def _with(system: System, neighbours: str) -> Crowd:

@@ -100,6 +100,8 @@ class Windows:
     def around(self, system: System) -> Surroundings:
         """What people walk among where ``system`` simulates them."""
         scene = system.scene(self.batch)
+        # people see what ``Surroundings`` holds; copies for many runs need no whole paths
+        scene.measured, scene.measured_rate = scene.measured[:2], scene.measured_rate[:2]
         force: Any = system.find_law("social_force")
         if force is not None and scene.wall.shape[1]:
             reach = force.r + CUT * force.B + STRAY

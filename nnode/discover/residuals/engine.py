@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from nnode.discover.residuals.variables import Variable
 
 
-Rate = Callable[[Tensor, Tensor], Tensor]
-
-
 @dataclass
 class Squares:
     """Squared errors of positions.

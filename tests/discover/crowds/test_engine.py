@@ -23,6 +23,7 @@ from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
 from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import State
+from nnode.simulate import alone as simulate
 from nnode.simulate.alone import PersonAlone
 from nnode.study.walking.laws import without_walls
 from tests.discover import walkers
@@ -102,8 +103,9 @@ def test_walls_of_a_law_are_felt(plain: list[Sequence]) -> None:
 
 @pytest.mark.parametrize("effect", [PairRepulsion(A_2=0.4, B_2=0.8), Alignment(c=0.5)])
 def test_effects_of_a_compiled_law_are_those_of_one_that_is_code(
-    plain: list[Sequence], effect: Effect
+    plain: list[Sequence], effect: Effect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(simulate, "CACHED", 200)  # several parts, the last one smaller
     windows = Windows(plain)
     found = []
     for force in (InteractionForce, Same):
