@@ -45,9 +45,9 @@ def with_line(file: str, line: str, folder: Path) -> subprocess.CompletedProcess
         ("nnode/data/store.py", "import nnode.model.term", "nnode.data", "nnode.model"),
         (
             "nnode/model/term.py",
-            "def late():\n    import nnode.simulate",
+            "def late():\n    import nnode.simulation",
             "nnode.model",
-            "nnode.simulate",
+            "nnode.simulation",
         ),
         (
             "nnode/plots/style.py",
@@ -55,7 +55,7 @@ def with_line(file: str, line: str, folder: Path) -> subprocess.CompletedProcess
             "nnode.plots",
             "nnode.discover",
         ),
-        ("nnode/simulate/base.py", "from nnode import load", "nnode.simulate", "nnode.app"),
+        ("nnode/simulation/base.py", "from nnode import load", "nnode.simulation", "nnode.app"),
         ("nnode/errors.py", "import nnode.files", "nnode.errors", "nnode.files"),
         ("nnode/errors.py", "import benchmarks.truths", "nnode", "benchmarks"),
         ("benchmarks/truths/case.py", "import nnode.model", "benchmarks.truths", "nnode.model"),

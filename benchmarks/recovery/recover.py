@@ -15,7 +15,7 @@ from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Traffic
 from nnode.model.laws import law_from
 from nnode.model.system import System
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 
 #: The searches start this share away from every parameter: up and down in turns, all up, all down.
 AWAY = 0.3

@@ -33,7 +33,7 @@ import sys, time
 import torch
 from benchmarks.speed.engines import torch_call
 from benchmarks.speed.problems import SHAPES, pose
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 torch.set_num_threads(1)
 name, model, what = sys.argv[1:]
 shape = next(one for one in SHAPES[name] if model in one.models)

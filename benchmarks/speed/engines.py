@@ -15,8 +15,8 @@ from benchmarks.speed.problems import Problem, pose
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch
 from nnode.model.system import System
-from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, substeps
-from nnode.simulate.base import check_finite, observed, simulated_batch
+from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, substeps
+from nnode.simulation.base import check_finite, observed, simulated_batch
 
 #: One simulation with cost and gradient: ``(K, B, N, D)`` positions and the flat gradient, in
 #: the order of ``System.named_parameters``.

@@ -10,7 +10,7 @@ from numba import njit
 
 from benchmarks.speed.problems import Problem
 from nnode.model import Law
-from nnode.simulate.kernels.functions import FLAGS, torch_softplus
+from nnode.simulation.kernels.functions import FLAGS, torch_softplus
 
 #: Numbers of a row: 8 kB at most, which stay in the first-level cache.
 _ROW = 1024

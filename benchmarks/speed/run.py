@@ -33,7 +33,7 @@ from nnode.errors import ConfigError, SimulationError
 from nnode.files import write_json
 from nnode.machine import machine
 from nnode.plots.style import save
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
 
 #: Packages whose versions are recorded.
 PACKAGES = ("torch", "torchdiffeq", "numba", "numpy", "jax", "diffrax")

@@ -22,7 +22,7 @@ from benchmarks.speed.problems import Shape, pose
 problem = pose(Shape(**json.loads(shape)), model, getattr(torch, dtype))
 torch.set_num_threads(1)
 begin = time.perf_counter()
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 FusedSolver(problem.shape.step)(problem.system, problem.batch).x.sum().backward()
 print(time.perf_counter() - begin)
 """

@@ -19,7 +19,7 @@ from torch import Tensor
 from benchmarks.speed.problems import Problem, Shape, pose
 from nnode.errors import SimulationError
 from nnode.model import Traffic
-from nnode.simulate.kernels import lanes
+from nnode.simulation.kernels import lanes
 
 #: Where this package stands: it is not installed.
 _ROOT = Path(__file__).parents[2]

@@ -242,6 +242,6 @@ def load_libraries() -> None:
     from nnode.app import discover, prepare, study, train  # noqa: F401
     from nnode.discover import diagnose  # noqa: F401
     from nnode.discover.report import page  # noqa: F401
-    from nnode.simulate import fused  # noqa: F401
+    from nnode.simulation import fused  # noqa: F401
 
     torch.set_num_threads(1)

@@ -356,7 +356,7 @@ def _by_tangents(
     from nnode.calibrate.intervals import intervals
     from nnode.calibrate.pooling import own_parameters
     from nnode.calibrate.problem import ResidualProblem
-    from nnode.simulate.fused import FusedSolver
+    from nnode.simulation.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
     make = partial(

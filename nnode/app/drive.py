@@ -20,7 +20,7 @@ from nnode.exchange.drivers import drivable
 from nnode.exchange.running_sumo import Steps
 from nnode.files import write_json
 from nnode.model import System
-from nnode.simulate.base import substeps
+from nnode.simulation.base import substeps
 
 #: What ``steps=`` asks for.
 STEPS = ("match", "run", "scenario")

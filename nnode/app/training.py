@@ -33,7 +33,7 @@ from nnode.data.split import Split, split
 from nnode.errors import ConfigError
 from nnode.model import InteractionForce, System, build_model
 from nnode.plots import force_figure
-from nnode.simulate import Solver, TorchdiffeqSolver, substeps
+from nnode.simulation import Solver, TorchdiffeqSolver, substeps
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
                 f"solver=fused works on the CPU, the device is {device}; set the device to cpu, "
                 "or take solver=torchdiffeq"
             )
-        from nnode.simulate import FusedSolver  # loads Numba, which takes a second
+        from nnode.simulation import FusedSolver  # loads Numba, which takes a second
 
         return FusedSolver(
             options.dt, options.threads, options.cutoff, options.cutoff_error, options.method

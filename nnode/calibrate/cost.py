@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.simulate.base import Trajectory
+from nnode.simulation.base import Trajectory
 
 #: Gaps below this count as this in logarithms and quotients, m.
 LEAST_GAP = 0.1

@@ -12,7 +12,7 @@ from nnode.calibrate.cost import Convention, sequence_costs
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.model.system import System
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 
 
 class EnsembleCost:

@@ -15,7 +15,7 @@ from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.model import Crowd, Law, System, Traffic
 from nnode.model.laws import law_from
-from nnode.simulate.base import Solver, Trajectory
+from nnode.simulation.base import Solver, Trajectory
 
 #: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
 MOST = 1e24

@@ -80,7 +80,7 @@ class SolverOptions:
 
 @dataclass
 class TorchdiffeqOptions(SolverOptions):
-    """See :class:`nnode.simulate.TorchdiffeqSolver`."""
+    """See :class:`nnode.simulation.TorchdiffeqSolver`."""
 
     name: str = "torchdiffeq"
     gradient: Gradient = Gradient.adjoint
@@ -90,7 +90,7 @@ class TorchdiffeqOptions(SolverOptions):
 
 @dataclass
 class FusedOptions(SolverOptions):
-    """See :class:`nnode.simulate.FusedSolver`."""
+    """See :class:`nnode.simulation.FusedSolver`."""
 
     name: str = "fused"
     threads: int = 1  # of the compiled kernels

@@ -26,9 +26,9 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.system import Crowd, System, Traffic
-from nnode.simulate.base import Trajectory, simulated_batch, substeps
-from nnode.simulate.fused import FusedSolver
-from nnode.simulate.kernels import lanes
+from nnode.simulation.base import Trajectory, simulated_batch, substeps
+from nnode.simulation.fused import FusedSolver
+from nnode.simulation.kernels import lanes
 
 #: Relative size of central differences of laws, in float64: the cube root of its precision, where
 #: the errors by rounding and by curvature are equal (Press et al. 2007, section 5.7). Parameters

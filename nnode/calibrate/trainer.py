@@ -34,7 +34,7 @@ from nnode.data.sequence import Batch
 from nnode.errors import CheckpointError, ConfigError, SimulationError
 from nnode.files import replacing
 from nnode.model import System
-from nnode.simulate.base import Solver
+from nnode.simulation.base import Solver
 
 log = logging.getLogger(__name__)
 

@@ -26,8 +26,8 @@ from nnode.model.steps import STAGES
 from nnode.model.system import System
 from nnode.model.term import State, Term
 from nnode.model.terms import Rule
-from nnode.simulate.base import Trajectory, check_finite, substeps
-from nnode.simulate.ode import Rates, whole_steps
+from nnode.simulation.base import Trajectory, check_finite, substeps
+from nnode.simulation.ode import Rates, whole_steps
 
 
 @dataclass(frozen=True)

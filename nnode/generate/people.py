@@ -13,8 +13,8 @@ from torchdiffeq import odeint
 from nnode.data.sequence import Batch
 from nnode.model.scene import Scene
 from nnode.model.system import Crowd
-from nnode.simulate.base import Trajectory, check_finite, substeps
-from nnode.simulate.ode import Rates, whole_steps
+from nnode.simulation.base import Trajectory, check_finite, substeps
+from nnode.simulation.ode import Rates, whole_steps
 
 #: The least preferred speed that is drawn, of the measured one.
 SLOWEST = 0.1

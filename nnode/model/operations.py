@@ -2,7 +2,7 @@
 
 A row gives the value for numbers of Python, arrays of NumPy, tensors of PyTorch and compiled code,
 the derivative, the rule for the unit, and the notation. Compiled code takes the functions that a
-row names from :mod:`nnode.simulate.kernels.functions`.
+row names from :mod:`nnode.simulation.kernels.functions`.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
 from nnode.model.system import System
 from nnode.pages.replay import ReplayBlock, Scene
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 
 
 def spread(items: Many[Sequence], number: int) -> list[Sequence]:

@@ -22,7 +22,7 @@ from nnode.exchange.drivers import Drivers, Seen
 from nnode.model import System, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.own import load_own
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from tests.app.conftest import Script
 from tests.discover.platoons import platoons
 from tests.model.test_forces import people

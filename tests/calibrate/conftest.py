@@ -16,7 +16,7 @@ from nnode.data.options import LoaderOptions
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store
 from nnode.model import build_model
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 
 LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 

@@ -13,9 +13,9 @@ from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import SimulationError
 from nnode.model import build_model
-from nnode.simulate import Solver, TorchdiffeqSolver
-from nnode.simulate.base import Trajectory
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation import Solver, TorchdiffeqSolver
+from nnode.simulation.base import Trajectory
+from nnode.simulation.fused import FusedSolver
 
 SOLVERS = [
     pytest.param(lambda dt: TorchdiffeqSolver(gradient="discrete", dt=dt), id="torchdiffeq"),

@@ -13,7 +13,7 @@ from nnode.calibrate.cost import Convention, sequence_costs, squared_error
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Traffic, make_law
-from nnode.simulate import TorchdiffeqSolver, Trajectory
+from nnode.simulation import TorchdiffeqSolver, Trajectory
 
 
 def two_sequences() -> Batch:

@@ -14,7 +14,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.build import build_model
 from nnode.model.system import System
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
 
 DT = 0.02
 N4 = {

@@ -19,7 +19,7 @@ from nnode.calibrate.evaluate import (
 )
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Traffic, make_law
-from nnode.simulate import TorchdiffeqSolver, Trajectory
+from nnode.simulation import TorchdiffeqSolver, Trajectory
 
 
 def traffic(name: str, x: list[list[float]], dt: float = 0.5) -> Sequence:

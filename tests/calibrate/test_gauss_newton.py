@@ -15,8 +15,8 @@ from nnode.errors import ConfigError
 from nnode.model import System, Traffic, build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.term import State, Term
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
-from tests.simulate.fused.compare import RungeKutta
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
+from tests.simulation.fused.compare import RungeKutta
 
 TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
 

@@ -20,8 +20,8 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.model.build import build_model
-from nnode.simulate import FusedSolver
-from nnode.simulate.ode import Rates
+from nnode.simulation import FusedSolver
+from nnode.simulation.ode import Rates
 
 TRUTH = (0.5, 40.0, 12.0)
 

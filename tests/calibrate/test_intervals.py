@@ -60,7 +60,7 @@ def test_what_the_data_do_not_tell_has_no_variance(which: str, lost: list[bool])
 
 @pytest.mark.parametrize("clusters", [4, 8, 20])
 def test_intervals_cover_the_truth_although_clusters_are_few(clusters: int) -> None:
-    """Errors that clusters share; the old normal intervals covered 83 % with four clusters."""
+    """Errors that clusters share."""
     rng, inside = np.random.default_rng(clusters), []
     for _ in range(1500):
         cluster = np.repeat(np.arange(clusters), rng.integers(3, 12, clusters))

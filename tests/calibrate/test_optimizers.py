@@ -22,7 +22,7 @@ from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 
 #: v0 (m/s) and L (m) that the data are made with.
 TRUTH = (24.0, 6.0)

@@ -16,7 +16,7 @@ from nnode.calibrate.pooling import Own, own_parameters
 from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 from nnode.study.following.candidates import EVERY
 from tests.app.following import pairs
 from tests.study.following.test_fit import HELLY, driven

@@ -16,7 +16,7 @@ from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import start_smoothed
 from nnode.errors import ConfigError
 from nnode.model import System
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 from nnode.study.following.candidates import EVERY
 from tests.app.following import pairs
 from tests.study.following.test_fit import HELLY, driven

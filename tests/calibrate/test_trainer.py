@@ -25,7 +25,7 @@ from nnode.calibrate.trainer import Trainer
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.model import System
-from nnode.simulate import Trajectory
+from nnode.simulation import Trajectory
 
 Make = Callable[..., Trainer]
 

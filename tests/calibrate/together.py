@@ -28,7 +28,7 @@ from nnode.data.options import LoaderOptions
 from nnode.data.store import Store
 from nnode.errors import SimulationError
 from nnode.model import build_model
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 
 N4 = {
     "term": "network_speed",

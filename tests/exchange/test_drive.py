@@ -25,7 +25,7 @@ from nnode.errors import ConfigError
 from nnode.exchange.drive import Drive, drive
 from nnode.exchange.running_sumo import RunningSumo, Steps
 from nnode.model import System, build_model
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 
 #: m: rounding of what SUMO writes, on both sides.
 ROUNDED = 1e-9

@@ -24,7 +24,7 @@ from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import SAME, sumo_type
 from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 from tests.exchange.test_recovery import recovered
 
 

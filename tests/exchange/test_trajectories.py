@@ -25,7 +25,7 @@ from nnode.exchange.trajectories import (
     write_pedpy,
     write_table,
 )
-from nnode.simulate.base import Trajectory
+from nnode.simulation.base import Trajectory
 
 
 def walk(

@@ -19,9 +19,9 @@ from nnode.generate.scores import band
 from nnode.model import Traffic, build_model
 from nnode.model.laws import make_law
 from nnode.model.term import State, Term
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 from tests.app.following import TRUE, platoon
-from tests.simulate.fused.compare import RungeKutta
+from tests.simulation.fused.compare import RungeKutta
 
 STEP = 0.1
 

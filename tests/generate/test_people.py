@@ -17,7 +17,7 @@ from nnode.generate.noise import Noise, constant_speed, free, sample, takes_driv
 from nnode.generate.people import SLOWEST
 from nnode.generate.scores import band, nearest
 from nnode.model import Crowd, System, build_model
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 
 STEP = 0.1
 

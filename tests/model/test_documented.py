@@ -13,7 +13,7 @@ from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.operations import FUNCTIONS
-from nnode.simulate.kernels import source
+from nnode.simulation.kernels import source
 
 METHOD = (
     Path("docs/method.md").read_text("utf-8").split("## A law is one formula")[1].split("\n## ")[0]

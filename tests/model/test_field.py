@@ -12,7 +12,7 @@ import torch
 
 from nnode.data.sequence import collate
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from tests.model.following import (
     DT,
     accelerations,
@@ -24,7 +24,7 @@ from tests.model.following import (
     set_,
     states,
 )
-from tests.simulate.fused.compare import RungeKutta, difference, gradient
+from tests.simulation.fused.compare import RungeKutta, difference, gradient
 
 #: Length of every vehicle here, m.
 LONG = 4.0

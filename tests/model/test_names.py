@@ -21,9 +21,9 @@ from nnode.model.laws import (
 from nnode.model.names import check_names, check_symbols
 from nnode.model.term import Term
 from nnode.model.terms import Rule
-from nnode.simulate.kernels.alone import WalkSource
-from nnode.simulate.kernels.crowds import CrowdSource
-from nnode.simulate.kernels.lanes import LaneSource
+from nnode.simulation.kernels.alone import WalkSource
+from nnode.simulation.kernels.crowds import CrowdSource
+from nnode.simulation.kernels.lanes import LaneSource
 
 CODE = '__import__("os").abort()'
 #: An annotation, an index, a default, a second line, letters and digits that are not ASCII.

@@ -11,7 +11,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import Crowd, build_model, make_law
 from nnode.model.effects import CATALOGUE
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 from tests.model.test_forces import people
 
 LAW: dict[str, Any] = {

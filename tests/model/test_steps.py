@@ -16,9 +16,9 @@ from nnode.errors import ConfigError, SimulationError
 from nnode.model import Traffic, build_model, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS, STAGES, stepped
-from nnode.simulate import FusedSolver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from tests.model.following import DT, behind, driven, model, numbers
-from tests.simulate.fused.compare import RungeKutta, difference, gradient
+from tests.simulation.fused.compare import RungeKutta, difference, gradient
 
 #: A car that brakes with b m/s², whatever is ahead, and one that accelerates.
 BRAKE = {"parameters": {"b": "3 m/s²"}, "rate": {"v": "0*dv*b/gap - b"}}

@@ -15,7 +15,7 @@ from nnode.model.differentiate import derivatives, slopes
 from nnode.model.expression import apply, const, symbol
 from nnode.model.operations import OPERATIONS, compiled
 from nnode.model.parse import parse
-from nnode.simulate.kernels import functions
+from nnode.simulation.kernels import functions
 
 #: Names in compiled code that are no functions of the kernels' own.
 SCALARS = {"zero": 0.0, "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}

@@ -21,7 +21,7 @@ import torch
 from benchmarks.speed.problems import Shape, pose
 from nnode import progress
 from nnode.errors import StudyError
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 from nnode.study import runner
 from nnode.study.runner import Task, kept_results, run_tasks
 from tests.app.conftest import ROOT

@@ -55,7 +55,7 @@ def simulate(law: str) -> dict[str, Any]:
     """The end of a small simulation by compiled code."""
     # imported here: all workers read this file
     from benchmarks.speed.problems import Shape, pose
-    from nnode.simulate import FusedSolver
+    from nnode.simulation import FusedSolver
 
     problem = pose(Shape("traffic", (law,), 3, 3, 2, 10, 0.02), law, torch.float64)
     with torch.no_grad():

@@ -35,7 +35,7 @@ from nnode.exchange.trajectories import simulated
 from nnode.model import System
 from nnode.model.build import add_effects
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.simulate import Solver
+from nnode.simulation import Solver
 
 #: Sequences that are simulated at once.
 _TOGETHER = 32

@@ -16,7 +16,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.model.system import System
-from nnode.simulate.base import Solver
+from nnode.simulation.base import Solver
 
 
 class GaussNewton(Optimizer):
@@ -71,7 +71,7 @@ class GaussNewton(Optimizer):
         self._batch = batch
         # compiled code takes a second to import
         from nnode.calibrate.problem import ResidualProblem
-        from nnode.simulate.fused import FusedSolver
+        from nnode.simulation.fused import FusedSolver
 
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")

@@ -24,7 +24,7 @@ from nnode.discover.residuals.variables import Variable
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
-from nnode.simulate.alone import PersonAlone, RunAlone, Surroundings
+from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
 
 #: A simulated person is never further than this from the measured one, m: contacts may throw
 #: somebody far away, and the rest of the run still counts.

@@ -26,7 +26,7 @@ from nnode.discover.crowds.paths import Path, Smoother
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
 from nnode.errors import SimulationError
 from nnode.model.system import Crowd, System
-from nnode.simulate.numpy import simulated
+from nnode.simulation.numpy import simulated
 
 log = logging.getLogger(__name__)
 

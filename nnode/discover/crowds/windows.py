@@ -14,7 +14,7 @@ from nnode.discover.crowds.paths import Smoother
 from nnode.errors import DataError
 from nnode.model.scene import Scene
 from nnode.model.system import System
-from nnode.simulate.alone import Surroundings
+from nnode.simulation.alone import Surroundings
 
 #: Longest step of a simulation, and about the interval of the residuals, s.
 STEP = 0.13

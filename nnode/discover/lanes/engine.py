@@ -27,9 +27,9 @@ from nnode.model.expression import symbols
 from nnode.model.extend import effects_of, extended, without
 from nnode.model.system import System
 from nnode.model.term import State, Term
-from nnode.simulate.linear import LinearResponse
-from nnode.simulate.numpy import simulated, strides
-from nnode.simulate.rhs import RightHandSide, formula_of, rates_along
+from nnode.simulation.linear import LinearResponse
+from nnode.simulation.numpy import simulated, strides
+from nnode.simulation.rhs import RightHandSide, formula_of, rates_along
 
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.

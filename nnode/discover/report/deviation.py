@@ -11,7 +11,7 @@ import torch
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
 from nnode.model import System, Traffic
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 
 #: Method and longest step, s: their error is to be seen in no picture.
 METHOD = {"traffic": "rk4", "crowd": "midpoint"}

@@ -20,7 +20,7 @@ from nnode.model.network import FeedForward
 from nnode.model.options import CrowdOptions, NetworkForceOptions, SocialForceOptions
 from nnode.model.system import System
 from nnode.plots.interaction import interaction
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 
 #: Social force and networks; those with the person himself in the sum, j = i, as printed.
 OPTIONS: dict[str, CrowdOptions] = {

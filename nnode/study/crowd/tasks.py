@@ -10,8 +10,8 @@ import torch
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.evaluate import Simulate, constant_velocity, no_interaction
 from nnode.data.sequence import Batch, collate
-from nnode.simulate.base import Trajectory
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.base import Trajectory
+from nnode.simulation.fused import FusedSolver
 from nnode.study.crowd.data import Place, chosen, parts, sequences, time_groups, turned
 from nnode.study.crowd.fit import calibrate, costs, new_system, row_of
 from nnode.study.crowd.printed import PARAMETERS

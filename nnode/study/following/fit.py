@@ -15,7 +15,7 @@ from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
 from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import EVERY, Candidate, decay, starts
 

@@ -14,7 +14,7 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.following import data, printed
 from nnode.study.following.candidates import Candidate, decay, starts
 from nnode.study.following.data import gap_of

@@ -12,7 +12,7 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.model.system import System
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.following import data
 from nnode.study.following.candidates import EVERY, REFERENCE, key
 from nnode.study.options import FollowingStudyOptions

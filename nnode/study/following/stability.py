@@ -23,7 +23,7 @@ import torch
 from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import Law
 from nnode.model.system import System
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 
 #: Gaps (m) among which equilibria are looked for.
 GAPS = np.linspace(0.2, 250.0, 5000)

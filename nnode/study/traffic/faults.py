@@ -10,7 +10,7 @@ import torch
 
 from nnode.pages.page import Block, FigureBlock, Heading, TableBlock, Text
 from nnode.plots.study_traffic import space_time
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.traffic.problem import Problem
 from nnode.study.traffic.results import AVERAGE, Study, least
 

@@ -18,7 +18,7 @@ from nnode.data.store import Store
 from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.plots.traffic import follow_law
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 
 #: Step of the first search, s; the best of its finds are then followed at the study's own step.
 COARSE = 0.02

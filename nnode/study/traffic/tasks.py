@@ -16,7 +16,7 @@ from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.statistics import group_weights
 from nnode.study.traffic.problem import COARSE, Problem, groups, named, recording, speeds
 

@@ -17,7 +17,7 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch
 from nnode.model.scene import Scene, wanted
 from nnode.model.system import System
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.walking.data import chosen
 from nnode.study.walking.laws import GRID, new_system
 

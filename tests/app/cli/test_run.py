@@ -14,7 +14,7 @@ from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver
 from nnode.calibrate.options import FusedOptions
 from nnode.errors import ConfigError
-from nnode.simulate import FusedSolver
+from nnode.simulation import FusedSolver
 from tests.app.conftest import CONF, Script, composed
 
 

@@ -21,7 +21,7 @@ from benchmarks.speed.memory import peak_memory
 from benchmarks.speed.problems import SHAPES, Shape, pose
 from benchmarks.speed.run import benchmark
 from nnode.errors import ConfigError, SimulationError
-from tests.simulate.kernels.test_lane_code import PACKED, is_vector_code
+from tests.simulation.kernels.test_lane_code import PACKED, is_vector_code
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 

@@ -23,8 +23,8 @@ from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
 from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import State
-from nnode.simulate import alone as simulate
-from nnode.simulate.alone import PersonAlone
+from nnode.simulation import alone as simulate
+from nnode.simulation.alone import PersonAlone
 from nnode.study.walking.laws import without_walls
 from tests.discover import walkers
 

@@ -22,7 +22,7 @@ from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.parse import parse
-from nnode.simulate import rhs
+from nnode.simulation import rhs
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 from tests.model.test_tensors import FORMULAS
 

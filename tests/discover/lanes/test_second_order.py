@@ -21,7 +21,7 @@ from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.lane import DriverHeterogeneity, Memory, RelativeSpeed, SpeedZone
 from nnode.model.extend import extended
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 from tests.discover.platoons import platoons
 
 LAWS = ["idm", "fvdm", "gipps", "krauss", "helly"]

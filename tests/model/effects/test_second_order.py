@@ -15,7 +15,7 @@ from nnode.errors import ConfigError
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 from tests.model.following import DT, accelerations, behind, model, numbers
 
 LONG, TRUCK = 4.0, 10.0

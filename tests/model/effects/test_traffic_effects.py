@@ -15,7 +15,7 @@ from nnode.errors import ConfigError
 from nnode.model import System, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import extended, without
-from nnode.simulate import TorchdiffeqSolver
+from nnode.simulation import TorchdiffeqSolver
 
 NAMES = [effect.name for effect in CATALOGUE.of("traffic")]
 V0, LENGTH = 30.0, 6.0

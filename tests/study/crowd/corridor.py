@@ -7,7 +7,7 @@ import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.system import System
-from nnode.simulate.ode import TorchdiffeqSolver
+from nnode.simulation.ode import TorchdiffeqSolver
 
 DT = 0.04
 

@@ -11,7 +11,7 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
-from nnode.simulate.fused import FusedSolver
+from nnode.simulation.fused import FusedSolver
 from nnode.study.following import data, fit, inference, leaders, printed
 from nnode.study.following.candidates import EVERY, decay, key, starts
 

@@ -15,7 +15,7 @@ from nnode.data.options import EsimasOptions, Faults
 from nnode.data.prepare import prepare
 from nnode.model.build import build_model
 from nnode.model.system import System
-from nnode.simulate import FusedSolver, Solver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
 from nnode.study.crowd.conventions import Convention, Tracks, recording_file
 from nnode.study.crowd.data import chosen, prepare_horizon, sequences
 from nnode.study.crowd.fit import system_of

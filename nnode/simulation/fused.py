@@ -1,0 +1,204 @@
+"""The fused solver: all steps of a simulation, and its gradient, in one compiled call."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError
+from nnode.model.steps import METHODS
+from nnode.model.system import System, with_parameters
+from nnode.model.term import Term
+from nnode.simulation.base import (
+    Trajectory,
+    check_finite,
+    observed,
+    simulated_batch,
+    substeps,
+)
+from nnode.simulation.kernels import crowds, lanes
+from nnode.simulation.ode import TorchdiffeqSolver
+
+log = logging.getLogger(__name__)
+
+
+class FusedSolver:
+    """A method of fixed steps and the exact gradient of its discrete scheme, in compiled code.
+
+    With ``method="euler"``, the default of speeds, states equal those of
+    ``TorchdiffeqSolver("euler")`` up to rounding; in float32 those of traffic are closer to the
+    float64 ones, as steps are added with compensation. The gradient is that of
+    ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint, from which it
+    differs by O(dt). ``rk4`` is the classic method, and torchdiffeq's the 3/8 rule, which differs
+    from it by O(dt^4).
+
+    Models whose law and effects are formulas (see :mod:`nnode.model.terms`) run compiled.
+    Any other model, with a term that is code of its own, goes through torchdiffeq: the same
+    gradient, at the speed and with the memory of PyTorch. The solver warns of it once.
+
+    The first call for a law compiles (seconds) and keeps the result in the user's cache
+    folder, or in NNODE_CACHE where this environment variable is set.
+
+    Args:
+        dt: step, s; None takes the domain's default, as TorchdiffeqSolver.
+        threads: at most so many threads compute blocks of simulations.
+        cutoff: m; in crowds, pairs, and people and wall points, that are farther apart do not
+            interact, whatever the number of people. It must be larger than the distance 2 r of
+            people who touch. For a force network it changes the model, since nothing makes such
+            a force decay. None derives it from ``cutoff_error`` for social forces of many
+            people, and lets everybody meet everybody otherwise.
+        cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
+            left out, in units of A. The acceleration of one person is then off by less than
+            ``cutoff_error`` A / m through people, and as much through walls; see
+            :func:`nnode.simulation.kernels.crowds.cutoff_distance`. 0 lets everybody meet
+            everybody.
+        method: of lanes, one of :data:`nnode.model.steps.METHODS`; None takes the law's own,
+            ``rk4`` for the smooth laws of the field, else ``ballistic`` for accelerations and
+            ``euler`` for speeds.
+
+    Attributes:
+        uncompiled: why the model it warned of is not compiled; empty: there was none.
+
+    Raises:
+        ConfigError: fewer than one thread, a cutoff that is not positive, or an error outside
+            [0, 1).
+    """
+
+    def __init__(
+        self,
+        dt: float | None = None,
+        threads: int = 1,
+        cutoff: float | None = None,
+        cutoff_error: float = 1e-10,
+        method: str | None = None,
+    ) -> None:
+        if threads < 1:
+            raise ConfigError(f"solver.threads={threads} must be a whole number of at least 1")
+        if method is not None and method not in METHODS:
+            raise ConfigError(
+                f"solver.method={method} is unknown to solver=fused, expected one of "
+                f"{', '.join(METHODS)}, or null for the law's own"
+            )
+        crowds.check_cutoff(cutoff, cutoff_error)
+        self.dt, self.threads = dt, threads
+        self.cutoff, self.cutoff_error = cutoff, cutoff_error
+        self.method, self.uncompiled = method, ""
+
+    def __call__(self, system: System, batch: Batch) -> Trajectory:
+        """Simulate from the first measured state, at the batch's sampling times.
+
+        Raises:
+            ConfigError: a step that does not divide the sampling interval, or a cutoff for a
+                model that cannot have one.
+            DataError: the batch is of another domain, or has no sampling interval.
+            SimulationError: a simulated state is not a finite number.
+        """
+        return check_finite(self.unchecked(system, batch), batch)
+
+    def unchecked(self, system: System, batch: Batch) -> Trajectory:
+        """The same, with states that are not finite among them."""
+        n, near, origin = self._posed(system, batch)
+        lane, law = lanes.supports(system, batch), crowds.supports(system, batch)
+        if lane is not None:
+            y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
+        elif law is not None:
+            y = crowds.simulate(system, law, near, n, self.threads, self.cutoff, self.cutoff_error)
+        else:
+            # the relaxation alone is a baseline, and cheap
+            if not self.uncompiled and not crowds.without_partners(system):
+                self.uncompiled = _reason(system)
+                log.warning(
+                    "solver=fused works in PyTorch and not in compiled code: %s; the gradient is "
+                    "the same, but costs up to hundreds of times as much, see docs/performance.md",
+                    self.uncompiled,
+                )
+            return TorchdiffeqSolver(self.method, "discrete", self.dt).solve(system, batch)
+        return observed(system, y, batch, origin)
+
+    def ensemble(
+        self, system: System, parameters: Mapping[str, Tensor], batch: Batch
+    ) -> Trajectory:
+        """Simulate R runs with parameters of their own, side by side.
+
+        A run that blows up keeps its states that are not finite; the others do not notice.
+
+        Args:
+            parameters: by their names in ``system.named_parameters()``, each with a leading
+                axis of R runs; the trajectory can be differentiated with respect to them.
+                Parameters that are missing are the system's own in all runs.
+
+        Returns:
+            x and v of shape ``(K, R, B, N, D)``.
+
+        Raises:
+            ConfigError: as in a single run, an unknown name, or shapes that do not fit.
+            DataError: as in a single run.
+        """
+        stacked = _stack(system, parameters)
+        lane = lanes.supports(system, batch)
+        if lane is None:
+            runs = [
+                with_parameters(
+                    system,
+                    {name: value[r] for name, value in stacked.items()},
+                    lambda own: self.unchecked(own, batch),
+                )
+                for r in range(len(next(iter(stacked.values()))))
+            ]
+        else:
+            n, near, origin = self._posed(system, batch)
+            y = lanes.simulate(system, lane, near, n, self.threads, stacked, self.method)
+            runs = [observed(system, own, batch, origin) for own in y.unbind(1)]
+        v = [run.v for run in runs if run.v is not None]
+        return Trajectory(torch.stack([run.x for run in runs], 1), torch.stack(v, 1) if v else None)
+
+    def _posed(self, system: System, batch: Batch) -> tuple[int, Batch, Tensor | None]:
+        """Steps in a sampling interval, the batch as it is simulated, and the origins of its
+        places."""
+        if batch.x.shape[-1] != system.dim:
+            system.scene(batch)  # says so
+        paired = crowds.supports(system, batch) or crowds.without_partners(system)
+        if self.cutoff is not None and not paired:
+            raise ConfigError(
+                f"solver.cutoff={self.cutoff:g} m works for crowds whose terms are formulas, as "
+                "model=sf or model=nn, only; set it to null"
+            )
+        return substeps(batch.dt, self.dt, system), *simulated_batch(system, batch)
+
+
+def _reason(system: System) -> str:
+    """Why compiled code is not used, in words: terms that it does not cover, by their names."""
+    terms = cast(list[Term], list(system.terms))
+    names = ", ".join(t.name for t in terms if t.rule_for(system.order) is None)
+    if names:
+        return f"it does not cover {names}"
+    alone = "models that begin with a law of the gap, without people who meet themselves and others"
+    return f"it covers {alone} on the CPU, without a gradient by what was measured"
+
+
+def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """All parameters of the system with a leading axis of runs."""
+    own = dict(system.named_parameters())
+    unknown = sorted(set(parameters) - set(own))
+    if unknown or not parameters:
+        raise ConfigError(
+            f"an ensemble needs parameters of the model, found {unknown or 'none'}; the model "
+            f"has: {', '.join(own)}"
+        )
+    runs = {len(value) if value.ndim else 0 for value in parameters.values()}
+    for name, value in parameters.items():
+        if len(runs) > 1 or value.shape[1:] != own[name].shape or 0 in runs:
+            raise ConfigError(
+                f"{name} of an ensemble must have shape (R, {', '.join(map(str, own[name].shape))})"
+                f" with the same R >= 1 for all parameters, found {tuple(value.shape)}"
+            )
+    number = runs.pop()
+    return {
+        name: parameters[name] if name in parameters else value.expand(number, *value.shape)
+        for name, value in own.items()
+    }

@@ -1,0 +1,21 @@
+"""Simulations in compiled code that is made from formulas, with exact gradients."""
+
+from __future__ import annotations
+
+from nnode.model.system import Crowd, System, Traffic
+
+
+def source(model: System) -> str:
+    """The code that simulates a model, to be read.
+
+    Raises:
+        ValueError: the model has a term that is no formula.
+    """
+    from nnode.simulation.kernels.crowds import CrowdSource
+    from nnode.simulation.kernels.lanes import LaneSource
+
+    if isinstance(model, Traffic) and model.lane is not None and model.lane.is_formula:
+        return LaneSource(model.lane).text()
+    if isinstance(model, Crowd) and model.formula is not None:
+        return CrowdSource(model.formula).text()
+    raise ValueError("the model has a term that is code of its own: it runs in PyTorch")

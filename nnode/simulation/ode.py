@@ -1,0 +1,155 @@
+"""torchdiffeq: the continuous adjoint, or the exact gradient of the discrete scheme."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchdiffeq import odeint, odeint_adjoint
+from torchdiffeq._impl.odeint import SOLVERS
+from torchdiffeq._impl.solvers import FixedGridODESolver
+
+from nnode.data.sequence import Batch
+from nnode.errors import ConfigError
+from nnode.model.steps import METHODS, STAGES
+from nnode.model.system import System
+from nnode.simulation.base import (
+    Trajectory,
+    check_finite,
+    observed,
+    simulated_batch,
+    substeps,
+)
+
+FIXED_STEP = tuple(
+    name for name, solver in SOLVERS.items() if issubclass(solver, FixedGridODESolver)
+)
+GRADIENTS = ("adjoint", "discrete")
+
+
+def whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
+    """Time grid of one step per unit between the first and the last time, either direction."""
+    n = round(float((t[-1] - t[0]).abs()))
+    return (
+        torch.linspace(0, 1, n + 1, dtype=torch.float64, device=t.device)
+        .mul_(n)
+        .round_()
+        .mul_(1.0 if t[-1] >= t[0] else -1.0)
+        .to(t)
+        + t[0]
+    )
+
+
+class Rates(nn.Module):
+    """Change of the state in one step: time counted in steps is exact in any precision.
+
+    A sequence that is shorter than its batch stands still after its end, so that nothing that
+    nobody measured can blow up and spoil the gradient of the others.
+
+    Args:
+        steps: in a sampling interval.
+        method: what becomes of a law of vehicles in a step, see :mod:`nnode.model.steps`.
+    """
+
+    def __init__(self, system: System, batch: Batch, steps: int, method: str = "euler") -> None:
+        super().__init__()
+        self.system, self.dt = system, batch.dt / steps
+        self.scene = replace(system.scene(batch), step=self.dt, method=method)
+        last = batch.valid.any(-1).sum(0) - 1
+        self.end = steps * last[:, None, None]
+        self.ragged = bool((last < batch.n_samples - 1).any())
+
+    def forward(self, step: Tensor, y: Tensor) -> Tensor:
+        """``(B, N, order * D)``: change of ``y`` from ``step`` to the next."""
+        return self.until_the_end(step, self.dt * self.system(step * self.dt, y, self.scene))
+
+    def until_the_end(self, step: Tensor, rate: Tensor) -> Tensor:
+        """A change of the state, and none of the sequences that have ended."""
+        # the end itself still moves: integrating backwards starts there
+        return rate.where(step <= self.end, 0.0) if self.ragged else rate
+
+
+class TorchdiffeqSolver:
+    """Solve with torchdiffeq.
+
+    Time runs in units of the step, so that the grid consists of whole numbers and the number
+    of steps is the one that is meant, also in float32. Only sampling times are outputs.
+
+    Args:
+        method: a torchdiffeq method, or ``ballistic`` or ``semi_implicit``, which are Euler's of
+            a changed formula (see :mod:`nnode.model.steps`); None takes the law's own, ``rk4``
+            for the smooth laws of the field, else ``ballistic`` for accelerations of vehicles and
+            ``euler`` for everything else. Fixed-step ones step ``dt``, adaptive ones obey
+            ``rtol`` and ``atol``. torchdiffeq's ``rk4`` is the 3/8 rule.
+        gradient: ``adjoint`` integrates the adjoint equation backwards (the continuous
+            adjoint of the paper, discretised: differs from the exact gradient of the
+            discrete scheme by O(dt)); ``discrete`` differentiates the scheme itself.
+        dt: step, s; None takes the domain's default (0.002 s in traffic; at most 0.0625 s,
+            dividing the sampling interval, in crowds).
+        rtol: relative tolerance of adaptive methods.
+        atol: absolute tolerance of adaptive methods, m and m/s.
+
+    Raises:
+        ConfigError: unknown method or gradient, two that exclude each other, or a step that
+            does not divide.
+    """
+
+    def __init__(
+        self,
+        method: str | None = None,
+        gradient: str = "adjoint",
+        dt: float | None = None,
+        rtol: float = 1e-6,
+        atol: float = 1e-8,
+    ) -> None:
+        if method is not None and method not in {*SOLVERS, *METHODS}:
+            raise ConfigError(
+                f"solver.method={method} is unknown, expected one of "
+                f"{', '.join(sorted({*SOLVERS, *METHODS}))}"
+            )
+        if gradient not in GRADIENTS:
+            raise ConfigError(
+                f"solver.gradient={gradient} is unknown, expected {' or '.join(GRADIENTS)}"
+            )
+        if gradient == "discrete" and method == "scipy_solver":
+            raise ConfigError(
+                "solver.method=scipy_solver leaves no graph to differentiate; use "
+                "solver.gradient=adjoint, or another method"
+            )
+        if not (rtol > 0 and atol > 0):
+            raise ConfigError(f"solver.rtol={rtol} and solver.atol={atol} must be positive")
+        self.method, self.gradient, self.dt = method, gradient, dt
+        self.rtol, self.atol = rtol, atol
+
+    def __call__(self, system: System, batch: Batch) -> Trajectory:
+        """Simulate from the first measured state, at the batch's sampling times.
+
+        Raises:
+            SimulationError: a simulated state is not a finite number.
+        """
+        return check_finite(self.solve(system, batch), batch)
+
+    def solve(self, system: System, batch: Batch) -> Trajectory:
+        """The same, states that are no finite numbers among them."""
+        n = substeps(batch.dt, self.dt, system)
+        method = self.method or system.step
+        near, origin = simulated_batch(system, batch)
+        rates = Rates(system, near, n, method if method in METHODS else "euler")
+        y0 = system.initial(near, batch.dt / n)
+        t = n * torch.arange(batch.n_samples, dtype=y0.dtype, device=y0.device)
+        method = STAGES.get(method, method)
+        options = {"grid_constructor": whole_steps} if method in FIXED_STEP else {}
+        kwargs: dict[str, Any] = {
+            "method": method,
+            "rtol": self.rtol,
+            "atol": self.atol,
+            "options": options,
+        }
+        trained = tuple(p for p in system.parameters() if p.requires_grad)
+        if self.gradient == "adjoint" and trained and torch.is_grad_enabled():
+            y = odeint_adjoint(rates, y0, t, adjoint_params=trained, **kwargs)
+        else:
+            y = odeint(rates, y0, t, **kwargs)
+        return observed(system, y, batch, origin)

@@ -1,0 +1,336 @@
+"""Compiled crowd models against torchdiffeq's discrete gradient in float64."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nnode.calibrate.cost import sequence_costs
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError, SimulationError
+from nnode.model import Crowd, InteractionForce, Law, System, Traffic, make_law
+from nnode.model.effects import CATALOGUE
+from nnode.model.network import FeedForward
+from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, fused
+from nnode.simulation.kernels import crowds as compiled
+from nnode.simulation.kernels.crowds import SIZE, CrowdSource
+from tests.simulation.fused.compare import difference, single
+from tests.simulation.fused.test_fallback import Sway
+
+DT = 0.05
+
+
+def network(hidden: int = 4, **options: object) -> Law:
+    return make_law(
+        "network_force", hidden=hidden, generator=torch.Generator().manual_seed(3), **options
+    )  # type: ignore[arg-type]
+
+
+MODELS = {
+    "sf": lambda: [
+        make_law("relaxation"),
+        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1),
+    ],
+    "nn": lambda: [make_law("relaxation"), network()],
+    "nn_self": lambda: [make_law("relaxation"), network(self_interaction=True)],
+}
+
+
+@pytest.fixture(autouse=True)
+def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """No test here may pass because the fallback is right."""
+
+    def refuse(*args: object) -> None:
+        raise AssertionError("the fallback was called")
+
+    monkeypatch.setattr(fused, "TorchdiffeqSolver", refuse)
+
+
+@pytest.fixture
+def people(crowd) -> list[Sequence]:  # type: ignore[no-untyped-def]
+    """Crowds of one to eight people, of different duration, with none, one and two walls."""
+    return [
+        crowd(4, samples=4, name="a"),
+        crowd(2, samples=3, name="b"),
+        crowd(7, samples=5, name="c"),
+        crowd(1, samples=2, name="d"),
+        crowd(8, samples=5, name="e", apart=0.3),
+    ]
+
+
+def gradient(model: System, solver: Solver, batch: Batch) -> tuple[Trajectory, Tensor]:
+    """A trajectory; gradient of a function of x and v by all parameters and the initial state."""
+    model.zero_grad()
+    x, v = batch.x.clone().requires_grad_(), batch.v.clone().requires_grad_()
+    found = solver(model, Batch(**{**vars(batch), "x": x, "v": v}))
+    assert found.v is not None
+    speeds = found.v.masked_fill(~batch.valid[..., None], 0.0)
+    (sequence_costs(found, batch).sum() + 0.02 * speeds.square().sum()).backward()
+    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
+    assert x.grad is not None
+    assert v.grad is not None
+    return found, torch.cat([part.flatten() for part in (*parts, x.grad[0], v.grad[0])]).detach()
+
+
+def check(model: System, batch: Batch, solver: Solver, limit: float = 1e-10) -> None:
+    """Compare states and gradients in float64."""
+    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
+    assert wanted.abs().max() > 0
+    found, own = gradient(model, solver, batch)
+    mask = batch.valid[..., None].expand_as(exact.x)
+    assert exact.v is not None
+    assert found.v is not None
+    torch.testing.assert_close(found.x[mask], exact.x[mask], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.v[mask], exact.v[mask], rtol=1e-12, atol=1e-12)
+    assert difference(own, wanted) < limit
+
+
+@pytest.mark.thorough  # each precision is compiled for
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_single_precision(name: str, people: list[Sequence]) -> None:
+    batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
+    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
+    found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
+    assert {p.grad.dtype for p in model.parameters()} == {torch.float32}
+    mask = batch.valid[..., None].expand_as(exact.x)
+    torch.testing.assert_close(found.x[mask].double(), exact.x[mask], rtol=1e-6, atol=1e-6)
+    assert difference(own, wanted) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_many_blocks_and_threads(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
+    # more than fit into one block, and rows that are cut into pieces
+    items = [crowd(3 + i % 5, samples=3, name=f"m{i}") for i in range(150)]
+    batch, model = single(items), Crowd(MODELS[name]())
+    check(model, batch, FusedSolver(DT))
+    one, share = gradient(model, FusedSolver(DT), batch)
+    for threads in (2, 3):
+        many, same = gradient(model, FusedSolver(DT, threads), batch)
+        torch.testing.assert_close(many.x, one.x, rtol=1e-13, atol=1e-13)
+        assert difference(same, share) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_rows_longer_than_a_piece(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
+    draw = np.random.default_rng(5)
+    x = np.tile(draw.uniform(0, 25, (SIZE + 21, 2)), (2, 1, 1))
+    x[1] += 0.1
+    wall = np.array([[-1.0, 0.0, 0.0, 0.0]])
+    item = Sequence(name="l", recording="r", time=np.array([0, 0.1]), x=x, walls=wall)
+    check(Crowd(MODELS[name]()), single([item]), FusedSolver(DT, cutoff_error=0))
+
+
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_far_from_the_origin(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
+    item = crowd(6, samples=4)
+    far = np.array([3000.0, -800.0])
+    moved = Sequence(
+        name="far", recording="r", time=item.time, x=item.x + far, v=item.v,
+        destination=item.destination + far, walls=item.walls + np.tile(far, 2),
+    )  # fmt: skip
+    check(Crowd(MODELS[name]()), collate([moved]), FusedSolver(DT), limit=1e-9)
+
+
+def test_people_in_one_place(crowd) -> None:  # type: ignore[no-untyped-def]
+    item = crowd(3, samples=3)
+    item.x[:, 1] = item.x[:, 0]
+    check(Crowd(MODELS["sf"]()), collate([item]), FusedSolver(DT))
+
+
+def test_saturated_neurons(people: list[Sequence]) -> None:
+    # PyTorch's softplus has a corner at 20
+    model = Crowd(MODELS["nn"]())
+    with torch.no_grad():
+        for term in model.terms:
+            if isinstance(term, Law) and term.entry == "network_force":
+                term.pair.layers[0].bias[:2] = torch.tensor([25.0, -40.0])
+                term.wall.layers[0].weight.mul_(30.0)
+    check(model, single(people), FusedSolver(DT))
+
+
+def test_directional_derivative(people: list[Sequence]) -> None:
+    # independent of every adjoint: a difference quotient of states
+    batch, model = single(people), Crowd(MODELS["nn"]())
+    _, found = gradient(model, FusedSolver(DT), batch)
+    draw = torch.Generator().manual_seed(1)
+    direction = [torch.randn(p.shape, generator=draw, dtype=p.dtype) for p in model.parameters()]
+    values = []
+    for side in (1e-6, -2e-6):
+        with torch.no_grad():
+            for p, d in zip(model.parameters(), direction, strict=True):
+                p += side * d
+            run = FusedSolver(DT)(model, batch)
+            assert run.v is not None
+            speeds = run.v.masked_fill(~batch.valid[..., None], 0.0)
+            total = sequence_costs(run, batch).sum() + 0.02 * speeds.square().sum()
+            values.append(float(total))
+    flat = torch.cat([d.flatten() for d in direction])
+    quotient = (values[0] - values[1]) / 2e-6
+    assert float(found[: len(flat)] @ flat) == pytest.approx(quotient, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("nn", {}), ("sf", {"cutoff": 30.0})], ids=["dense", "lists"]
+)
+def test_padding_stands_still(name: str, options: dict[str, float], people: list[Sequence]) -> None:
+    batch = single(people)
+    x0, v0 = batch.x.clone().requires_grad_(), batch.v.clone().requires_grad_()
+    moving = Batch(**{**vars(batch), "x": x0, "v": v0})
+    model = Crowd(MODELS[name]())
+    law = compiled.supports(model, moving)
+    assert law is not None
+    x = compiled.simulate(model, law, moving, 2, **options)[..., :2]
+    padding = ~batch.agent
+    assert padding.any()
+    assert (x[:, padding] == batch.x[0, padding]).all()
+    x[:, padding].sum().backward()
+    assert x0.grad is not None
+    assert (x0.grad[0, padding] == len(x)).all()
+    assert not x0.grad[0, ~padding].any()
+
+
+def test_without_gradient_nothing_changes(people: list[Sequence]) -> None:
+    for name in ("sf", "nn"):
+        batch, model = collate(people), Crowd(MODELS[name]())
+        with torch.no_grad():
+            found = FusedSolver(DT)(model, batch).x
+        assert not found.requires_grad
+        same = FusedSolver(DT)(model, batch).x.detach()
+        torch.testing.assert_close(found, same, rtol=1e-14, atol=1e-14)
+
+
+def test_backward_twice(people: list[Sequence]) -> None:
+    batch, model = collate(people), Crowd(MODELS["sf"]())
+    cost = FusedSolver(DT)(model, batch).x[:, :, :2].square().sum()
+    weights = list(model.parameters())
+    once = torch.autograd.grad(cost, weights, retain_graph=True)
+    again = torch.autograd.grad(cost, weights)
+    for a, b in zip(once, again, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def test_a_blow_up_is_reported(crowd) -> None:  # type: ignore[no-untyped-def]
+    items = [crowd(1, name="alone"), crowd(3, name="crushed", apart=0.1)]
+    model = Crowd(
+        [make_law("relaxation"), make_law("social_force", A=1e300, k=0.0, kappa=0.0, B=1e-4)]
+    )
+    with pytest.raises(SimulationError, match="crushed blew up"):
+        FusedSolver(DT)(model, collate(items))
+
+
+def test_one_compilation_for_all_shapes(people: list[Sequence], crowd) -> None:  # type: ignore[no-untyped-def]
+    # arrays of another layout would be compiled for again, unnoticed but for the seconds
+    for items in (people, people[3:4], [crowd(2, samples=2)], [crowd(3)] * 70):
+        gradient(Crowd(MODELS["sf"]()), FusedSolver(DT), collate(items))
+    law = compiled.supports(Crowd(MODELS["sf"]()))
+    assert law is not None
+    module = compiled.compiled(CrowdSource(law))
+    for function in (module.forward, module.backward):
+        assert 1 <= len(function.signatures) <= 2  # of two precisions
+
+
+def test_what_is_covered(people: list[Sequence]) -> None:
+    class Weaker(InteractionForce):
+        def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+            return 0.5 * super().pair_force(dx, dv)
+
+    batch = collate(people)
+    assert compiled.supports(Crowd(MODELS["sf"]()), batch)
+    assert compiled.supports(Crowd(MODELS["nn"]()))
+    assert not compiled.supports(Traffic([make_law("lin")]))
+    assert not compiled.supports(Crowd([make_law("relaxation")]))
+    assert not compiled.supports(Crowd([make_law("relaxation"), Weaker(entry="social_force")]))
+    assert not compiled.supports(Crowd([*MODELS["sf"](), Sway()]))
+    deep = Crowd(MODELS["nn"]())
+    deep.find_law("network_force").pair = FeedForward((4, 3, 3, 2))
+    assert compiled.supports(deep)
+    alone = Crowd(MODELS["sf"]())
+    alone.neighbours = "measured"
+    assert not compiled.supports(alone)
+    # what sums run over is one for all of them, and only networks' may be over oneself
+    both = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
+    assert not compiled.supports(Crowd(both))
+    batch.destination.requires_grad_()
+    assert not compiled.supports(Crowd(MODELS["sf"]()), batch)
+
+
+def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
+    message = r"solver\.cutoff=0\.4 m must be larger than 0\.5 m, the distance of people who touch"
+    with pytest.raises(ConfigError, match=message):
+        FusedSolver(DT, cutoff=0.4)(Crowd(MODELS["sf"]()), collate(people))
+
+
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_loops_are_vector_code(name: str) -> None:
+    # losing this makes everything ten times slower and nothing else would tell
+    from tests.simulation.kernels.test_lane_code import PACKED, platform
+
+    if platform.machine() not in PACKED:
+        pytest.skip("unknown instruction set")
+    law = compiled.supports(Crowd(MODELS[name]()))
+    assert law is not None
+    source = CrowdSource(law)
+    module = compiled.compiled(source)
+    for kind in (np.float64, np.float32):
+        room, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
+        loops = ("law_others_vjp", "law_points_vjp", "slopes_others", "slopes_points")
+        divide = [getattr(module, one) for one in loops if hasattr(module, one)]
+        assert len(divide) == 2
+        for function in divide:
+            if function.__name__.startswith("law"):
+                function(room, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
+            else:
+                function(room, *(np.ones(32, kind) for _ in range(3)), 32, kind(1))
+            text = function.inspect_asm(function.signatures[-1])
+            assert re.findall(PACKED[platform.machine()], text), function.__name__
+
+
+#: What changes each part of a formula: sums over others, wall points and walls, inputs, clocks.
+EFFECTS = {
+    "sums": {
+        "alignment": {"c": 0.4},
+        "side_preference": {"c": 0.9},
+        "density_slowdown": {"c": 0.3},
+    },
+    "force": {"anticipation": {"T_a": 0.4}, "field_of_view": {"lambda_": 0.3}, "drift": {}},
+    "walls": {
+        "wall_repulsion": {"A_w": 0.8, "B_w": 0.3},
+        "group_cohesion": {"c": 0.5},
+        "gait_sway": {"a": 0.3, "f": 1.0, "people": {"a": [0.1, 0.4, 0.2, 0.9]}},
+        "walker_heterogeneity": {"people": {"c": [0.1, -0.3, 0.2, 0.4, 0.0, 0.1, 0.3]}},
+    },
+}
+
+
+def with_effects(base: str, *chosen: str) -> Crowd:
+    """A model, and the effects of some of the parts."""
+    effects = {name: values for part in chosen for name, values in EFFECTS[part].items()}
+    return Crowd([*MODELS[base](), *(CATALOGUE.effects[n](**v) for n, v in effects.items())])
+
+
+def in_groups(people: list[Sequence]) -> list[Sequence]:
+    names = ("g", "", "h", "g", "h", "g", "i", "h")
+    return [replace(item, group=names[: item.x.shape[1]]) for item in people]
+
+
+@pytest.mark.thorough  # many effects at once take long to compile
+@pytest.mark.parametrize(
+    ("base", "chosen"), [("sf", ("sums", "force", "walls")), ("nn", ("force",))], ids=str
+)
+def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> None:
+    check(with_effects(base, *chosen), single(in_groups(people)), FusedSolver(DT, 2))
+
+
+@pytest.mark.thorough
+def test_effects_among_neighbours(people: list[Sequence]) -> None:
+    model, batch = with_effects("sf", "walls"), single(in_groups(people))
+    check(model, batch, FusedSolver(DT, cutoff=50.0))
+    # one that leaves people out is another model
+    with torch.no_grad():
+        whole, near = (FusedSolver(DT, cutoff=c)(model, batch).x[-1] for c in (50.0, 0.6))
+    assert (whole - near)[batch.valid[-1]].abs().max() > 1e-6

@@ -1,0 +1,79 @@
+"""Compiled crowd code is kept between processes, and not beyond a change of what it is made of."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nnode.errors import ConfigError
+from nnode.model import Crowd, make_law
+from nnode.model.formula import crowd_of
+from nnode.simulation.kernels import crowds, source
+from nnode.simulation.kernels.crowds import CrowdSource
+
+SCRIPT = """
+import json
+import numpy as np
+from nnode.data.sequence import Sequence, collate
+from nnode.model import Crowd, make_law
+x = np.arange(12.0).reshape(1, 6, 2) + 0.1 * np.arange(3)[:, None, None]
+batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x)])
+model = Crowd([make_law("relaxation"), make_law("social_force")])
+from nnode.simulation import FusedSolver
+FusedSolver()(model, batch).x.sum().backward()
+from nnode.simulation.kernels.crowds import CrowdSource, compiled, supports
+module = compiled(CrowdSource(supports(model)))
+hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
+print(json.dumps({"hits": hits}))
+"""
+
+
+@pytest.mark.thorough
+def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
+    runs = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT],
+            env={**os.environ, "NNODE_CACHE": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        runs.append(json.loads(done.stdout))
+    assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
+    assert len(list((tmp_path / "fused").glob("*.py"))) == 1
+
+
+def test_one_law_of_other_bodies_is_one_module() -> None:
+    one, other = (
+        make_law("social_force", A=1.0, k=2.0, kappa=3.0),
+        make_law("social_force", A=4.0, k=5.0, kappa=6.0, r=0.3, B=0.2, mass=70.0),
+    )
+    texts = set()
+    for force in (one, other):
+        law = crowd_of([make_law("relaxation", tau=0.1 * len(texts) + 0.4), force])
+        assert law is not None
+        texts.add(CrowdSource(law).text())
+    assert len(texts) == 1
+
+
+def test_its_source_is_shown() -> None:
+    text = source(
+        Crowd([make_law("relaxation"), make_law("social_force", A=1.0, k=2.0, kappa=3.0)])
+    )
+    assert "social_force.pair_x = sum over others of" in text
+    assert "def backward(" in text
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
+    law = crowd_of([make_law("social_force", A=1.0, k=2.0, kappa=3.0)])
+    assert law is not None
+    with pytest.raises(ConfigError, match="NNODE_CACHE"):
+        crowds.compiled.__wrapped__(CrowdSource(law))

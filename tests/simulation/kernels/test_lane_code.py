@@ -1,0 +1,185 @@
+"""Compiled code: vector instructions, laws from elsewhere, and what is kept between processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from nnode.errors import ConfigError
+from nnode.model import Crowd, Traffic, make_law
+from nnode.model.effects.lane import RelativeSpeed
+from nnode.simulation import FusedSolver
+from nnode.simulation.kernels import functions, lanes, source
+from nnode.simulation.kernels.cache import digest
+from nnode.simulation.kernels.lanes import LaneSource
+from nnode.simulation.kernels.runs import COMPILED_IN
+from tests.simulation.fused.compare import gradient, single
+
+#: Divisions of several numbers at once, by processor.
+PACKED = {
+    "x86_64": r"\sv?divp[sd]\s",
+    "AMD64": r"\sv?divp[sd]\s",
+    "aarch64": r"\sfdiv(\.[24][sd])?\s+v",
+    "arm64": r"\sfdiv(\.[24][sd])?\s+v",
+}
+#: Calls into the mathematical library, which stay scalar.
+LIBRARY = r"\b(call\w*|movabsq|bl|adrp)\s[^\n]*\b(exp2?|expm1|log1p|log2?|pow)f?\b"
+#: Calls of our own functions that were not inlined.
+CALLED = r"\b(call\w*|movabsq|bl)\s[^\n]*\b_ZN5nnode8simulate\w*functions"
+
+
+def is_vector_code(text: str, loops: int = 1) -> bool:
+    """Whether assembly divides several numbers at once, in so many places, and calls nothing."""
+    packed = len(re.findall(PACKED[platform.machine()], text)) >= loops
+    return packed and not re.search(LIBRARY, text) and not re.search(CALLED, text)
+
+
+@pytest.fixture
+def fresh(tmp_path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
+    """An empty cache, and modules loaded from it."""
+    monkeypatch.setenv("NNODE_CACHE", str(tmp_path))
+    monkeypatch.setattr(lanes, "compiled", lanes.compiled.__wrapped__)
+    return Path(tmp_path)
+
+
+@pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
+@pytest.mark.parametrize(
+    ("law", "dtype"),
+    [
+        ("network_speed", torch.float64),
+        ("log", torch.float32),
+        pytest.param("network_speed", torch.float32, marks=pytest.mark.thorough),
+        pytest.param("log", torch.float64, marks=pytest.mark.thorough),
+        pytest.param("lin", torch.float64, marks=pytest.mark.thorough),
+        pytest.param("lin", torch.float32, marks=pytest.mark.thorough),
+    ],
+)
+def test_loops_are_vector_code(law, dtype, ragged, fresh, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    # losing this makes everything ten times slower and nothing else would tell
+    modules = []
+    load = lanes.compiled
+
+    def remember(own: LaneSource) -> object:
+        modules.append(load(own))
+        return modules[-1]
+
+    monkeypatch.setattr(lanes, "compiled", remember)
+    batch = single(ragged).to(dtype=dtype)
+    gradient(Traffic([make_law(law)]).to(dtype), FusedSolver(0.1), batch)
+    # every law divides in its derivatives
+    function = modules[-1].backward
+    (signature,) = function.signatures
+    assert is_vector_code(function.inspect_asm(signature))
+    # modules of the same text that are loaded later do not compile
+    gradient(Traffic([make_law(law)]).to(dtype), FusedSolver(0.1), batch)
+    first, second = (
+        [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
+        for module in modules
+    )
+    assert (first, second) == ([0, 0], [1, 1])
+
+
+@pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
+@pytest.mark.parametrize("body", ["np.exp(-x[i])", "np.log(x[i] + 2)", "far(x[i])", "exp(-x[i])"])
+def test_the_guard_sees_scalar_code(body: str) -> None:
+    @numba.njit(error_model="numpy", inline="never")
+    def far(x: float) -> float:
+        return np.exp(-x)  # type: ignore[no-any-return]
+
+    names = {"np": np, "far": far, "exp": functions.exp}
+    text = f"""
+def run(x, out):
+    for i in range(len(x)):
+        out[i] = x[i] / (1 + {body})
+    for i in range(len(x)):
+        out[i] = x[i] / (3 + out[i])
+"""
+    exec(text, names)
+    run = numba.njit(error_model="numpy", fastmath=functions.FLAGS)(names["run"])
+    run(np.ones(4), np.ones(4))
+    assert is_vector_code(run.inspect_asm(run.signatures[0])) == (body == "exp(-x[i])")
+
+
+def test_an_edit_of_what_is_compiled_in_changes_the_name(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    before = digest(b"text", COMPILED_IN)
+    assert digest(b"other", COMPILED_IN) != before
+    for module in COMPILED_IN:
+        assert module.__file__ is not None
+        file = tmp_path / Path(module.__file__).name
+        file.write_bytes(Path(module.__file__).read_bytes() + b"\n# edited\n")
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "__file__", str(file))
+            assert digest(b"text", COMPILED_IN) != before
+
+
+def test_everything_that_is_compiled_in_counts() -> None:
+    # whatever compiled text imports from the package must be part of the digest
+    counted = {module.__name__ for module in COMPILED_IN}
+    texts = [Path(str(module.__file__)).read_text("utf-8") for module in COMPILED_IN]
+    crowd = Crowd([make_law("relaxation"), make_law("social_force")])
+    texts += [source(model) for model in (Traffic([make_law("lin")]), crowd)]
+    for text in texts:
+        for line in text.splitlines():
+            if line.startswith("from nnode."):
+                assert line.split()[1] in counted, line
+
+
+def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
+    lane = Traffic([make_law("lin")]).lane
+    assert lane is not None
+    with pytest.raises(ConfigError, match="NNODE_CACHE"):
+        lanes.compiled.__wrapped__(LaneSource(lane))
+
+
+def test_the_source_can_be_read() -> None:
+    model = Traffic([make_law("lin"), RelativeSpeed(kappa=0.2)])
+    text = source(model)
+    compile(text, "generated", "exec")
+    assert "relative_speed.kappa" in text.split('"""')[1]
+
+
+SCRIPT = """
+import json, sys
+import numpy as np, torch
+from nnode.data.sequence import Sequence, collate
+from nnode.model import Traffic, make_law
+x = np.cumsum(np.full((3, 4, 1), 12.0), 1) + np.arange(3.0)[:, None, None]
+batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)])
+model = Traffic([make_law("network_speed")])
+from nnode.simulation import FusedSolver
+FusedSolver()(model, batch).x.sum().backward()
+from nnode.simulation.kernels import lanes
+from nnode.simulation.kernels.lanes import LaneSource
+module = lanes.compiled(LaneSource(model.lane))
+hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
+print(json.dumps({"hits": hits}))
+"""
+
+
+@pytest.mark.thorough
+def test_a_second_process_does_not_compile(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    environment = {**os.environ, "NNODE_CACHE": str(tmp_path)}
+    runs = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        runs.append(json.loads(done.stdout))
+    assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
+    assert len(list((tmp_path / "fused").glob("*.py"))) == 1

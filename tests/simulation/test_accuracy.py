@@ -1,0 +1,161 @@
+"""Trajectories against plain loops and against an analytic solution.
+
+A follower of the law Lin behind a leader at v0 has dg/dt = v0 - v0 (1 - L / g) = v0 L / g, so its
+gap is g(t) = sqrt(g(0)² + 2 v0 L t).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import collate
+from nnode.errors import SimulationError
+from nnode.model import Crowd, Traffic, make_law
+from nnode.simulation import TorchdiffeqSolver
+
+V0, LENGTH, GAP = 20.0, 5.0, 8.0
+
+
+def simulated_gap(platoon, method: str, dt: float, **tolerances: float) -> np.ndarray:  # type: ignore[no-untyped-def]
+    batch = collate([platoon([GAP], samples=8)])
+    model = Traffic([make_law("lin", v0=V0, L=LENGTH)])
+    x = TorchdiffeqSolver(method, dt=dt, **tolerances)(model, batch).x.detach().numpy()
+    return x[:, 0, 1, 0] - x[:, 0, 0, 0]
+
+
+ANALYTIC = np.sqrt(GAP**2 + 2 * V0 * LENGTH * 0.2 * np.arange(8))
+
+
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [("euler", 1), ("midpoint", 2), ("heun3", 3), ("rk4", 4)],
+)
+def test_order_of_convergence(platoon, method: str, order: int) -> None:  # type: ignore[no-untyped-def]
+    number = np.array([8, 16, 32, 64]) if order < 4 else np.array([2, 4, 8, 16])
+    error = [abs(simulated_gap(platoon, method, 0.2 / n) - ANALYTIC).max() for n in number]
+    slope = np.polyfit(np.log(0.2 / number), np.log(error), 1)[0]
+    assert slope == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize("method", ["explicit_adams", "implicit_adams"])
+def test_multistep_methods_step_inside_the_sampling_interval(platoon, method: str) -> None:  # type: ignore[no-untyped-def]
+    coarse = abs(simulated_gap(platoon, method, 0.04) - ANALYTIC).max()
+    fine = abs(simulated_gap(platoon, method, 0.01) - ANALYTIC).max()
+    assert coarse > 0
+    # order four at least
+    assert fine < coarse / 4**3.5
+
+
+@pytest.mark.parametrize("method", ["dopri5", "scipy_solver"])
+def test_adaptive_methods_meet_their_tolerance(platoon, method: str) -> None:  # type: ignore[no-untyped-def]
+    error = {}
+    for tolerance in (1e-5, 1e-10):
+        gap = simulated_gap(platoon, method, 0.2, rtol=tolerance, atol=tolerance)
+        error[tolerance] = abs(gap - ANALYTIC).max()
+        # positions are of the order of 50 m, and errors of several steps add up
+        assert error[tolerance] < tolerance * 50 * 10
+    assert error[1e-10] < error[1e-5] / 1e3
+
+
+def lin(gap: float) -> float:
+    return 25.0 * (1 - 4.5 / gap)
+
+
+def log(gap: float) -> float:
+    return 25.0 * np.log(gap / 4.5)
+
+
+@pytest.mark.parametrize(("term", "law"), [("lin", lin), ("log", log)])
+def test_euler_in_traffic_is_the_plain_loop(platoon, term, law) -> None:  # type: ignore[no-untyped-def]
+    item = platoon([12.0, 30.0, 9.0], samples=5)
+    found = TorchdiffeqSolver("euler", dt=0.01)(
+        Traffic([make_law(term, v0=25.0, L=4.5)]), collate([item])
+    )
+    x = item.x[0, :, 0].copy()
+    for k in range(5):
+        np.testing.assert_allclose(found.x[k, 0, :, 0].detach(), x, rtol=1e-13)
+        for _ in range(20):
+            rate = [law(x[i + 1] - x[i]) for i in range(3)] + [25.0]
+            x = x + 0.01 * np.array(rate)
+
+
+def test_euler_in_crowds_is_the_plain_loop(crowd) -> None:  # type: ignore[no-untyped-def]
+    item = crowd(3, samples=4)
+    model = Crowd([make_law("relaxation", tau=0.5)])
+    found = TorchdiffeqSolver("euler", dt=0.05)(model, collate([item]))
+    x, v = item.x[0].copy(), item.velocity()[0].copy()
+    for k in range(4):
+        np.testing.assert_allclose(found.x[k, 0].detach(), x, rtol=1e-10)
+        np.testing.assert_allclose(found.v[k, 0].detach(), v, rtol=1e-10)
+        for _ in range(4):
+            way = item.destination - x
+            speed = np.linalg.norm(v, axis=1, keepdims=True)
+            desired = speed * way / np.linalg.norm(way, axis=1, keepdims=True)
+            x, v = x + 0.05 * v, v + 0.05 * (desired - v) / 0.5
+
+
+def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
+    for model, items in (
+        (
+            Traffic([make_law("lin", v0=25.0, L=4.5)]),
+            [platoon([12.0, 30.0], samples=13, start=900.0)],
+        ),
+        (
+            Crowd([make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]),
+            [crowd(4)],
+        ),
+    ):
+        double = TorchdiffeqSolver("euler", dt=0.01)(model, collate(items)).x
+        single = TorchdiffeqSolver("euler", dt=0.01)(
+            model.to(torch.float32), collate(items).to(dtype=torch.float32)
+        ).x
+        # rounding of one step, 6e-8 of the position, over at most 240 steps
+        torch.testing.assert_close(single.double(), double, rtol=6e-8 * 240, atol=1e-5)
+        assert not torch.equal(single.double(), double)
+
+
+def test_the_gradient_does_not_change_the_trajectory(platoon) -> None:  # type: ignore[no-untyped-def]
+    model, batch = Traffic([make_law("lin", v0=25.0, L=4.5)]), collate([platoon([12.0, 30.0])])
+    adjoint = TorchdiffeqSolver(gradient="adjoint", dt=0.02)(model, batch).x
+    discrete = TorchdiffeqSolver(gradient="discrete", dt=0.02)(model, batch).x
+    assert torch.equal(adjoint, discrete)
+
+
+def test_a_blow_up_names_sequence_agent_and_time(platoon) -> None:  # type: ignore[no-untyped-def]
+    crash = platoon([30.0, 20.0], noise=0.0, name="run/crash")
+    crash.x[:, 1] = crash.x[:, 2]  # agent 1 stands where agent 2 does: its gap is 0
+    batch = collate([platoon([20.0, 25.0], name="run/good"), crash])
+    with pytest.raises(SimulationError, match=r"run/crash.*agent 1 at 0\.2 s"):
+        TorchdiffeqSolver(dt=0.02)(Traffic([make_law("lin")]), batch)
+
+
+def runaway() -> Traffic:
+    """Speed 1e40 m/s per metre of gap: single precision lasts only a few steps."""
+    term = make_law("network_speed", hidden=1, v0=0.0)
+    with torch.no_grad():
+        for weight, value in zip(term.network.parameters(), (1.0, 0.0, -1e12, 0.0), strict=True):
+            weight.fill_(value)
+    return Traffic([term])
+
+
+def test_a_blow_up_is_dated(platoon) -> None:  # type: ignore[no-untyped-def]
+    model = runaway().to(torch.float32)
+    batch = collate([platoon([30.0], samples=9, noise=0.0)]).to(dtype=torch.float32)
+    # each Euler step of 0.2 s multiplies the gap by 0.2e12: 30 * (2e11)^k overflows at k = 4
+    with pytest.raises(SimulationError, match=r"agent 0 at 0\.8 s"):
+        TorchdiffeqSolver(dt=0.2)(model, batch)
+
+
+def test_a_sequence_stands_still_after_its_end(platoon) -> None:  # type: ignore[no-untyped-def]
+    model = runaway().to(torch.float32)
+    short, long = platoon([30.0], samples=3, noise=0.0), platoon([], samples=9)
+    batch = collate([short, long]).to(dtype=torch.float32)
+    trajectory = TorchdiffeqSolver(gradient="discrete", dt=0.2)(model, batch)
+    x = trajectory.x.detach()
+    assert x.isfinite().all()
+    assert torch.equal(x[4:, 0], x[-1:, 0].expand_as(x[4:, 0]))
+    # what overflows behind the end would turn into NaN here, masked or not
+    (trajectory.x[..., 0] * batch.valid).sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())

@@ -1,0 +1,429 @@
+"""Laws, effects, methods and engines: states and gradients against float64 autograd.
+
+Of lanes most cases run the generated source in Python's interpreter, which takes less time than
+to compile it. The compiled ones are a selection here, and all of them are among the thorough tests.
+Crowds are always compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nnode.app.python.inputs import model_options
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.model import System, Traffic, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
+from nnode.model.steps import METHODS
+from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
+from nnode.simulation.kernels import lanes
+from tests.model.effects.test_crowd_effects import VALUES
+from tests.model.following import model
+from tests.simulation.fused.compare import RungeKutta
+from tests.simulation.kernels.interpreted import interpreted
+
+LEADERS = ("constant", "measured")
+SUBSTEPS = 2
+#: Laws of the paper; networks start at random weights.
+PAPER: dict[str, dict[str, Any]] = {
+    "lin": {"term": "lin", "v0": 21.0, "L": 4.0, "L_min": 2.0},
+    "log": {"term": "log", "v0": 21.0, "L": 4.0, "L_min": 2.0},
+    **{
+        f"n{n}": {"term": "network_speed", "v0": 21.0, "hidden": n, "box": None} for n in (2, 4, 10)
+    },
+}
+#: What a user's law may have: a state, a delay, a network, the time, the second vehicle ahead.
+OWN: dict[str, dict[str, Any]] = {
+    "speed": {"parameters": {"v0": "21 m/s", "L": "4 m"}, "rate": {"x": "v0*(1 - L/gap)"}},
+    "speed_ahead": {
+        "parameters": {"v0": "21 m/s", "L": "4 m", "c": "0.3"},
+        "rate": {"x": "(1 - c)*v0*(1 - L/gap) + c*dx_1"},
+    },
+    "speed_network": {
+        "parameters": {"v0": "21 m/s"}, "rate": {"x": "v0*NN(gap/20)"}, "network": 3,
+    },
+    "state": {
+        "parameters": {"c": "0.8 1/s", "T": "1.1 s", "tau": "0.7 s"},
+        "states": {"late": ["m/s", "(gap/T - late)/tau", "v*T/T"]},
+        "rate": {"v": "c*(late - v)"},
+    },
+    "delay": {
+        "parameters": {"c": "0.8 1/s", "T": "1.1 s", "wait": "0.13 s"},
+        "delayed": {"late": ["gap", "m", "wait"]}, "remembered": 4,
+        "rate": {"v": "c*(late/T - v)"},
+    },
+    "network": {
+        "parameters": {"unit": "1 m/s²"}, "network": 3,
+        "rate": {"v": "unit*NN(gap/20, v/10, dv/2)"},
+    },
+    "second": {
+        "parameters": {"c": "0.1 1/s²", "k": "0.4 1/s"},
+        "rate": {"v": "c*(gap_1 - gap) + k*(v_2 - v)"},
+    },
+    "beside": {**CAR_FOLLOWING_LAWS["idm"], "network": 2},
+}  # fmt: skip
+#: One value that is not neutral of every effect.
+EFFECTS: dict[str, dict[str, Any]] = {
+    "speed_zone": {"alpha": 0.7, "a": 10.0, "b": 40.0},
+    "speed_period": {"alpha": 0.7, "a": 0.1, "b": 2.0},
+    "vehicle_class": {"kind": "truck", "phi": 1.3},
+    "driver_heterogeneity": {"people": {"p0": [0.1, 0.0, -0.2, 0.0], "p1": [0.1, 0.1]}},
+    "slope": {"grade": 0.04, "a": 10.0, "b": 45.0},
+    "pure_delay": {"T": 0.13},
+}
+#: Laws that are compiled in the thorough tests: one of each kind.
+COMPILED = ("lin", "speed_ahead", "state", "beside", "ovm", "fvdm", "helly", "gipps", "a2")
+
+#: Forces of the paper, as options of the model.
+FORCES: dict[str, dict[str, Any]] = {
+    "sf": {"term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1},
+    "sf_opposing": {
+        "term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1, "r": 0.3,
+        "mass": 2.0, "tau": 0.7, "opposing_wall_friction": True,
+    },
+    "sf_open": {
+        "term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1, "walls": False,
+    },
+    "nn": {"term": "network_force"},
+    "nn_open": {"term": "network_force", "hidden": 3, "mass": 2.0, "walls": False},
+    "nn_self": {"term": "network_force", "self_interaction": True},
+}  # fmt: skip
+#: What a user's law of people may have: sums, smallest and largest values that name each other.
+OWN_FORCES: dict[str, dict[str, Any]] = {
+    "sums": {
+        "parameters": {"A": "2 m/s²", "B": "40 cm", "tau": "0.7 s"},
+        "where": {"push": "A*exp((2*r - d)/B)"},
+        "others": {"push_x": "push*n_x", "push_y": "push*n_y"},
+        "rate": {
+            "vx": "(speed*way_x - vx)/tau + push_x", "vy": "(speed*way_y - vy)/tau + push_y",
+        },
+    },
+    "smallest": {
+        "parameters": {"A": "0.6 1/s", "B": "0.5 m", "C": "0.3 1/s²", "tau": "0.7 s"},
+        "where": {
+            "crowded": "1 + number", "near": "d*crowded", "push": "A*max(2*B - closest, 0)/tau",
+        },
+        "others": {"number": "exp(-d/B)"},
+        "smallest": {"closest": "near", "slow": "sqrt(dvx**2 + dvy**2 + small_v**2)"},
+        "largest": {"right": "choose(2.5*B - d, dx, -nobody)"},
+        "rate": {
+            "vx": "(speed*way_x - vx)/tau + push + C*max(right, -B)",
+            "vy": "(speed*way_y - vy)/tau + 0.1*A*min(slow, speed)",
+        },
+    },
+}  # fmt: skip
+#: Values of effects on people that are not neutral.
+CROWD_EFFECTS: dict[str, dict[str, Any]] = {
+    **VALUES,
+    "walker_heterogeneity": {"people": {"6": [0.1, -0.2, 0.0, 0.3, 0.1, -0.1], "2": [0.2, 0.1]}},
+}
+#: Laws of people that are compiled every time; the others take seconds each and are thorough.
+OFTEN = ("sf", "nn", "nn_self", "cfsm", "sums")
+#: Two sides of a room, and a wall in it; x1, y1, x2, y2 in m.
+WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
+
+
+def platoons() -> Batch:
+    """Three platoons of different numbers of vehicles and of samples, in a wave; of cars and
+    trucks."""
+    found = []
+    for i, n in enumerate((4, 2, 3)):
+        t = 0.1 * torch.arange(6 - i, dtype=torch.float64)[:, None]
+        late = t - 0.3 * torch.arange(n - 1, -1, -1)
+        x = 12 * late + 2 * torch.sin(late + i) + (22.3 + i) * torch.arange(n)
+        v = 12 + 2 * torch.cos(late + i)
+        found.append(
+            Sequence(
+                name=f"p{i}", recording="r", time=t[:, 0].numpy(),
+                x=x[..., None].numpy(), v=v[..., None].numpy(),
+                length=torch.where(torch.arange(n) == 1, 9.0, 4.0).numpy(),
+                kind=tuple("truck" if j == 1 else "car" for j in range(n)),
+            )
+        )  # fmt: skip
+    return collate(found)
+
+
+def lane_of(law: str, leader: str, *effects: str) -> Traffic:
+    chosen = [{"name": e, **EFFECTS.get(e, {})} for e in effects]
+    if law in CAR_FOLLOWING_LAWS:
+        own = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
+        found = model(own, *chosen, leader=leader)
+    elif law in OWN:
+        given = dict(OWN[law])
+        more = {"network": given.pop("network")} if "network" in given else {}
+        found = model(given, *chosen, leader=leader, **more)
+    else:
+        built = build_model({"name": law, "leader": leader, "effects": chosen, **PAPER[law]})
+        assert isinstance(built, Traffic)
+        found = built
+    with torch.no_grad():  # nothing stays at a kink, or at the neutral value of a network
+        for i, p in enumerate(found.parameters()):
+            if p.ndim:
+                p.add_(0.05 * torch.cos(torch.arange(p.numel()) + i).reshape(p.shape))
+    return found
+
+
+def moving(batch: Batch) -> tuple[Batch, Tensor, Tensor]:
+    """The same batch with places and speeds of the start of which a gradient can be taken."""
+    x, v = (t[0].clone().requires_grad_() for t in (batch.x, batch.v))
+    both = [torch.cat([start[None], t[1:]]) for start, t in ((x, batch.x), (v, batch.v))]
+    return Batch(**{**vars(batch), "x": both[0], "v": both[1]}), x, v
+
+
+def weights(batch: Batch, states: int) -> Tensor:
+    """``(K, B, N, M)`` different weights of all valid states."""
+    shape = (*batch.x.shape[:3], states)
+    found = torch.cos(torch.arange(batch.x[..., 0].numel() * states).double()).reshape(shape)
+    return torch.where(batch.valid[..., None], found, 0.0)
+
+
+def exact(system: System, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """States at the samples, and the gradient of their weighted sum, by autograd."""
+    scene, x, v = moving(batch)
+    dt = batch.dt / SUBSTEPS
+    solver = RungeKutta(SUBSTEPS) if method == "rk4" else TorchdiffeqSolver(method, "discrete", dt)
+    states = _states(solver(system, scene))
+    return states, _slopes(system, batch, states, x, v)
+
+
+def _states(path: Trajectory) -> Tensor:
+    return path.x if path.v is None else torch.cat([path.x, path.v], -1)
+
+
+def _slopes(
+    system: System, batch: Batch, states: Tensor, x: Tensor, v: Tensor
+) -> dict[str, Tensor]:
+    own = {name: p for name, p in system.named_parameters() if p.requires_grad}
+    total = (weights(batch, states.shape[-1]) * states).sum()
+    found = torch.autograd.grad(total, [*own.values(), x, v], allow_unused=True)
+    named = {
+        name: torch.zeros_like(p) if slope is None else slope
+        for (name, p), slope in zip({**own, "x": x, "v": v}.items(), found, strict=True)
+    }
+    if getattr(system, "leader", "") == "measured":  # the leader's places and speeds are data
+        follower = system.scene(batch).follower[..., None]
+        named |= {name: torch.where(follower, named[name], 0.0) for name in ("x", "v")}
+    return named
+
+
+def compiled(
+    system: System, batch: Batch, method: str, threads: int = 1
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same by the generated code."""
+    scene, x, v = moving(batch)
+    if isinstance(system, Traffic):  # the solver refuses gradients by a leader's measured path
+        lane = lanes.supports(system, batch)
+        assert lane is not None
+        y = lanes.simulate(system, lane, scene, SUBSTEPS, method=method)[:, 0]
+        found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
+    else:
+        solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
+        found = _states(solver(system, scene))
+        assert not solver.uncompiled
+    return found, _slopes(system, batch, found, x, v)
+
+
+def threaded(system: System, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same by two threads."""
+    return compiled(system, batch, method, 2)
+
+
+def ensemble(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same with two runs at once, whose parameters are rows of numbers; of the second one,
+    which has other parameters, nothing is returned."""
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    scene, x, v = moving(batch)
+    own = dict(system.named_parameters())
+    both = {name: torch.stack([p, 1.01 * p]) for name, p in own.items()}
+    y = lanes.simulate(system, lane, scene, SUBSTEPS, parameters=both, method=method)[:, 0]
+    found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
+    return found, _slopes(system, batch, found, x, v)
+
+
+def by_tangents(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same by the derivatives of all states, of the parameters alone."""
+    lane = lanes.supports(system, batch)
+    assert lane is not None
+    own = {name: torch.zeros_like(p) for name, p in system.named_parameters() if p.requires_grad}
+    owned = {symbol: at for symbol, at in lane.owned.items() if at[0] in own}
+    y, slopes = lanes.tangents(system, lane, batch, SUBSTEPS, list(owned), method=method)
+    weight = weights(batch, system.order)
+    if system.leader == "measured":
+        weight = torch.where(system.scene(batch).follower[..., None], weight, 0.0)
+    for slope, (name, place, _) in zip(slopes, owned.values(), strict=True):
+        own[name].view(-1)[place] = (weight * slope[..., : system.order]).sum()
+    found = torch.cat([part for part in system.observe(y, batch) if part is not None], -1)
+    return found, own
+
+
+def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
+    """Compare states, and every part of the gradient by itself."""
+    states, wanted = exact(system, batch, method)
+    assert wanted["x"].abs().max() > 0
+    for engine in engines:
+        found, own = engine(system, batch, method)
+        torch.testing.assert_close(found[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11)
+        for name, slope in own.items():
+            size = float(wanted[name].abs().max())
+            away = float((slope - wanted[name]).abs().max())
+            # of cancelling sums rounding remains, in units of the largest part of the gradient
+            assert away <= 1e-9 * size + 1e-12, (engine.__name__, name, slope, wanted[name])
+
+
+def cases(laws: Iterable[str]) -> list[Any]:
+    """Laws with the methods that they have: a map has no stages in between. Large networks are
+    formulas like small ones."""
+    found = []
+    for law in laws:
+        for method in METHODS:
+            large = law in ("n4", "n10", "a4", "a10") and method != "rk4"
+            if not (method == "rk4" and _is_map(law)):
+                marks = [pytest.mark.thorough] if large else []
+                found.append(pytest.param(law, method, marks=marks))
+    return found
+
+
+#: Effects that act on each other, and several memories.
+TOGETHER = (
+    ("lin", "reaction_delay+relative_speed+speed_zone"), ("lin", "reaction_delay+inertia"),
+    ("idm", "memory+relative_speed"),
+)  # fmt: skip
+
+
+def _is_map(law: str, *effects: str) -> bool:
+    lane = lane_of(law, "measured", *effects).lane
+    assert lane is not None
+    return "dt" in lane.symbols
+
+
+def with_effects() -> list[Any]:
+    """One effect of each kind on a law of each order."""
+    found = []
+    for law, order in (("lin", 1), ("idm", 2)):
+        for effect in CATALOGUE.of("traffic", every=True):
+            if order not in effect.rules:
+                continue
+            for method in METHODS:
+                if method == "rk4" and _is_map(law, effect.name):
+                    continue
+                often = method in ("rk4", "ballistic" if effect.name == "pure_delay" else "")
+                marks = [] if often else [pytest.mark.thorough]
+                found.append(pytest.param(law, effect.name, method, marks=marks))
+    return found + [(law, effects, "euler") for law, effects in TOGETHER]
+
+
+@pytest.fixture
+def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lanes, "compiled", interpreted)
+
+
+@pytest.mark.usefixtures("without_compiler")
+@pytest.mark.parametrize("leader", LEADERS)
+@pytest.mark.parametrize(("law", "method"), cases([*PAPER, *OWN, *CAR_FOLLOWING_LAWS]))
+def test_every_law_and_method(law: str, method: str, leader: str) -> None:
+    check(lane_of(law, leader), platoons(), method, compiled, ensemble, by_tangents)
+
+
+@pytest.mark.usefixtures("without_compiler")
+@pytest.mark.parametrize("leader", LEADERS)
+@pytest.mark.parametrize(("law", "effect", "method"), with_effects())
+def test_every_effect(law: str, effect: str, method: str, leader: str) -> None:
+    system = lane_of(law, leader, *effect.split("+"))
+    check(system, platoons(), method, compiled, by_tangents)
+
+
+@pytest.mark.parametrize(
+    "law", ["n4", "idm", *(pytest.param(n, marks=pytest.mark.thorough) for n in COMPILED)]
+)
+def test_compiled_stages(law: str) -> None:
+    """A leader that drives by itself, in vehicles side by side and in vehicles one after the
+    other."""
+    check(lane_of(law, "constant"), platoons(), "rk4", compiled)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("law", ["lin", "idm", "speed_ahead"])
+@pytest.mark.parametrize("method", METHODS)
+def test_compiled_runs_and_tangents(law: str, method: str) -> None:
+    check(lane_of(law, "constant"), platoons(), method, ensemble, by_tangents)
+
+
+def room() -> Batch:
+    """Crowds of one to nine people, of different duration, with none to three walls."""
+    found = []
+    for n, walls, samples in ((6, 1, 6), (9, 2, 4), (1, 3, 6), (2, 0, 6)):
+        draw, time = np.random.default_rng(n), 0.04 * np.arange(samples)
+        x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
+        found.append(
+            Sequence(
+                name=f"{n}", recording="r", time=time, x=x + time[:, None, None] * v,
+                v=np.broadcast_to(v, (samples, n, 2)), walls=WALLS[:walls],
+                preferred=draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1],
+                group=tuple("ab"[i % 2] for i in range(n)),
+            )
+        )  # fmt: skip
+    return collate(found)
+
+
+def crowd_of(law: str, *effects: str) -> System:
+    chosen = [{"name": e, **CROWD_EFFECTS[e]} for e in effects]
+    if law in FORCES:
+        return build_model({**model_options({"name": law, **FORCES[law]}), "effects": chosen}, 3)
+    own = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
+    options = model_options({"term": "formula", "name": law, "law": own})
+    found = build_model({**options, "desired": "direction", "effects": chosen})
+    if law == "ttc":  # milder, so that nobody is thrown out of the room
+        with torch.no_grad():
+            found.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
+    return found
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        pytest.param(law, marks=() if law in OFTEN else pytest.mark.thorough)
+        for law in (*FORCES, *OWN_FORCES, *PEDESTRIAN_LAWS)
+    ],
+)
+def test_every_law_of_people(law: str) -> None:
+    check(crowd_of(law).double(), room(), "euler", compiled, threaded)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        pytest.param(effect, marks=() if effect == "drift" else pytest.mark.thorough)
+        for effect in CROWD_EFFECTS
+    ],
+)
+def test_every_effect_on_people(effect: str) -> None:
+    check(crowd_of("sf", effect).double(), room(), "euler", compiled)
+
+
+@pytest.mark.parametrize("leader", LEADERS)
+@pytest.mark.parametrize("law", ["lin", "idm"])
+@pytest.mark.parametrize(("method", "order"), [("euler", 1), ("ballistic", 1), ("rk4", 4)])
+def test_the_adjoint_equation(law: str, method: str, order: int, leader: str) -> None:
+    """torchdiffeq's adjoint approaches the gradient of the solution with the order of the method:
+    a finer step by a factor of four divides its distance to that of the next one by 4**order."""
+    system, batch = lane_of(law, leader), platoons()
+    found = []
+    for substeps in (1, 4, 16):
+        scene, x, v = moving(batch)
+        path = TorchdiffeqSolver(method, "adjoint", batch.dt / substeps)(system, scene)
+        slopes = _slopes(system, batch, _states(path), x, v)
+        found.append(torch.cat([slopes[name].flatten() for name in slopes]))
+    coarse, fine = (float((one - found[2]).norm()) for one in found[:2])
+    assert fine > 0
+    # of errors c, c/r and c/r² with r = 4**order the distances to the last one have the ratio r + 1
+    assert coarse / fine > 0.7 * (4**order + 1), (coarse, fine)
+    wanted = exact(system, batch, "rk4")[1]
+    away = torch.cat([wanted[name].flatten() for name in slopes]) - found[2]
+    assert away.norm() < 2 * coarse / 4**order + 1e-7 * found[2].norm()

@@ -1,0 +1,167 @@
+"""Gradients of the cost against complex differentiation of plain numpy loops.
+
+For a function f that is real on the real axis, Im f(u + i h) / h is its derivative without
+cancellation: h = 1e-30 gives every digit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.calibrate.cost import sequence_costs
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.model import Crowd, Law, System, Traffic, make_law
+from nnode.simulation import TorchdiffeqSolver
+
+HIDDEN, R, B, TAU = 4, 0.25, 0.1, 0.5
+
+
+def traffic_loop(speed: Callable, item: Sequence, u: np.ndarray, steps: int) -> np.ndarray:
+    """Cost by Euler; u[0] is v0."""
+    x, total = item.x[0, :, 0].astype(complex), 0.0
+    for k in range(1, item.n_samples):
+        for _ in range(steps):
+            x = x + item.dt / steps * np.append(speed(np.diff(x), u), u[0])
+        total += 0.5 * item.dt * ((x - item.x[k, :, 0]) ** 2).sum()
+    return total
+
+
+def lin(gap: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return u[0] * (1 - u[1] / gap)
+
+
+def log(gap: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return u[0] * np.log(gap / u[1])
+
+
+def n4(gap: np.ndarray, u: np.ndarray) -> np.ndarray:
+    w1, b1, w2, b2 = np.split(u[1:], [HIDDEN, 2 * HIDDEN, 3 * HIDDEN])
+    return np.array([np.log(1 + np.exp(w1 * g + b1)) @ w2 + b2[0] for g in gap])
+
+
+def length(vector: np.ndarray) -> complex:
+    return np.sqrt((vector**2).sum())
+
+
+def social_force_loop(item: Sequence, u: np.ndarray, steps: int) -> np.ndarray:
+    """Cost by Euler without walls; u is (A, k, kappa)."""
+    n = item.n_agents
+    x, v = item.x[0].astype(complex), item.velocity()[0].astype(complex)
+    total = 0.0
+    for k in range(1, item.n_samples):
+        for _ in range(steps):
+            a = np.zeros_like(v)
+            for i in range(n):
+                way = item.destination[i] - x[i]
+                a[i] += (length(v[i]) * way / length(way) - v[i]) / TAU
+                for j in range(n):
+                    if j == i:
+                        continue
+                    d = length(x[i] - x[j])
+                    e = (x[i] - x[j]) / d
+                    t = np.array([-e[1], e[0]])
+                    h = 2 * R - d if d.real < 2 * R else 0.0
+                    push = u[0] * np.exp((2 * R - d) / B) + u[1] * h
+                    a[i] += (push * e + u[2] * h * ((v[j] - v[i]) @ t) * t) / n
+            x, v = x + item.dt / steps * v, v + item.dt / steps * a
+        total += 0.5 * item.dt * ((x - item.x[k]) ** 2).sum()
+    return total
+
+
+def complex_gradient(cost: Callable, u: np.ndarray) -> np.ndarray:
+    h = 1e-30
+    return np.array([cost(u + 1j * h * e).imag / h for e in np.eye(len(u))])
+
+
+def network() -> Law:
+    return make_law(
+        "network_speed", hidden=HIDDEN, v0=16.0, generator=torch.Generator().manual_seed(4)
+    )
+
+
+TRAFFIC = {
+    "lin": (lambda: make_law("lin", v0=21.0, L=4.5), lin),
+    "log": (lambda: make_law("log", v0=21.0, L=6.5), log),
+    "n4": (network, n4),
+}
+
+
+def flat(model: System, gradient: bool = False) -> np.ndarray:
+    values = [p.grad if gradient else p.detach() for p in model.parameters()]
+    return torch.cat([value.flatten() for value in values]).numpy()
+
+
+def gradient(model: System, batch: Batch, kind: str, dt: float) -> np.ndarray:
+    model.zero_grad()
+    solver = TorchdiffeqSolver("euler", kind, dt)
+    sequence_costs(solver(model, batch), batch).sum().backward()
+    return flat(model, gradient=True)
+
+
+@pytest.mark.parametrize("name", TRAFFIC)
+def test_discrete_gradient_in_traffic(platoon, name: str) -> None:  # type: ignore[no-untyped-def]
+    make, speed = TRAFFIC[name]
+    # softplus of an argument above 20 is replaced by it in torch: 2e-9 away, so gaps stay small
+    item = platoon([6.0, 8.0, 5.5], samples=4, noise=1.0)
+    model = Traffic([make()])
+    expected = complex_gradient(lambda u: traffic_loop(speed, item, u, 10), flat(model))
+    found = gradient(model, collate([item]), "discrete", 0.02)
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
+
+
+def test_discrete_gradient_in_crowds(crowd) -> None:  # type: ignore[no-untyped-def]
+    item = crowd(4, samples=4)
+    shaken = item.x + 0.05 * np.cos(9 * np.arange(4))[:, None, None]
+    item = replace(item, walls=None, x=shaken)
+    model = Crowd(
+        [
+            make_law("relaxation", tau=TAU),
+            make_law("social_force", A=1.5, k=30.0, kappa=9.0, r=R, B=B),
+        ]
+    )
+    expected = complex_gradient(lambda u: social_force_loop(item, u, 5), flat(model))
+    found = gradient(model, collate([item]), "discrete", 0.04)
+    assert abs(expected).min() > 0
+    # the package smooths distances at 1e-6 m, which changes them by 1e-12 of a square metre
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def adjoint_deviation(model: System, batch: Batch, dt: float) -> float:
+    discrete = gradient(model, batch, "discrete", dt)
+    adjoint = gradient(model, batch, "adjoint", dt)
+    return float(np.linalg.norm(adjoint - discrete) / np.linalg.norm(discrete))
+
+
+@pytest.mark.parametrize("name", [*TRAFFIC, "sf"])
+def test_adjoint_gradient_deviates_at_first_order(platoon, crowd, name: str) -> None:  # type: ignore[no-untyped-def]
+    if name == "sf":
+        model: System = Crowd(
+            [
+                make_law("relaxation", tau=TAU),
+                make_law("social_force", A=1.5, k=30.0, kappa=9.0, r=R, B=B),
+            ]
+        )
+        # at 0.35 m neighbours stay in contact all the time: no kink is crossed
+        batch, number = collate([crowd(3, samples=3, apart=0.35)]), np.array([64, 128, 256])
+    else:
+        model = Traffic([TRAFFIC[name][0]()])
+        batch = collate([platoon([9.0, 16.0, 7.0], samples=4, noise=1.0)])
+        number = np.array([32, 64, 128])
+    deviation = [adjoint_deviation(model, batch, 0.2 / n) for n in number]
+    slope = np.polyfit(np.log(0.2 / number), np.log(deviation), 1)[0]
+    assert 0.9 < slope < 1.1
+    assert deviation[-1] < 0.05
+
+
+def test_gradient_in_single_precision(platoon) -> None:  # type: ignore[no-untyped-def]
+    batch = collate([platoon([9.0, 16.0, 7.0], noise=1.0)])
+    for kind in ("adjoint", "discrete"):
+        model = Traffic([make_law("lin", v0=21.0, L=4.5)])
+        double = gradient(model, batch, kind, 0.02)
+        single = gradient(model.to(torch.float32), batch.to(dtype=torch.float32), kind, 0.02)
+        np.testing.assert_allclose(single, double, rtol=1e-3)

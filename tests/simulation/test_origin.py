@@ -1,0 +1,206 @@
+"""Where the origin of coordinates lies does not matter, in float32 as little as in float64."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nnode.app.python.inputs import model_options
+from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.ensemble import EnsembleCost
+from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.problem import ResidualProblem
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.errors import ConfigError
+from nnode.model import Crowd, System, Traffic, make_law
+from nnode.model.build import add_effects, build_model
+from nnode.model.effects import CATALOGUE
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, Law, law_from
+from nnode.simulation import FusedSolver, TorchdiffeqSolver
+from nnode.simulation.base import simulated_batch
+
+#: Metres: a city's own coordinates, a country's, and northings of UTM.
+AWAY = (1e5, 7e6)
+SOLVERS = {
+    "torchdiffeq": TorchdiffeqSolver("euler", "discrete", 0.02),
+    "fused": FusedSolver(0.02),
+}
+
+
+def people(shift: float = 0.0) -> Sequence:
+    """Two streams that meet between two walls, of people who touch."""
+    time = 0.1 * np.arange(21)
+    start = np.array([[0.0, 0.0], [1.2, 0.3], [4.0, 0.62], [5.0, -0.4], [2.5, 1.0]])
+    speed = np.array([[1.3, 0.0], [1.1, 0.0], [-1.2, 0.0], [-1.0, 0.0], [0.9, -0.3]])
+    walls = np.array([[-5.0, -1.0, 15.0, -1.0], [15.0, 2.0, -5.0, 2.0]])
+    x = start + time[:, None, None] * speed + shift
+    return Sequence(name="people", recording="r", time=time, x=x, walls=walls + shift)
+
+
+def cars(shift: float = 0.0, number: int = 5) -> Sequence:
+    time = 0.2 * np.arange(76)
+    x = 25.0 * np.arange(number) + 15 * time[:, None] + 8 * np.sin(time[:, None] / 4)
+    return Sequence(name=f"cars {number}", recording="r", time=time, x=(x + shift)[..., None])
+
+
+def crowd(dtype: torch.dtype) -> System:
+    return Crowd([make_law("relaxation"), make_law("social_force", A=2.0, k=100.0, kappa=10.0)]).to(
+        dtype
+    )
+
+
+def lin(dtype: torch.dtype) -> System:
+    return Traffic([make_law("lin", v0=25.0, L=5.0)]).to(dtype)
+
+
+def idm(dtype: torch.dtype) -> System:
+    return Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])], leader="measured").to(dtype)
+
+
+CASES = {
+    "people": (crowd, lambda shift: collate([people(shift)])),
+    "lin": (lin, lambda shift: collate([cars(shift), cars(shift + 3e4, 3)])),
+    "idm": (idm, lambda shift: collate([cars(shift), cars(shift + 3e4, 3)])),
+}
+
+
+def single(batch: Batch) -> Batch:
+    return batch.to(dtype=torch.float32)
+
+
+def gradient(model: System, solver: object, batch: Batch) -> tuple[Tensor, Tensor]:
+    found = solver(model, batch)  # type: ignore[operator]
+    own = torch.autograd.grad(sequence_costs(found, batch).sum(), list(model.parameters()))
+    return found.x.detach(), torch.cat([part.flatten() for part in own])
+
+
+@pytest.mark.parametrize("kind", SOLVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_float32_does_not_depend_on_the_origin(case: str, kind: str) -> None:
+    build, make = CASES[case]
+    exact = SOLVERS[kind](build(torch.float64), make(0.0)).x.detach()
+    here, slope = gradient(build(torch.float32), SOLVERS[kind], single(make(0.0)))
+    real = make(0.0).valid[..., None].expand_as(exact)
+    assert (here - exact)[real].abs().max() < 0.01
+    for shift in AWAY:
+        there, other = gradient(build(torch.float32), SOLVERS[kind], single(make(shift)))
+        # what is left is the rounding of the measured positions in float64, 1e-9 m at 7,000 km,
+        # which can move a float32 by its last place
+        assert (there - shift - here)[real].abs().max() < 1e-3
+        torch.testing.assert_close(other, slope, rtol=1e-3, atol=1e-3)
+
+
+def test_costs_of_an_ensemble_and_tangents_far_away() -> None:
+    model, solver = idm(torch.float32), FusedSolver()
+    near, far = (single(CASES["idm"][1](shift)) for shift in (0.0, 7e6))
+    rows = [EnsembleCost(model, b, solver) for b in (near, far)]
+    row = ParameterVector(model).row[None]
+    torch.testing.assert_close(rows[0].costs(row), rows[1].costs(row), rtol=1e-4, atol=1e-6)
+    curved = [ResidualProblem(model, b, solver)(row[0].numpy()) for b in (near, far)]
+    np.testing.assert_allclose(curved[0].cost, curved[1].cost, rtol=1e-4)
+    scale = np.abs(curved[0].gradient).max()
+    np.testing.assert_allclose(curved[0].gradient, curved[1].gradient, atol=1e-3 * scale)
+
+
+def test_float64_takes_positions_as_they_are() -> None:
+    batch = collate([people(1e5)])
+    same, origin = simulated_batch(crowd(torch.float64), batch)
+    assert same is batch
+    assert origin is None
+
+
+def test_positions_of_a_batch_stay_as_they_were_measured() -> None:
+    batch = collate([people(7e6), replace(people(-3e6), walls=None)])
+    moved = single(batch)
+    for name in ("x", "destination", "walls"):
+        torch.testing.assert_close(
+            getattr(moved, name), getattr(batch, name), rtol=0, atol=0, equal_nan=True
+        )
+    near, origin = simulated_batch(crowd(torch.float32), moved)
+    assert origin is not None
+    assert (origin == origin.round()).all()
+    assert near.x.dtype == near.walls.dtype == near.destination.dtype == torch.float32
+    for name, ends in (("x", 1), ("destination", 1), ("walls", 2)):
+        back = getattr(near, name).double() + origin.repeat(1, ends)[:, None]
+        wanted = getattr(batch, name)
+        torch.testing.assert_close(back, wanted, rtol=0, atol=1e-5, equal_nan=True)
+
+
+def test_a_leader_that_follows_its_measured_path_has_no_error_at_all() -> None:
+    batch = single(collate([cars(7e6), cars(7e6, 3)]))
+    x = FusedSolver()(idm(torch.float32), batch).x
+    for b, last in enumerate((4, 2)):
+        assert torch.equal(x[:, b, last], batch.x[:, b, last])
+
+
+@pytest.mark.parametrize("law", [make_law("lin"), make_law("log"), make_law("network_speed")])
+def test_the_paper_s_lanes_name_no_places(law: object) -> None:
+    assert not Traffic([law]).names_places  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("name", CAR_FOLLOWING_LAWS)
+def test_laws_of_the_field_name_no_places(name: str) -> None:
+    assert not build_model(model_options(name)).names_places
+
+
+@pytest.mark.parametrize("name", PEDESTRIAN_LAWS)
+def test_laws_of_people_name_no_places(name: str) -> None:
+    assert not Crowd([law_from(name, PEDESTRIAN_LAWS[name])]).names_places
+
+
+def test_the_paper_s_crowds_name_no_places() -> None:
+    assert not Crowd(
+        [make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]
+    ).names_places
+    assert not Crowd([make_law("relaxation"), make_law("network_force")]).names_places
+
+
+PLACES = {"speed_zone", "slope", "obstacle", "attraction"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "leader"), [("lin", "measured"), ("idm", "measured"), ("sf", None)]
+)
+def test_effects_of_places_name_places(kind: str, leader: str | None) -> None:
+    domain = "crowd" if kind == "sf" else "traffic"
+    known = CATALOGUE.of(domain, every=True)  # type: ignore[arg-type]
+    offered, found = set(), set()
+    for effect in (e for e in known if e.__module__.startswith("nnode.")):
+        with suppress(ConfigError):  # some are for laws of the other order
+            model = build_model(model_options(kind, leader, [effect.name]))
+            offered.add(effect.name)
+            if model.names_places:
+                found.add(effect.name)
+    assert found == PLACES & offered
+
+
+def test_a_term_that_is_code_may_name_places() -> None:
+    class Windy(Law):
+        def forward(self, state):  # type: ignore[no-untyped-def]
+            return super().forward(state) + state.x * 1e-3
+
+    assert Crowd([Windy("relaxation")]).names_places
+
+
+def test_a_zone_stays_where_it_is() -> None:
+    def zoned(shift: float, dtype: torch.dtype) -> System:
+        model = Traffic([make_law("lin", v0=25.0, L=5.0)], leader="measured")
+        zone = {"name": "speed_zone", "alpha": 0.5, "a": shift + 60.0, "b": shift + 160.0}
+        add_effects(model, [zone])
+        return model.to(dtype)
+
+    plain, solver = CASES["lin"][1], TorchdiffeqSolver("euler", "discrete", 0.02)
+    exact = solver(zoned(0.0, torch.float64), plain(0.0)).x.detach()
+    bare = solver(
+        Traffic([make_law("lin", v0=25.0, L=5.0)], leader="measured"), plain(0.0)
+    ).x.detach()
+    assert (exact - bare).abs()[:, 0].max() > 1
+    for shift, limit in ((0.0, 0.02), (4096.0, 0.2)):
+        batch = single(plain(shift))
+        found = solver(zoned(shift, torch.float32), batch).x.detach() - shift
+        assert (found - exact)[:, 0].abs().max() < limit

@@ -1,0 +1,142 @@
+"""How many steps are taken, and that they are the ones asked for."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nnode.calibrate.cost import sequence_costs
+from nnode.data.sequence import collate
+from nnode.errors import ConfigError, DataError
+from nnode.model import System, Traffic, make_law
+from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
+from nnode.model.system import Crowd
+from nnode.simulation import TorchdiffeqSolver, substeps
+
+#: Speeds in a lane, accelerations in a lane, accelerations of people.
+LANE, PEDESTRIAN_LAWS = Traffic([make_law("lin")]), Crowd([make_law("relaxation")])
+FOLLOWING = Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])])
+
+
+def count_evaluations(system: System) -> list[int]:
+    """A list whose length grows by one with each evaluation of the right-hand side."""
+    calls: list[int] = []
+    system.register_forward_hook(lambda *_: calls.append(1))
+    return calls
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("samples", "sampling", "dt", "steps"),
+    [
+        (13, 0.2, 0.01, 240),  # T = 2.4 s
+        (13, 0.2, 0.002, 1200),
+        (14, 0.2, 0.2, 13),
+        (4, 0.2, 0.2 / 3, 9),
+        (11, 0.1, 0.02, 50),
+        (8, 0.3, 0.1, 21),
+        (3, 0.2, None, 200),
+    ],
+)
+def test_number_of_steps(platoon, dtype, samples, sampling, dt, steps) -> None:  # type: ignore[no-untyped-def]
+    model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
+    calls = count_evaluations(model)
+    batch = collate([platoon([20.0], samples=samples, dt=sampling)]).to(dtype=dtype)
+    with torch.no_grad():
+        TorchdiffeqSolver("euler", dt=dt)(model, batch)
+    assert len(calls) == steps
+
+
+@pytest.mark.parametrize(("sampling", "steps"), [(0.04, 25), (0.0625, 25), (0.1, 50)])
+def test_default_step_of_crowds(crowd, sampling: float, steps: int) -> None:  # type: ignore[no-untyped-def]
+    model = Crowd([make_law("relaxation")])
+    calls = count_evaluations(model)
+    TorchdiffeqSolver("euler")(model, collate([crowd(2, samples=26, dt=sampling)]))
+    assert len(calls) == steps
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("method", "stages"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
+def test_the_adjoint_takes_as_many_steps_back(platoon, dtype, method, stages) -> None:  # type: ignore[no-untyped-def]
+    model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
+    calls = count_evaluations(model)
+    batch = collate([platoon([20.0], samples=13)]).to(dtype=dtype)
+    trajectory = TorchdiffeqSolver(method, "adjoint", dt=0.02)(model, batch)
+    assert len(calls) == 120 * stages
+    sequence_costs(trajectory, batch).sum().backward()
+    assert len(calls) == 2 * 120 * stages
+
+
+@pytest.mark.parametrize(
+    ("sampling", "dt", "number"),
+    [
+        (0.2, 0.002, 100),
+        (0.2, 0.2, 1),
+        (0.2 + 3e-9, 0.02, 10),  # recorded times carry rounding errors
+        (0.30000000000000004, 0.1, 3),
+        (1 / 25, 0.01, 4),
+    ],
+)
+def test_substeps(sampling: float, dt: float, number: int) -> None:
+    assert substeps(sampling, dt, LANE) == number
+
+
+@pytest.mark.parametrize(
+    ("sampling", "system", "number"),
+    [
+        (0.2, LANE, 100),
+        (0.1, LANE, 50),
+        (0.001, LANE, 1),
+        (0.0033, LANE, 2),
+        (0.1, FOLLOWING, 1),
+        (0.2, FOLLOWING, 2),
+        (0.04, PEDESTRIAN_LAWS, 1),
+        (0.0625, PEDESTRIAN_LAWS, 1),
+        (0.2, PEDESTRIAN_LAWS, 4),
+    ],
+)
+def test_chosen_substeps_are_the_fewest_below_the_default(
+    sampling: float, system: System, number: int
+) -> None:
+    assert substeps(sampling, None, system) == number
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, float("nan"), float("inf")])
+def test_a_step_must_be_positive(dt: float) -> None:
+    with pytest.raises(ConfigError, match=r"solver\.dt=.*positive"):
+        substeps(0.2, dt, LANE)
+
+
+@pytest.mark.parametrize(("sampling", "dt"), [(0.2, 1e-7), (2e8, 0.1), (2e8, None)])
+def test_more_than_a_million_steps_are_refused(sampling: float, dt: float | None) -> None:
+    with pytest.raises(ConfigError, match=r"expected at most 1e\+06; take a larger solver\.dt"):
+        substeps(sampling, dt, LANE)
+    assert substeps(0.1, 1e-7, LANE) == 10**6
+
+
+@pytest.mark.parametrize("dt", [0.03, 0.3, 0.19, 0.2001, 1e3])
+def test_a_step_that_does_not_divide_is_refused_with_ones_that_do(dt: float) -> None:
+    with pytest.raises(ConfigError, match="does not divide") as caught:
+        substeps(0.2, dt, LANE)
+    offered = str(caught.value).split("use solver.dt=")[1].split(",")[0].split(" or ")
+    for value in offered:
+        assert substeps(0.2, float(value), LANE) >= 1
+
+
+def test_a_single_sample_has_no_sampling_interval(platoon) -> None:  # type: ignore[no-untyped-def]
+    batch = collate([platoon([20.0], samples=1)])
+    with pytest.raises(DataError, match="at least two samples"):
+        TorchdiffeqSolver()(Traffic([make_law("lin")]), batch)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"method": "eular"}, r"solver\.method=eular.*euler"),
+        ({"gradient": "exact"}, r"solver\.gradient=exact.*adjoint or discrete"),
+        ({"method": "scipy_solver", "gradient": "discrete"}, "leaves no graph"),
+    ],
+)
+def test_unknown_choices_are_refused(options: dict[str, str], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        TorchdiffeqSolver(**options)
