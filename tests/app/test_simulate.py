@@ -26,7 +26,7 @@ SAMPLES = 39
 def run(started: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short training."""
     folder = tmp_path_factory.mktemp("simulate")
-    table(10, 20.0).to_csv(folder / "mine.csv", index=False)
+    table(10, 10.0).to_csv(folder / "mine.csv", index=False)
     done = started(
         "train", "model=idm", "data=table", "data.domain=traffic", f"data.path={folder}/mine.csv",
         "trainer.max_epochs=2", f"hydra.run.dir={folder}/run",
@@ -77,7 +77,7 @@ def test_a_format_that_does_not_fit_is_refused_at_once(
 
 
 def test_in_python_it_is_an_object(tmp_path: Path) -> None:
-    drives = table(10, 20.0)
+    drives = table(10, 10.0)
     run = nnode.fit(drives, "traffic", model="idm", epochs=2)
     with pytest.raises(ConfigError, match="a table in memory; give it again, as data=TABLE"):
         nnode.simulate(run)
