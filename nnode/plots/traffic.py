@@ -45,7 +45,7 @@ def follow_law(system: System, name: str = "model") -> Law:
         ConfigError: there is none.
     """
     law = system.find(Law)
-    if law is None:
+    if law is None or system.domain != "traffic":
         raise ConfigError(
             f"{name}: a speed curve needs a traffic model with a law of the gap, found a "
             f"{system.domain} model with the terms {[t.name for t in system.terms]}"
