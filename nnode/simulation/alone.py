@@ -27,7 +27,7 @@ from nnode.model.system import System
 from nnode.model.term import State, Term
 from nnode.model.terms import CrowdDynamics, own_values, values_of
 from nnode.simulation.kernels.alone import FIELDS, WalkSource, compiled
-from nnode.simulation.linear import DenseSolver
+from nnode.simulation.linear import RungeKuttaSolver
 from nnode.simulation.numpy import simulated
 from nnode.simulation.rhs import side_by_side
 
@@ -301,21 +301,13 @@ class RunAlone:
         source = np.zeros((times, 2, 2, 4 + 2 * times, 1))
         start[0, 0, 0] = start[0, 1, 1] = start[1, 0, 2] = start[1, 1, 3] = 1.0
         for axis in range(2):
-            source[:, 1, axis, 4 + axis :: 2, 0] = _curved(times)
+            source[:, 1, axis, 4 + axis :: 2, 0] = np.eye(times)
         found = []
         for part in np.split(matrix, range(PEOPLE, matrix.shape[1], PEOPLE), 1):
             every = [np.repeat(unit, part.shape[1], -1) for unit in (source, start)]
-            found.append(DenseSolver(part, 2, self.around.step).response(*every))
+            found.append(RungeKuttaSolver(part, self.around.step).response(*every))
         responses = torch.from_numpy(np.concatenate(found, -1)).permute(3, 0, 1, 2)
         return responses[..., :4], responses[..., 4:]
-
-
-def _curved(times: int) -> np.ndarray:
-    """``(F, F)``: rates at the steps for which the trapezoidal rule, applied twice, gives the
-    positions of accelerations that are curved between the steps: a - h²/6 a''. A gait's sway of
-    one second changes too fast for lines."""
-    bend = np.diff(np.eye(times), 2, axis=0)
-    return np.eye(times) - np.concatenate([bend[:1], bend, bend[-1:]]) / 6
 
 
 def _with_values(system: System, parameters: dict[str, Tensor]) -> System:
