@@ -63,6 +63,11 @@ class Surroundings:
         return self._scenes[number]
 
     @cached_property
+    def place(self) -> Tensor:
+        """``(P,)`` of the real people among those of all windows."""
+        return self.window * self.x.shape[2] + self.person
+
+    @cached_property
     def others(self) -> np.ndarray:
         """``(H, 4, W, N)`` measured positions and velocities."""
         return torch.cat([self.x, self.v], -1).permute(0, 3, 1, 2).contiguous().numpy()
@@ -104,6 +109,7 @@ class PersonAlone:
 
     Attributes:
         compiled: whether the law is.
+        of_law: names of the parameters that the compiled law has.
     """
 
     def __init__(self, around: Surroundings, system: System, parameters: dict[str, Tensor]) -> None:
@@ -113,10 +119,12 @@ class PersonAlone:
         laws = list(takewhile(lambda term: isinstance(term, Law), terms))
         force, law = system.find(InteractionForce), crowd_of(laws)
         self.compiled = law is not None and not (force is not None and force.self_interaction)
+        self.of_law: frozenset[str] = frozenset()
         effects: list[Term] = []
         if law is not None and self.compiled:
             self._kernel = compiled(WalkSource(law))
             own = {name: value.detach() for name, value in own_values(laws, law).items()}
+            self.of_law = frozenset(own)
             rows = [*values_of(law, own | parameters), *settings_of(laws, law).values()]
             every = [torch.as_tensor(row, dtype=torch.float64).expand(self.number) for row in rows]
             self._law = torch.stack(every, 1).numpy() if every else np.zeros((self.number, 1))
@@ -147,23 +155,24 @@ class PersonAlone:
         return [_with_values(self._system, run) for run in self._runs]
 
     @torch.no_grad()
-    def __call__(self, moment: np.ndarray, x: Tensor, v: Tensor) -> Tensor:
+    def __call__(self, moment: np.ndarray, states: Tensor, by_law: Tensor | None = None) -> Tensor:
         """``(L, W, N, 2)`` accelerations, m/s².
 
         Args:
             moment: ``(L,)`` half steps since the start.
-            x, v: ``(L, W, N, 2)`` positions (m) and velocities (m/s).
+            states: ``(L, W, N, 4)`` positions (m) and velocities (m/s).
+            by_law: of :meth:`by_law`, where it is known.
         """
-        rate = self.by_law(moment, x, v)
+        rate = self.by_law(moment, states) if by_law is None else by_law.clone()
         if self._effects:
-            self._add_effects(moment, x, v, rate)
+            self._add_effects(moment, states, rate)
         if not self._code:
             return rate
-        size = len(x) // len(self._systems)
+        size = len(states) // len(self._systems)
         found = []
         for k, system in enumerate(self._systems):
             part = slice(k * size, (k + 1) * size)
-            state = self._state(system, moment[part], x[part], v[part], rate[part])
+            state = self._state(system, moment[part], states[part], rate[part])
             for place in self._code:
                 assert state.rate is not None
                 state = replace(state, rate=state.rate + system.terms[place](state))
@@ -171,17 +180,17 @@ class PersonAlone:
             found.append(state.rate.view(rate[part].shape))
         return torch.cat(found)
 
-    def _add_effects(self, moment: np.ndarray, x: Tensor, v: Tensor, rate: Tensor) -> None:
+    def _add_effects(self, moment: np.ndarray, states: Tensor, rate: Tensor) -> None:
         """Add the accelerations by effects, in parts that fit the cache."""
         around, out = self.around, rate.numpy()
-        states = torch.cat([x, v], -1).permute(0, 3, 1, 2).contiguous().numpy()
-        windows, people = states.shape[2:]
+        components = states.permute(0, 3, 1, 2).contiguous().numpy()
+        windows, people = components.shape[2:]
         size = max(1, CACHED // people**2)
         for k, at in enumerate(moment):
             effects = self._effects[k if self.number > 1 else 0]
             for first in range(0, windows, size):
                 part = slice(first, first + size)
-                now, others = states[k][:, part], around.others[at][:, part]
+                now, others = components[k][:, part], around.others[at][:, part]
                 for axis, found in enumerate(effects(at * around.step / 2, now, others, part)):
                     out[k, part, :, axis] += found
 
@@ -191,41 +200,38 @@ class PersonAlone:
         h = self.around.step
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
-            x, v = torch.from_numpy(y).split(2, -1)
-            return torch.cat([v, self(np.full(len(y), round(2 * t / h)), x, v)], -1).numpy()
+            found = self(np.full(len(y), round(2 * t / h)), torch.from_numpy(y))
+            return np.concatenate([y[..., 2:], found.numpy()], -1)
 
-        y = start.expand(self.number, -1, -1, -1).numpy()
+        y = start.repeat(self.number, 1, 1, 1).numpy()
         return torch.from_numpy(simulated(rate, y, h, steps + 1, h))
 
-    def by_law(self, moment: np.ndarray, x: Tensor, v: Tensor) -> Tensor:
+    def by_law(self, moment: np.ndarray, states: Tensor) -> Tensor:
         """As above, without what is not compiled."""
-        rate = torch.zeros_like(x)
+        rate = torch.zeros_like(states[..., :2], memory_format=torch.contiguous_format)
         if self.compiled:
-            window, person = self.around.window, self.around.person
-            states = torch.cat([x, v], -1)[:, window, person]
-            number, people = states.shape[:2]
+            place, number = self.around.place, len(states)
             row = np.arange(number) if self.number > 1 else np.zeros(number, dtype=int)
+            own = states.flatten(1, 2).index_select(1, place)
             found = self._kernel.accelerations(
-                states.view(-1, 4).numpy(), np.tile(np.arange(people), number),
-                np.repeat(moment, people), np.repeat(row, people), *self.around.tables, self._law,
+                own.view(-1, 4).numpy(), np.tile(np.arange(len(place)), number),
+                np.repeat(moment, len(place)), np.repeat(row, len(place)),
+                *self.around.tables, self._law,
             )  # fmt: skip
-            rate[:, window, person] = torch.from_numpy(found).view(number, people, 2)
+            rate.flatten(1, 2).index_copy_(1, place, torch.from_numpy(found).view(number, -1, 2))
         return rate
 
-    def state(self, moment: np.ndarray, x: Tensor, v: Tensor) -> State:
+    def state(self, moment: np.ndarray, states: Tensor) -> State:
         """What a further term sees at many times of one run, ``(L W, N, 2)``."""
-        return self._state(self._systems[0], moment, x, v, self(moment, x, v))
+        return self._state(self._systems[0], moment, states, self(moment, states))
 
-    def _state(
-        self, system: System, moment: np.ndarray, x: Tensor, v: Tensor, rate: Tensor
-    ) -> State:
+    def _state(self, system: System, moment: np.ndarray, states: Tensor, rate: Tensor) -> State:
         around, at = self.around, torch.from_numpy(moment)
-        t = (at.to(x.dtype) * around.step / 2).repeat_interleave(x.shape[1])
+        t = (at.to(rate.dtype) * around.step / 2).repeat_interleave(rate.shape[1])
         others = around.x[at].flatten(0, 1), around.v[at].flatten(0, 1)
-        scene = around.repeated(len(x))
-        x, v, rate = x.flatten(0, 1), v.flatten(0, 1), rate.flatten(0, 1)
+        (x, v), scene = states.flatten(0, 1).split(2, -1), around.repeated(len(states))
         terms = cast(list[Term], list(system.terms))
-        return State(t, x, v, scene, terms, rate=rate, seen=others)
+        return State(t, x, v, scene, terms, rate=rate.flatten(0, 1), seen=others)
 
 
 def _is_formula(term: Term) -> bool:
@@ -239,12 +245,12 @@ class RunAlone:
     Args:
         around: the surroundings.
         system: the model, with the parameters of the run.
-        x, v: ``(F, W, N, 2)`` positions (m) and velocities (m/s) at the F steps.
+        states: ``(F, W, N, 4)`` positions (m) and velocities (m/s) at the F steps.
     """
 
-    def __init__(self, around: Surroundings, system: System, x: Tensor, v: Tensor) -> None:
-        self.around, self.system, self._x, self._v = around, system, x, v
-        self._moment = 2 * np.arange(len(x))
+    def __init__(self, around: Surroundings, system: System, states: Tensor) -> None:
+        self.around, self.system, self._states = around, system, states.contiguous()
+        self._moment = 2 * np.arange(len(states))
         self._own = {
             name: p.detach()[None] for name, p in system.named_parameters() if p.requires_grad
         }
@@ -253,11 +259,11 @@ class RunAlone:
     @cached_property
     def state(self) -> State:
         """What a further term sees along the run, ``(F W, N, 2)``."""
-        return self._rhs.state(self._moment, self._x, self._v)
+        return self._rhs.state(self._moment, self._states)
 
     def of_people(self, field: Tensor) -> Tensor:
         """``(P, 2 F)`` of accelerations ``(F W, N, 2)`` or ``(F, W, N, 2)``, by time."""
-        own = field.reshape(self._x.shape)[:, self.around.window, self.around.person]
+        own = field.reshape(len(self._states), -1, 2).index_select(1, self.around.place)
         return own.movedim(1, 0).flatten(1)
 
     def parameters(self, steps: Sequence[float]) -> list[Tensor]:
@@ -268,14 +274,16 @@ class RunAlone:
                 over a visible difference of its strength is what a fit has to know.
         """
         found: list[Tensor] = []
+        by_law = self._rhs.by_law(self._moment, self._states)
         for name, value in self._own.items():
+            known = None if name in self._rhs.of_law else by_law
             for place in range(value.numel()):
                 half = torch.zeros(value.numel(), dtype=value.dtype)
                 half[place] = steps[len(found)] / 2
                 half = half.reshape(value.shape)
                 higher, lower = (
                     PersonAlone(self.around, self.system, {**self._own, name: value + change})(
-                        self._moment, self._x, self._v
+                        self._moment, self._states, known
                     )
                     for change in (half, -half)
                 )
@@ -285,14 +293,13 @@ class RunAlone:
     def unit_responses(self) -> tuple[Tensor, Tensor]:
         """``(P, F, 2, 4)`` responses of positions to the start (x, v); ``(P, F, 2, 2 F)`` to
         accelerations at the steps, by time."""
-        matrix = np.zeros((len(self._x), len(self.around.window), 4, 4))
+        matrix = np.zeros((len(self._states), len(self.around.window), 4, 4))
         matrix[..., 0, 2] = matrix[..., 1, 3] = 1.0
         for k in range(4):
-            change = torch.zeros(4, dtype=self._x.dtype)
+            change = torch.zeros(4, dtype=self._states.dtype)
             change[k] = DIFFERENCE
             higher, lower = (
-                self._rhs(self._moment, self._x + sign * change[:2], self._v + sign * change[2:])
-                for sign in (1, -1)
+                self._rhs(self._moment, self._states + sign * change) for sign in (1, -1)
             )
             slope = (higher - lower)[:, self.around.window, self.around.person]
             matrix[..., 2:, k] = slope.numpy() / (2 * DIFFERENCE)

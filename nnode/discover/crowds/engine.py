@@ -125,8 +125,8 @@ class CrowdEngine:
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""
         windows, nothing = self.windows, Crowd([])
-        x, v = windows.batch.x[::2], windows.batch.v[::2]
-        run = RunAlone(windows.around(nothing), nothing, x, v)
+        measured = torch.cat([windows.batch.x[::2], windows.batch.v[::2]], -1)
+        run = RunAlone(windows.around(nothing), nothing, measured)
         first = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
         return crowd_variables(run.state, first)
 
@@ -175,7 +175,7 @@ class CrowdEngine:
         states = self._states(system, row[None])[:, 0]
         filled = ParameterVector(copy.deepcopy(system)).fill_(row)
         assert self._around is not None
-        run = RunAlone(self._around, filled, states[..., :2], states[..., 2:])
+        run = RunAlone(self._around, filled, states)
         return system, row.clone(), run
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
