@@ -15,7 +15,7 @@ from benchmarks.recovery.recover import Recovered, recover
 from nnode.data.options import SumoOptions
 from nnode.data.readers.sumo import read_sumo
 from nnode.data.sequence import Sequence
-from nnode.model.laws import CAR_FOLLOWING_LAWS
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 
 #: What SUMO calls the parameters.
 _SUMO = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel"}
@@ -129,7 +129,7 @@ def _collision_free() -> Case:
     typed = {"T": 1.0, "l": 0.4, "a": 8.0, "D": 0.1}
 
     def recovered(folder: Path) -> Recovered:
-        law = import_module("nnode.model.field_crowd").PEDESTRIAN_LAWS["cfsm"]
+        law = PEDESTRIAN_LAWS["cfsm"]
         jupedsim = import_module("jupedsim")
         model = jupedsim.CollisionFreeSpeedModel(
             strength_neighbor_repulsion=typed["a"], range_neighbor_repulsion=typed["D"]

@@ -44,7 +44,7 @@ def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ..
     """Which of the field's laws a model has, whatever it calls it.
 
     Args:
-        described: their descriptions by name, see :func:`nnode.model.formula_law.law_from`.
+        described: their descriptions by name, see :func:`nnode.model.laws.law_from`.
         names: those that are asked for.
     """
     term = system.terms[0] if len(system.terms) else None

@@ -284,7 +284,7 @@ class Crowd(System):
     first order.
 
     Args:
-        desired: where people want to go, see :func:`nnode.model.scene.desired`.
+        desired: where people want to go, see :func:`nnode.model.scene.wanted`.
         neighbours: ``simulated``: people react to each other's simulated states;
             ``measured``: each is simulated alone among the measured paths of the others.
     """

@@ -1,7 +1,7 @@
 """The right-hand side of people who each walk alone among the measured paths of the others.
 
-The law is compiled where it is a formula. Its effects are computed by PyTorch for all simulations
-at once, so that nothing is compiled for each of the many models of a search.
+The law is compiled where it is a formula. Effects with a rule are computed by NumPy, and terms that
+are code by PyTorch, so that nothing is compiled for each of the many models of a search.
 
 Arrays are ``(L, W, N, ...)``: L runs of a model, or L times of one run; W windows; N people.
 """

@@ -44,7 +44,7 @@ def ballistic(law: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A law of :data:`nnode.model.field.FIELD` and what is added to it.
+    """A law of :data:`nnode.model.laws.CAR_FOLLOWING_LAWS` and what is added to it.
 
     Attributes:
         law: its name.

@@ -91,7 +91,7 @@ def clipped(
     steps, ballistic ones.
 
     Args:
-        law: its description, see :data:`nnode.model.field.FIELD`.
+        law: its description, see :data:`nnode.model.laws.CAR_FOLLOWING_LAWS`.
         limits: m/s².
         values: by parameter, SI units.
     """
