@@ -38,7 +38,7 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.discover.options import DiscoverOptions
-from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS, PEDESTRIAN_LAWS
+from nnode.model.laws import LAW_MODELS
 from nnode.model.options import (
     FormulaOptions,
     LawOptions,
@@ -181,10 +181,8 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("model", "formula_schema"): FormulaOptions(term="formula"),
     # a law is chosen by its name; its file among the laws is all that it needs
     **{
-        ("model", name): FormulaOptions(
-            name=name, term="formula", law=law, network=NEURONS.get(name)
-        )
-        for name, law in (CAR_FOLLOWING_LAWS | PEDESTRIAN_LAWS).items()
+        ("model", name): FormulaOptions(name=name, **options)
+        for name, options in LAW_MODELS.items()
     },
     ("model", "network_speed_schema"): NetworkSpeedOptions(term="network_speed"),
     ("model", "social_force_schema"): SocialForceOptions(term="social_force"),

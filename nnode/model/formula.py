@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -19,7 +18,7 @@ from nnode.model.laws import Law, parameters_of
 from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
-from nnode.model.term import State, Term
+from nnode.model.term import State, Term, numbered
 from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, own_values, values_of
 
 #: What terms say of their formulas to the formula of all.
@@ -94,13 +93,9 @@ def owners(terms: Sequence[Term]) -> list[str]:
     Raises:
         ConfigError: a name that cannot stand in a formula.
     """
-    check_names("terms", [term.name for term in terms])
-    seen: Counter[str] = Counter()
-    found = []
-    for term in terms:
-        seen[term.name] += 1
-        found.append(term.name if seen[term.name] == 1 else f"{term.name}_{seen[term.name]}")
-    return found
+    names = [term.name for term in terms]
+    check_names("terms", names)
+    return numbered(names)
 
 
 def symbols_of(

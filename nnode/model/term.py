@@ -217,14 +217,21 @@ def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
     The address is the term's name and the parameter's, ``lin.v0``: whatever other terms there are,
     it stays the same. Of terms of one name the second is numbered, ``speed_zone_2.alpha``.
     """
-    found: dict[str, tuple[Tensor, str]] = {}
+    terms = [term for term in module.modules() if isinstance(term, Term) and term.units]
+    return {
+        f"{owner}.{name}": (getattr(term, name).detach(), unit)
+        for owner, term in zip(numbered(term.name for term in terms), terms, strict=True)
+        for name, unit in term.units.items()
+    }
+
+
+def numbered(names: Iterable[str]) -> list[str]:
+    """Names of terms, of which the second of one name is numbered, and those after it."""
     seen: Counter[str] = Counter()
-    for term in module.modules():
-        if isinstance(term, Term) and term.units:
-            seen[term.name] += 1
-            owner = term.name if seen[term.name] == 1 else f"{term.name}_{seen[term.name]}"
-            for name, unit in term.units.items():
-                found[f"{owner}.{name}"] = (getattr(term, name).detach(), unit)
+    found = []
+    for name in names:
+        seen[name] += 1
+        found.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
     return found
 
 

@@ -26,7 +26,8 @@ from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State, Term
 from nnode.model.terms import CrowdDynamics, own_values, values_of
-from nnode.simulation.kernels.alone import FIELDS, WalkSource, compiled
+from nnode.simulation.kernels.alone import FIELDS, WalkSource
+from nnode.simulation.kernels.runs import compiled
 from nnode.simulation.linear import RungeKuttaSolver
 from nnode.simulation.numpy import simulated
 from nnode.simulation.rhs import side_by_side

@@ -162,8 +162,9 @@ class FusedSolver:
         places."""
         if batch.x.shape[-1] != system.dim:
             system.scene(batch)  # says so
-        paired = crowds.supports(system, batch) or crowds.without_partners(system)
-        if self.cutoff is not None and not paired:
+        if self.cutoff is not None and not (
+            crowds.supports(system, batch) or crowds.without_partners(system)
+        ):
             raise ConfigError(
                 f"solver.cutoff={self.cutoff:g} m works for crowds whose terms are formulas, as "
                 "model=sf or model=nn, only; set it to null"

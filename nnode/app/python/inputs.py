@@ -26,21 +26,17 @@ from nnode.data.readers.columns import Table as DataTable
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError
-from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS, PEDESTRIAN_LAWS
+from nnode.model.laws import LAW_MODELS
 from nnode.program import configuration
 
-#: Models by the names that ``conf/model`` gives them.
+#: Models by their names: those of ``conf/model``, and the laws of the package.
 MODELS: dict[str, dict[str, Any]] = {
     "lin": {"term": "lin"},
     "log": {"term": "log"},
     "n2": {"term": "network_speed", "hidden": 2},
     "n4": {"term": "network_speed", "hidden": 4},
     "n10": {"term": "network_speed", "hidden": 10},
-    **{
-        name: {"term": "formula", "law": law, "network": NEURONS.get(name)}
-        for name, law in CAR_FOLLOWING_LAWS.items()
-    },
-    **{name: {"term": "formula", "law": law} for name, law in PEDESTRIAN_LAWS.items()},
+    **LAW_MODELS,
     "formula": {"term": "formula"},
     "sf": {"term": "social_force"},
     "nn": {"term": "network_force"},

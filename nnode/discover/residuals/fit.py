@@ -77,9 +77,12 @@ class Fit:
         Args:
             power: see :meth:`~nnode.calibrate.intervals.ClusterInfluence.covariance`.
         """
+        return self._errors(self.influence(cluster), cluster, power)
+
+    def _errors(self, influence: ClusterInfluence, cluster: np.ndarray, power: float) -> np.ndarray:
         found = np.full(len(self.row), np.nan)
         if len(np.unique(cluster)) >= 3 and self.free.any():
-            variance = np.diag(self.influence(cluster).covariance(power))
+            variance = np.diag(influence.covariance(power))
             found[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
         return found if self.simulated is None else np.hypot(found, self.simulated)
 
@@ -93,8 +96,9 @@ class Fit:
     def intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
         """``(K, 2)`` confidence intervals, by CR2 with Satterthwaite's degrees of freedom; NaN
         as of :meth:`errors`."""
-        half = self.errors(cluster, 0.5)
-        half[self.free] *= stats.t.ppf(0.5 + level / 2, self.influence(cluster).degrees())
+        influence = self.influence(cluster)
+        half = self._errors(influence, cluster, 0.5)
+        half[self.free] *= stats.t.ppf(0.5 + level / 2, influence.degrees())
         return np.stack([self.row - half, self.row + half], 1)
 
 

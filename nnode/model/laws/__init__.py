@@ -18,6 +18,7 @@ from torch import Tensor
 
 from nnode.errors import ConfigError
 from nnode.model.arrays import Code, computed
+from nnode.model.crowd import velocity
 from nnode.model.crowd_formula import rates_of, settings_of
 from nnode.model.expression import Expr, call, const, substitute, symbol, symbols
 from nnode.model.names import check_names
@@ -92,6 +93,11 @@ CAR_FOLLOWING_LAWS = _described(_KEYS, {"v"})
 PEDESTRIAN_LAWS = _described(_CROWD_KEYS, {"vx", "y"})
 #: Neurons of the hidden layer of those that are networks.
 NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
+#: Name of a law to the options of the model that consists of it.
+LAW_MODELS: dict[str, dict[str, Any]] = {
+    name: {"term": "formula", "law": law, "network": NEURONS.get(name)}
+    for name, law in (CAR_FOLLOWING_LAWS | PEDESTRIAN_LAWS).items()
+}
 
 
 class Law(Term):
@@ -426,17 +432,6 @@ def _law_alone(lane: LaneDynamics) -> Expr:
 @cache
 def _names_gap_alone(lane: LaneDynamics) -> bool:
     return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
-
-
-def velocity(state: State) -> Tensor:
-    """``(B, N, 2)`` m/s.
-
-    Raises:
-        ValueError: the model is of first order.
-    """
-    if state.v is None:
-        raise ValueError("a term of a second-order model needs velocities")
-    return state.v
 
 
 def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
