@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import copy
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
@@ -19,6 +19,7 @@ from nnode.model.term import Interval, State, Term, physical_parameters, short_n
 from nnode.model.terms import CrowdDynamics, Dynamics, LaneDynamics
 
 T = TypeVar("T", bound=Term)
+N = TypeVar("N", bound=nn.Module)
 
 
 class System(nn.Module):
@@ -327,28 +328,30 @@ class Crowd(System):
         return torch.cat([*moving[1:], self._rates(state)], -1)
 
 
-class _Given(nn.Module):
-    """A model in a module that calls a function of it, so that its parameters can be replaced."""
+def with_parameters(module: N, parameters: Mapping[str, Tensor]) -> N:
+    """A model or a term with tensors in place of some parameters; the others are shared.
 
-    def __init__(self, system: System) -> None:
-        super().__init__()
-        self.system = system
-
-    def forward(self, function: Callable[[System], Any]) -> Any:
-        return function(self.system)
-
-
-def with_parameters(
-    system: System, parameters: Mapping[str, Tensor], function: Callable[[System], Any]
-) -> Any:
-    """A function of a model, with other parameters in place of the model's."""
-    own = {f"system.{name}": value for name, value in parameters.items()}
-    return functional_call(_Given(system), own, (function,))
+    Args:
+        parameters: by their names in ``module.named_parameters()``; of any shape.
+    """
+    found = copy.copy(module)
+    found._parameters, found._modules = dict(module._parameters), dict(module._modules)
+    inner: dict[str, dict[str, Tensor]] = {}
+    for name, value in parameters.items():
+        first, _, rest = name.partition(".")
+        if rest:
+            inner.setdefault(first, {})[rest] = value
+        else:
+            found._parameters[name] = value  # type: ignore[assignment]
+    for name, own in inner.items():
+        part = module._modules[name]
+        assert part is not None
+        found._modules[name] = with_parameters(part, own)
+    return found
 
 
 def initial_with(
     system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
 ) -> Tensor:
     """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
-    found: Tensor = with_parameters(system, parameters, lambda own: own.initial(batch, step))
-    return found
+    return with_parameters(system, parameters).initial(batch, step)

@@ -8,7 +8,6 @@ Arrays are ``(L, W, N, ...)``: L runs of a model, or L times of one run; W windo
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ from nnode.model.crowd_formula import CrowdRates, people_of, settings_of, walls_
 from nnode.model.formula import added_to, crowd_of
 from nnode.model.laws import InteractionForce, Law
 from nnode.model.scene import Scene
-from nnode.model.system import System
+from nnode.model.system import System, with_parameters
 from nnode.model.term import State, Term
 from nnode.model.terms import CrowdDynamics, own_values, values_of
 from nnode.simulation.kernels.alone import FIELDS, WalkSource
@@ -152,8 +151,8 @@ class PersonAlone:
             wide = {
                 name: value.repeat_interleave(windows)[:, None, None] for name, value in own.items()
             }
-            return [_with_values(self._system, wide)]
-        return [_with_values(self._system, run) for run in self._runs]
+            return [with_parameters(self._system, wide)]
+        return [with_parameters(self._system, run) for run in self._runs]
 
     @torch.no_grad()
     def __call__(self, moment: np.ndarray, states: Tensor, by_law: Tensor | None = None) -> Tensor:
@@ -316,14 +315,3 @@ class RunAlone:
             found.append(RungeKuttaSolver(part, self.around.step).response(*every))
         responses = torch.from_numpy(np.concatenate(found, -1)).permute(3, 0, 1, 2)
         return responses[..., :4], responses[..., 4:]
-
-
-def _with_values(system: System, parameters: dict[str, Tensor]) -> System:
-    """A copy of a model with tensors in place of parameters."""
-    found = copy.deepcopy(system)
-    for name, value in parameters.items():
-        path, _, leaf = name.rpartition(".")
-        module = found.get_submodule(path)
-        del module._parameters[leaf]
-        setattr(module, leaf, value)
-    return found

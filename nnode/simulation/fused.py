@@ -143,10 +143,9 @@ class FusedSolver:
         lane = lanes.supports(system, batch)
         if lane is None:
             runs = [
-                with_parameters(
-                    system,
-                    {name: value[r] for name, value in stacked.items()},
-                    lambda own: self.unchecked(own, batch),
+                self.unchecked(
+                    with_parameters(system, {name: value[r] for name, value in stacked.items()}),
+                    batch,
                 )
                 for r in range(len(next(iter(stacked.values()))))
             ]

@@ -6,7 +6,6 @@ rows, each of which is whole; then L runs of a model, or L times of one run; the
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import fields
@@ -15,14 +14,14 @@ from typing import Any, cast
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import functional_call, vmap
+from torch.func import vmap
 
 from nnode.data.sequence import Batch
 from nnode.model.formula import lane_of, symbols_of
 from nnode.model.lane_rates import LaneRates, Values
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
-from nnode.model.system import System, Traffic, initial_with
+from nnode.model.system import System, Traffic, initial_with, with_parameters
 from nnode.model.term import State, Term
 from nnode.model.terms import LaneDynamics, own_values, values_of
 
@@ -67,13 +66,13 @@ class RightHandSide:
             self.lane = formula_of(system, -1)
             if self.lane is not None:
                 self.own, self.coded = f"terms.{len(terms) - 1}.", slice(self.top, self.top + 1)
-                self.added = copy.copy(terms[-1])
-                self.added._parameters = dict(self.added._parameters)
-                for name, value in (parameters or {}).items():
-                    if name.startswith(self.own):  # one for each simulation
-                        several = value.repeat_interleave(len(scene.agent))[:, None, None]
-                        del self.added._parameters[name.removeprefix(self.own)]
-                        setattr(self.added, name.removeprefix(self.own), several)
+                several = {  # one for each simulation
+                    name.removeprefix(self.own): value.repeat_interleave(len(scene.agent))
+                    for name, value in (parameters or {}).items()
+                    if name.startswith(self.own)
+                }
+                wide = {name: value[:, None, None] for name, value in several.items()}
+                self.added = with_parameters(terms[-1], wide)
         self._every: dict[int, Scene] = {}
         self.measured = getattr(system, "leader", "constant") == "measured"
         self.leads = _rows(scene.leader.T)
@@ -182,13 +181,13 @@ class RightHandSide:
                 change = self.added(state)
             else:
                 own = {name.removeprefix(self.own): p for name, p in parameters.items()}
-                change = functional_call(self.added, own, (state,))
+                change = with_parameters(self.added, own)(state)
             return change[..., 0].T.reshape(1, *y.shape[1:])
         runs = parameters is None and self.parameters is not None
         given = dict((self.parameters or {}) if parameters is None else parameters)
 
         def one(own: dict[str, Tensor], t: Tensor, y: Tensor) -> Tensor:
-            found: Tensor = functional_call(self.system, own, (t, y, self.scene))
+            found: Tensor = with_parameters(self.system, own)(t, y, self.scene)
             return found
 
         time = torch.as_tensor(t, dtype=torch.float64).flatten()
