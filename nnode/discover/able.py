@@ -62,7 +62,7 @@ def check_model(system: System) -> None:
             f"the diagnosis of crowds cannot simulate a law {what}; it can be trained and "
             "evaluated, but not diagnosed; take another law, such as model=sf"
         )
-    lane = system.lane if isinstance(system, Traffic) else None
+    lane = system.formula if isinstance(system, Traffic) else None
     added = [] if lane is None else list(lane.rates.values())[lane.order :]
     if "dt" in symbols(added):
         raise ConfigError(

@@ -284,7 +284,7 @@ def drivable(system: System) -> LaneDynamics:
             "released wheels take no model of one's own: export.py to=jupedsim writes the "
             "parameters of models that it has"
         )
-    lane = system.lane
+    lane = system.formula
     if type(system) is not Traffic or lane is None or not lane.is_formula:
         raise ConfigError(
             "the run's model has a term that is Python code; to drive vehicles it needs a formula, "

@@ -98,7 +98,7 @@ def takes_drivers(system: System, batch: Batch) -> bool:
     trial = copy.deepcopy(system)
     trial.terms.append(DriverHeterogeneity())
     try:
-        return trial.lane is not None or trial.order == 1
+        return trial.formula is not None or trial.order == 1
     except ConfigError:  # a law without a time gap
         return False
 

@@ -125,7 +125,7 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
         model.terms.append(effect)
         if model.domain == "traffic" and model.order > 1:
             try:
-                model.lane  # noqa: B018 - says what the law does not have
+                model.formula  # noqa: B018 - says what the law does not have
             except ConfigError as error:
                 raise ConfigError(f"model.effects: {effect.name} cannot act: {error}") from error
 

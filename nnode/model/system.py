@@ -191,23 +191,18 @@ class Traffic(System):
     def step(self) -> str:
         law = self.terms[0] if len(self.terms) else None
         own = law.step if isinstance(law, Law) else None
-        if own == "rk4" and self.lane is not None and "dt" in self.lane.symbols:
+        if own == "rk4" and self.formula is not None and "dt" in self.formula.symbols:
             own = None  # an effect that remembers step by step has no stages in between
         return own or ("ballistic" if self.order > 1 else "euler")
 
     @property
-    def lane(self) -> LaneDynamics | None:
-        """The model's formula; None where a term is code without one."""
-        return lane_of(self._terms())
-
-    @property
     def formula(self) -> LaneDynamics | None:
-        return self.lane
+        return lane_of(self._terms())
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
         if not self.memory:
             return []
-        terms, lane, scene = self._terms(), self.lane, self.scene(batch)
+        terms, lane, scene = self._terms(), self.formula, self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
         if lane is None:  # code that remembers nothing does not matter at the start
             rules = [term.rule_for(self.order) for term in terms]
@@ -247,7 +242,7 @@ class Traffic(System):
         law = self.terms[0]
         # a law of the gap alone computes its speed without a formula of the lane
         alone = len(self.terms) == 1 and isinstance(law, Law) and law.of_gap
-        lane = None if alone else self.lane
+        lane = None if alone else self.formula
         if lane is not None:
             rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
             return rate if place is None else rate.masked_fill(lead, 0.0)

@@ -88,7 +88,7 @@ def test_a_model_that_is_code_is_sampled_as_its_formula() -> None:
     batch, noise = platoons(3, 10.0), Noise(0.5, 2.0, 0.0, 0.1)
     by_formula = Traffic([make_law("lin", v0=25.0, L=6.0, L_min=0.0)], "measured")
     by_code = Traffic([make_law("lin", v0=25.0, L=6.0, L_min=0.0), Nothing()], "measured")
-    assert by_code.lane is None
+    assert by_code.formula is None
     assert takes_drivers(by_code, batch)
     one, two = (sample(m, batch, noise, 3, seed=0, dt=0.05).x for m in (by_formula, by_code))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-9)

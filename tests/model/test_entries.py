@@ -62,7 +62,7 @@ def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> No
     }  # fmt: skip
     assert model.bounds()["terms.0.reach"].low == 2.0
     assert isinstance(model, Traffic)
-    assert model.lane is not None
+    assert model.formula is not None
 
 
 @pytest.mark.parametrize(
@@ -108,8 +108,8 @@ def test_effects_change_a_force_that_is_code() -> None:
 
 def test_a_law_that_is_code_is_called_by_the_formula() -> None:
     model = Traffic([Tanh(20.0)])
-    assert model.lane is not None
-    assert not model.lane.is_formula
+    assert model.formula is not None
+    assert not model.formula.is_formula
     gap = torch.tensor([3.0, 30.0], dtype=torch.float64)
     assert torch.equal(model.terms[0].speed(gap), 20 * torch.tanh(gap / 10))  # type: ignore[operator]
 

@@ -103,7 +103,7 @@ def test_nor_has_an_effect() -> None:
 
     model = Traffic([make_law("lin"), Wrong(kappa=0.3)])
     with pytest.raises(ConfigError, match=r"^terms: "):
-        model.lane  # noqa: B018
+        model.formula  # noqa: B018
 
 
 def test_all_names_of_the_package_are_such_names() -> None:

@@ -143,7 +143,7 @@ def test_compiled_steps_and_their_gradient_are_those_of_a_loop(method: str) -> N
 
 
 def test_speeds_are_stepped_as_they_are() -> None:
-    lane = Traffic([make_law("lin")]).lane
+    lane = Traffic([make_law("lin")]).formula
     assert lane is not None
     assert all(stepped(lane, method) is lane for method in METHODS)
     assert set(STAGES) == set(METHODS)
@@ -209,9 +209,9 @@ def test_the_default_follows_the_solution_for_half_a_minute() -> None:
 @pytest.mark.parametrize("law", ["krauss", "newell"])
 def test_maps_from_step_to_step_have_no_stages(law: str) -> None:
     system = model(law)
-    assert system.lane is not None
+    assert system.formula is not None
     with pytest.raises(ConfigError, match=r"names dt.*rk4 has stages"):
-        stepped(system.lane, "rk4")
+        stepped(system.formula, "rk4")
     batch = behind(lambda t: 10 * t, [20.0], 0.5)
     for solver in (TorchdiffeqSolver("rk4", "discrete", DT), FusedSolver(DT, method="rk4")):
         with pytest.raises(ConfigError, match="names dt"):

@@ -37,6 +37,25 @@ def platoon() -> MakePlatoon:
 
 
 @pytest.fixture(scope="session")
+def ragged(platoon) -> list[Sequence]:  # type: ignore[no-untyped-def]
+    """Platoons of one to four vehicles that end at different times."""
+    return [
+        platoon([12.0, 25.0, 9.0], samples=4, name="a"),
+        platoon([7.0], samples=7, name="b"),
+        platoon([], samples=2, name="c"),
+        platoon([14.0, 11.0], samples=6, name="d", start=700.0),
+    ]
+
+
+@pytest.fixture(scope="session")
+def equal(platoon) -> list[Sequence]:  # type: ignore[no-untyped-def]
+    """Forty platoons of four vehicles: more than one block, and blocks that are not full."""
+    return [
+        platoon([10.0 + 0.3 * i, 20.0 - 0.2 * i, 15.0], samples=4, name=f"e{i}") for i in range(40)
+    ]
+
+
+@pytest.fixture(scope="session")
 def crowd() -> MakeCrowd:
     """Make people in a corridor, 0 <= y <= 3; neighbours are ``apart`` (m) from each other."""
 

@@ -298,7 +298,7 @@ TOGETHER = (
 
 
 def _is_map(law: str, *effects: str) -> bool:
-    lane = lane_of(law, "measured", *effects).lane
+    lane = lane_of(law, "measured", *effects).formula
     assert lane is not None
     return "dt" in lane.symbols
 

@@ -33,16 +33,6 @@ CROWD = {
 
 
 @pytest.fixture(scope="session")
-def platoons(platoon) -> list[Sequence]:  # type: ignore[no-untyped-def]
-    return [
-        platoon([12.0, 25.0, 9.0], samples=4, name="a"),
-        platoon([7.0], samples=7, name="b"),
-        platoon([], samples=2, name="c"),
-        platoon([14.0, 11.0], samples=6, name="d", start=700.0),
-    ]
-
-
-@pytest.fixture(scope="session")
 def crowds(crowd) -> list[Sequence]:  # type: ignore[no-untyped-def]
     # with 4, 1, 2 and 3 people come two, no, one and two walls
     return [
@@ -89,8 +79,8 @@ def check(model: System, items: list[Sequence], solver: TorchdiffeqSolver, dtype
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-11), (torch.float32, 2e-4)])
 @pytest.mark.parametrize("gradient", ["adjoint", "discrete"])
 @pytest.mark.parametrize("model", TRAFFIC)
-def test_traffic(platoons, model, gradient, dtype, rtol) -> None:  # type: ignore[no-untyped-def]
-    check(TRAFFIC[model](), platoons, TorchdiffeqSolver("euler", gradient, 0.02), dtype, rtol)
+def test_traffic(ragged, model, gradient, dtype, rtol) -> None:  # type: ignore[no-untyped-def]
+    check(TRAFFIC[model](), ragged, TorchdiffeqSolver("euler", gradient, 0.02), dtype, rtol)
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-9), (torch.float32, 2e-3)])
@@ -101,8 +91,8 @@ def test_crowd(crowds, model, gradient, dtype, rtol) -> None:  # type: ignore[no
 
 
 @pytest.mark.parametrize("method", ["rk4", "dopri5"])
-def test_other_methods(platoons, method: str) -> None:  # type: ignore[no-untyped-def]
+def test_other_methods(ragged, method: str) -> None:  # type: ignore[no-untyped-def]
     # an adaptive step suits all sequences of a batch: equal to tolerance, not to rounding
     rtol = 1e-11 if method == "rk4" else 1e-6
     solver = TorchdiffeqSolver(method, "discrete", 0.02, rtol=1e-10, atol=1e-10)
-    check(TRAFFIC["lin"](), platoons, solver, torch.float64, rtol)
+    check(TRAFFIC["lin"](), ragged, solver, torch.float64, rtol)

@@ -87,7 +87,7 @@ def _together(
     batch = collate(sequences).to(like.device, like.dtype)
     longest = STEP[system.domain] if step is None else step
     dt = batch.dt / max(1, math.ceil(batch.dt / longest - 1e-6))
-    lane = system.lane if isinstance(system, Traffic) else None
+    lane = system.formula if isinstance(system, Traffic) else None
     # a law that names the length of a step has no stages within one
     method = system.step if lane is not None and "dt" in lane.symbols else METHOD[system.domain]
     x = TorchdiffeqSolver(method, dt=dt)(system, batch).x.double().cpu().numpy()

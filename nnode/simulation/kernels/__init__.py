@@ -14,8 +14,8 @@ def source(model: System) -> str:
     from nnode.simulation.kernels.crowds import CrowdSource
     from nnode.simulation.kernels.lanes import LaneSource
 
-    if isinstance(model, Traffic) and model.lane is not None and model.lane.is_formula:
-        return LaneSource(model.lane).text()
+    if isinstance(model, Traffic) and model.formula is not None and model.formula.is_formula:
+        return LaneSource(model.formula).text()
     if isinstance(model, Crowd) and model.formula is not None:
         return CrowdSource(model.formula).text()
     raise ValueError("the model has a term that is code of its own: it runs in PyTorch")

@@ -337,7 +337,7 @@ def supports(system: System, batch: Batch) -> LaneDynamics | None:
         return None
     if system.leader == "measured" and batch.x.requires_grad:
         return None  # measured positions are constants here
-    lane = system.lane
+    lane = system.formula
     return lane if lane is not None and lane.is_formula else None
 
 

@@ -106,7 +106,7 @@ DV = -np.diff(SPEEDS)
 )  # fmt: skip
 def test_accelerations_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
     system, batch = model("idm", effect), platoon()
-    assert system.lane is not None
+    assert system.formula is not None
     found = accelerations(system, batch)[0, :3]
     np.testing.assert_allclose(found, np.array(expected), rtol=1e-12)
 

@@ -1,11 +1,7 @@
-"""Compiled crowd code is kept between processes, and not beyond a change of what it is made of."""
+"""Compiled crowd code: one module for one law, and its source."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,38 +11,6 @@ from nnode.model import Crowd, make_law
 from nnode.model.formula import crowd_of
 from nnode.simulation.kernels import crowds, source
 from nnode.simulation.kernels.crowds import CrowdSource
-
-SCRIPT = """
-import json
-import numpy as np
-from nnode.data.sequence import Sequence, collate
-from nnode.model import Crowd, make_law
-x = np.arange(12.0).reshape(1, 6, 2) + 0.1 * np.arange(3)[:, None, None]
-batch = collate([Sequence(name="a", recording="a", time=0.04 * np.arange(3), x=x)])
-model = Crowd([make_law("relaxation"), make_law("social_force")])
-from nnode.simulation import FusedSolver
-FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulation.kernels.crowds import CrowdSource, compiled, supports
-module = compiled(CrowdSource(supports(model)))
-hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
-print(json.dumps({"hits": hits}))
-"""
-
-
-@pytest.mark.thorough
-def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
-    runs = []
-    for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT],
-            env={**os.environ, "NNODE_CACHE": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        runs.append(json.loads(done.stdout))
-    assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
-    assert len(list((tmp_path / "fused").glob("*.py"))) == 1
 
 
 def test_one_law_of_other_bodies_is_one_module() -> None:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
 import platform
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numba
@@ -137,7 +133,7 @@ def test_everything_that_is_compiled_in_counts() -> None:
 def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
-    lane = Traffic([make_law("lin")]).lane
+    lane = Traffic([make_law("lin")]).formula
     assert lane is not None
     with pytest.raises(ConfigError, match="NNODE_CACHE"):
         lanes.compiled.__wrapped__(LaneSource(lane))
@@ -148,38 +144,3 @@ def test_the_source_can_be_read() -> None:
     text = source(model)
     compile(text, "generated", "exec")
     assert "relative_speed.kappa" in text.split('"""')[1]
-
-
-SCRIPT = """
-import json, sys
-import numpy as np, torch
-from nnode.data.sequence import Sequence, collate
-from nnode.model import Traffic, make_law
-x = np.cumsum(np.full((3, 4, 1), 12.0), 1) + np.arange(3.0)[:, None, None]
-batch = collate([Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)])
-model = Traffic([make_law("network_speed")])
-from nnode.simulation import FusedSolver
-FusedSolver()(model, batch).x.sum().backward()
-from nnode.simulation.kernels import lanes
-from nnode.simulation.kernels.lanes import LaneSource
-module = lanes.compiled(LaneSource(model.lane))
-hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backward)]
-print(json.dumps({"hits": hits}))
-"""
-
-
-@pytest.mark.thorough
-def test_a_second_process_does_not_compile(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    environment = {**os.environ, "NNODE_CACHE": str(tmp_path)}
-    runs = []
-    for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        runs.append(json.loads(done.stdout))
-    assert [run["hits"] for run in runs] == [[0, 0], [1, 1]]
-    assert len(list((tmp_path / "fused").glob("*.py"))) == 1

@@ -39,7 +39,7 @@ def by_autograd(
     if (method or system.step) == "rk4":
         solver = RungeKutta(substeps)
     x = solver(system, batch).x
-    lane = system.lane
+    lane = system.formula
     assert lane is not None
     places = [lane.owned[name] for name in names]
     known = dict(system.named_parameters())
@@ -72,7 +72,7 @@ def compared(system: Traffic, batch: Batch, names: list[str], method: str | None
 
 
 def owned(system: Traffic) -> list[str]:
-    lane = system.lane
+    lane = system.formula
     assert lane is not None
     return list(lane.owned)
 
@@ -129,7 +129,7 @@ def test_of_starts_that_depend_on_the_law_and_on_measured_speeds() -> None:
 
 def test_their_formulas_are_the_slopes_of_the_rate() -> None:
     """Of v0 (1 - L/gap): by v0 the rate 1 - L/gap and v0 L/gap² times the gap's own tangent."""
-    lane = linear().lane
+    lane = linear().formula
     assert lane is not None
     twice = with_tangents(lane, ("lin__v0", "lin__L"))
     assert list(twice.rates) == ["x", "x__d0", "x__d1"]
