@@ -62,14 +62,14 @@ SOCIAL_FORCE: dict[str, Any] = {
         "tau": {"value": "0.5 s", "low": "0.05 s", "high": "5 s"},
         "radius": "0.3 m",  # known, as are JuPedSim's reach and step
         "reach": "2.5 m",
-        "step": "0 s",
+        "lookahead": "0 s",
     },
     "where": {
-        "to_x": "goal_x - x - step*vx",
-        "to_y": "goal_y - y - step*vy",
+        "to_x": "goal_x - x - lookahead*vx",
+        "to_y": "goal_y - y - lookahead*vy",
         "way": "sqrt(to_x**2 + to_y**2)",
-        "then_x": "dx + step*dvx",
-        "then_y": "dy + step*dvy",
+        "then_x": "dx + lookahead*dvx",
+        "then_y": "dy + lookahead*dvy",
         "far": "sqrt(then_x**2 + then_y**2)",
         "contact": "max(2*radius - far, 0)",
         "push": "choose(reach - far, A*exp((2*radius - far)/B) + k*contact, 0)/far",
@@ -89,7 +89,7 @@ SOCIAL_FORCE: dict[str, Any] = {
 
 def stepping(law: dict[str, Any], step: float) -> dict[str, Any]:
     """A law of people for steps of JuPedSim's, whose length is ``step`` s."""
-    return {**law, "parameters": {**law["parameters"], "step": f"{step} s"}}
+    return {**law, "parameters": {**law["parameters"], "lookahead": f"{step} s"}}
 
 
 _HERMITE = {
@@ -116,14 +116,14 @@ CENTRIFUGAL: dict[str, Any] = {
         "tau": {"value": "0.5 s", "low": "0.05 s", "high": "5 s"},
         "a_v": {"value": "0.5 s", "low": "0 s", "high": "2 s"},
         "a_min": "0.2 m", "b_min": "0.2 m", "b_max": "0.4 m", "near": "0.6 m", "closest": "0.4 m",
-        "far": "1.9 m", "reach": "2 m", "most": "9", "step": "0 s",
+        "far": "1.9 m", "reach": "2 m", "most": "9", "lookahead": "0 s",
     },
     "where": {
-        "to_x": "goal_x - x - step*vx",
-        "to_y": "goal_y - y - step*vy",
+        "to_x": "goal_x - x - lookahead*vx",
+        "to_y": "goal_y - y - lookahead*vy",
         "way": "sqrt(to_x**2 + to_y**2)",
-        "then_x": "dx + step*dvx",
-        "then_y": "dy + step*dvy",
+        "then_x": "dx + lookahead*dvx",
+        "then_y": "dy + lookahead*dvy",
         "away": "sqrt(then_x**2 + then_y**2)",
         "m_x": "then_x/away",
         "m_y": "then_y/away",
