@@ -30,12 +30,10 @@ from nnode.simulation.base import Trajectory, simulated_batch, substeps
 from nnode.simulation.fused import FusedSolver
 from nnode.simulation.kernels import lanes
 
-#: Relative size of central differences of laws, in float64. The cube root of its precision, 6e-6,
-#: where the errors by rounding and by curvature are equal (Press et al. 2007, section 5.7), is too
-#: large for people: who is nearest changes within it, and ``cfsm`` is not recovered from its own
-#: paths. A hundredth of it leaves nine digits. Parameters smaller than the second number are varied
-#: as if they had this size, in their own units.
-_CENTRAL = 1e-7, 0.01
+#: Relative size of central differences of laws, in float64: the cube root of its precision, where
+#: the errors by rounding and by curvature are equal (Press et al. 2007, section 5.7). Parameters
+#: smaller than the second number are varied as if they had this size, in their own units.
+_CENTRAL = float(np.finfo(np.float64).eps) ** (1 / 3), 0.01
 #: The same of forward differences of networks, by precision: they have tens of weights, and bear
 #: the errors.
 _FORWARD = {torch.float32: (1e-3, 0.1), torch.float64: (1e-6, 0.1)}
