@@ -18,8 +18,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from nnode.data.paths import noise_variance
 from nnode.data.sequence import Batch
-from nnode.discover.lanes.paths import noise_variance
 from nnode.errors import DataError
 from nnode.generate.noise import Noise, sample, takes_drivers
 from nnode.model import System

@@ -23,9 +23,9 @@ from scipy import stats
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import least_number
+from nnode.data.paths import velocity
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.lanes.paths import velocity
 from nnode.discover.residuals.fit import sums
 from nnode.discover.result import Profile
 from nnode.errors import SimulationError

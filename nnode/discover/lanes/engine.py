@@ -15,9 +15,9 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.found import Simulation
-from nnode.discover.lanes.paths import noise_variance, smooth, velocity
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
 from nnode.discover.residuals.engine import Squares, of_residuals

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, drawn_in
-from nnode.discover.lanes.paths import noise_variance, smooth, velocity
 from nnode.discover.locate.curves import curves, weighed
 from nnode.discover.name.search import search, settled
 from nnode.discover.residuals.fit import Fit, refine, sums

@@ -1,0 +1,1 @@
+"""Agents who differ: a law, the agents' own parameters, disturbances that last, errors."""

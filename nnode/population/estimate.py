@@ -1,0 +1,245 @@
+"""Parameters, differences between agents and disturbances, estimated together.
+
+Two steps take turns until neither changes the result. The first maximises the marginal likelihood
+of the linearised samples over the variances. The second minimises the penalised sum of squares
+
+    (y - f)' V0^-1 (y - f) + b' Omega^-1 b + h' S^-1 h
+
+over the parameters, the deviations of agents and those of starts, by a step of Gauss and Newton's
+that is halved until the sum falls, for agents whose own sum rises. A step that turns back is
+shortened as well: the covariance changes with the parameters, so the steps might cycle.
+
+Source: Lindstrom & Bates 1990, Biometrics 46; Wolfinger & Lin 1997, Comput. Stat. Data Anal. 25.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import minimize
+
+from nnode.population.likelihood import Linearised, Marginal, Noise, Products, marginal
+
+#: Difference of logarithms of standard deviations for derivatives.
+DIFFERENCE = 1e-4
+#: Halvings of a step at most.
+HALVINGS = 6
+#: The smallest share of a step that turns back.
+LEAST = 0.2
+
+
+class Response(Protocol):
+    """A model of agents, simulated and linearised."""
+
+    def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
+        """The samples, linearised.
+
+        Args:
+            theta: ``(P,)`` parameters.
+            agents: ``(D, Q)`` deviations of the agents.
+            start: ``(S, H)`` deviations of the segments' starts.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variances:
+    """Standard deviations, and the times for which disturbances last.
+
+    Attributes:
+        noise: of the :class:`~nnode.population.likelihood.Noise`, in the order of its names.
+        spread: ``(Q,)`` of the agents' deviations.
+        start: ``(H,)`` of the starts' deviations.
+        low, high: of all of them, one after the other; where these are equal, nothing is estimated.
+    """
+
+    noise: np.ndarray
+    spread: np.ndarray
+    start: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def row(self) -> np.ndarray:
+        """All of them."""
+        return np.concatenate([self.noise, self.spread, self.start])
+
+    def filled(self, row: np.ndarray) -> Variances:
+        """With other values."""
+        ends = np.cumsum([len(self.noise), len(self.spread)])
+        noise, spread, start = np.split(row, ends)
+        return replace(self, noise=noise, spread=spread, start=start)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What was estimated.
+
+    Attributes:
+        theta: ``(P,)`` parameters.
+        agents: ``(D, Q)`` deviations of the agents. start: ``(S, H)`` of the starts.
+        variances: standard deviations.
+        data: the samples, linearised there.
+        marginal: the likelihood there.
+        steps: linearisations.
+        converged: whether the last step changed nothing.
+    """
+
+    theta: np.ndarray
+    agents: np.ndarray
+    start: np.ndarray
+    variances: Variances
+    data: Linearised
+    marginal: Marginal
+    steps: int
+    converged: bool
+
+
+def estimate(
+    response: Response, noise: Noise, theta: np.ndarray, variances: Variances, *,
+    low: np.ndarray | None = None, high: np.ndarray | None = None, restricted: bool = False,
+    longest: float = np.inf, steps: int = 40, tolerance: float = 1e-3,
+    begin: Estimate | None = None,
+) -> Estimate:  # fmt: skip
+    """Estimate a model of agents who differ.
+
+    Args:
+        response: the model.
+        noise: what differs from sample to sample.
+        theta: ``(P,)`` where the search starts.
+        variances: where it starts, and bounds.
+        low, high: ``(P,)`` bounds of the parameters.
+        restricted: REML, for few agents.
+        longest: step of a parameter at most, in its own unit.
+        steps: linearisations at most.
+        tolerance: the search ends when a step moves no parameter by more than this share of its
+            standard error, no standard deviation by more than this share of itself, and no agent's
+            deviation by more than this share of their standard deviation.
+        begin: an estimate whose deviations and variances are taken to begin with.
+    """
+    theta = np.array(theta, dtype=float)
+    low = np.full(len(theta), -np.inf) if low is None else low
+    high = np.full(len(theta), np.inf) if high is None else high
+    first = response(theta, np.zeros((0, 0)), np.zeros((0, 0))) if begin is None else begin.data
+    number = int(first.agent.max()) + 1
+    agents = np.zeros((number, first.random.shape[-1]))
+    start = np.zeros(first.start.shape[::2])
+    if begin is not None:
+        agents, start, variances = begin.agents, begin.start, begin.variances
+    data, converged, taken = response(theta, agents, start), False, 1
+    most, last = 1.0, np.zeros(len(theta))
+    for _ in range(steps):
+        before = variances
+        variances = fit_variances(
+            data, noise, variances, restricted=restricted, tolerance=tolerance
+        )
+        here = _likelihood(data, noise, variances, restricted)
+        change = np.clip(here.change, -longest, longest)
+        change = np.clip(change, low - theta, high - theta)
+        misfit = _misfit(data, noise, variances, agents, start)
+        turned = last @ here.information @ change < 0
+        most, last = max(most / 2, LEAST) if turned else min(1.25 * most, 1.0), change
+        share, shares, found, there = most, np.full((number, 1), most), None, data
+        for _ in range(HALVINGS):
+            trial = (
+                theta + share * change,
+                agents + shares * (here.deviations - agents),
+                start + shares[data.agent] * (here.start - start),
+            )
+            there, taken = response(*trial), taken + 1
+            fixed = replace(there, step=data.step, forced=data.forced)
+            then = _misfit(fixed, noise, variances, *trial[1:])
+            if then.sum() <= misfit.sum():
+                found = trial
+                break
+            share, shares = share / 2, np.where((then > misfit)[:, None], shares / 2, shares)
+        scale = np.sqrt(np.maximum(np.diag(here.information), 1e-300))
+        moved = np.max(np.abs(change) * scale, initial=0.0)
+        moved = max(moved, np.max(np.abs(np.log(variances.row / before.row)), initial=0.0))
+        differ = np.abs(here.deviations - agents) / variances.spread
+        moved = max(moved, np.max(differ, initial=0.0))
+        if found is not None:
+            (theta, agents, start), data = found, there
+        if moved < tolerance or found is None:
+            converged = bool(moved < tolerance)
+            break
+    variances = fit_variances(data, noise, variances, restricted=restricted, tolerance=tolerance)
+    return Estimate(
+        theta=theta, agents=agents, start=start, variances=variances, data=data,
+        marginal=_likelihood(data, noise, variances, restricted), steps=taken, converged=converged,
+    )  # fmt: skip
+
+
+def fit_variances(
+    data: Linearised, noise: Noise, variances: Variances, *,
+    restricted: bool = False, tolerance: float = 1e-3,
+) -> Variances:  # fmt: skip
+    """The variances that are most likely, the samples' linearisation given.
+
+    Logarithms of standard deviations are scaled by the spread of the agents' scores, which is their
+    curvature (Berndt et al. 1974).
+
+    Args:
+        tolerance: the search ends when a step gains less in the logarithm of the likelihood.
+    """
+    split, whole = len(variances.noise), np.log(variances.row)
+    free = np.flatnonzero(variances.low < variances.high)
+    if not len(free):
+        return variances
+    known: dict[tuple[float, ...], Products] = {}
+
+    def at(row: np.ndarray) -> Marginal:
+        logs = whole.copy()
+        logs[free] = row
+        found = variances.filled(np.exp(logs))
+        key = tuple(found.noise)
+        if key not in known:
+            known[key] = noise.products(data, found.noise)
+        return marginal(data, known[key], found.spread, found.start, restricted=restricted)
+
+    def slopes(row: np.ndarray) -> tuple[Marginal, list[tuple[Marginal, Marginal]]]:
+        for key in [key for key in known if key != tuple(np.exp(whole[:split]))]:
+            del known[key]
+        steps = DIFFERENCE * np.eye(len(row))
+        return at(row), [(at(row + step), at(row - step)) for step in steps]
+
+    sides = slopes(whole[free])[1]
+    scores = np.stack([(up.each - down.each) / (2 * DIFFERENCE) for up, down in sides])
+    scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
+
+    def value(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+        here, sides = slopes(scaled * scale)
+        slope = np.array([up.loglik - down.loglik for up, down in sides]) / (2 * DIFFERENCE)
+        return -here.loglik, -slope * scale
+
+    low, high = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
+    start = np.clip(whole[free] / scale, low, high)
+    size = max(abs(at(start * scale).loglik), 1.0)
+    best = minimize(
+        value, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+        options={"ftol": tolerance / size, "gtol": tolerance},
+    )  # fmt: skip
+    whole[free] = best.x * scale
+    return variances.filled(np.exp(whole))
+
+
+def _misfit(
+    data: Linearised, noise: Noise, variances: Variances, agents: np.ndarray, start: np.ndarray
+) -> np.ndarray:
+    """``(D,)`` the agents' penalised sums of squares; infinite where a simulation blows up."""
+    number, count = data.fixed.shape[-1], len(agents)
+    blown = ~np.isfinite(np.where(data.seen, data.residual, 0.0)).all(1)
+    back = -np.concatenate([agents[data.agent], start], 1)
+    weights = np.concatenate([np.ones((len(back), 1)), np.zeros((len(back), number)), back], 1)
+    gram = noise.products(data, variances.noise).gram
+    square = np.einsum("si,sij,sj->s", weights, gram, weights)
+    square = np.where(blown, np.inf, square + ((start / variances.start) ** 2).sum(1))
+    tied = ((agents / variances.spread) ** 2).sum(1)
+    return np.bincount(data.agent, square, count) + tied
+
+
+def _likelihood(data: Linearised, noise: Noise, variances: Variances, restricted: bool) -> Marginal:
+    products = noise.products(data, variances.noise)
+    return marginal(data, products, variances.spread, variances.start, restricted=restricted)
