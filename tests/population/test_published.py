@@ -1,0 +1,142 @@
+"""Estimates of mixed models against those of R's nlme 3.1, which has the same method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nnode.population.estimate import Estimate, Variances, estimate
+from nnode.population.likelihood import Linearised, WhiteNoise
+
+FOLDER = Path(__file__).with_name("data")
+#: Relative difference for derivatives of a function that is known to 1e-16.
+DIFFERENCE = 1e-5
+
+#: Values ``(D, K)`` of a function with parameters ``(P, D, 1)``.
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Curves:
+    """A function of time with parameters that differ between subjects, as a response.
+
+    Attributes:
+        function: the curves of all subjects.
+        y: ``(D, K)`` what was measured.
+        random: numbers of the parameters that differ.
+    """
+
+    function: Function
+    y: np.ndarray
+    random: list[int]
+
+    def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
+        own = np.tile(theta[:, None, None], (1, len(self.y), 1))
+        if agents.size:
+            own[self.random] += agents.T[..., None]
+        columns = []
+        for p, value in enumerate(theta):
+            step = np.zeros((len(theta), 1, 1))
+            step[p] = DIFFERENCE * abs(value)
+            slope = self.function(own + step) - self.function(own - step)
+            columns.append(slope / (2 * step[p]))
+        fixed = np.stack(columns, -1)
+        residual = self.y - self.function(own)
+        if agents.size:
+            residual = residual + np.einsum("dkq,dq->dk", fixed[..., self.random], agents)
+        return Linearised(
+            residual=residual, fixed=fixed, random=fixed[..., self.random],
+            start=np.zeros((*self.y.shape, 0)), seen=np.ones(self.y.shape, dtype=bool),
+            agent=np.arange(len(self.y)),
+        )  # fmt: skip
+
+
+def table(name: str, subject: str) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Names of subjects, and ``(D, K)`` of each column."""
+    read = pd.read_csv(FOLDER / f"{name}.csv", comment="#", dtype={subject: str})
+    names = list(dict.fromkeys(read[subject]))
+    parts = [read[read[subject] == one] for one in names]
+    return names, {
+        column: np.stack([part[column].to_numpy(dtype=float) for part in parts])
+        for column in read.columns.drop(subject)
+    }
+
+
+def spreads(residual: float, *random: float) -> Variances:
+    """Where the search for standard deviations begins, with bounds that are far away."""
+    number = 1 + len(random)
+    return Variances(
+        noise=np.array([residual]), spread=np.array(random), start=np.zeros(0),
+        low=np.full(number, 1e-4), high=np.full(number, 1e4),
+    )  # fmt: skip
+
+
+def errors(found: Estimate) -> np.ndarray:
+    """``(P,)`` standard errors of the parameters."""
+    return np.sqrt(np.diag(np.linalg.inv(found.marginal.information)))
+
+
+def test_orange_trees_that_grow_to_sizes_of_their_own_are_nlme_s() -> None:
+    names, data = table("orange", "Tree")
+
+    def size(own: np.ndarray) -> np.ndarray:
+        most, middle, scale = own
+        return np.asarray(most / (1 + np.exp(-(data["age"] - middle) / scale)))
+
+    found = estimate(
+        Curves(size, data["circumference"], [0]), WhiteNoise(), np.array([192.0, 728.0, 350.0]),
+        spreads(10.0, 20.0), tolerance=1e-7,
+    )  # fmt: skip
+    assert found.converged
+    # nlme stops where its next step is small beside the parameters: further steps move xmid and
+    # scal in the fifth digit, and all that depends on them
+    np.testing.assert_allclose(found.theta, [191.0500, 722.5593, 344.1684], rtol=2e-5)
+    np.testing.assert_allclose(found.variances.row, [7.846254, 31.48255], rtol=1e-6)
+    np.testing.assert_allclose(found.marginal.loglik, -131.584554, atol=3e-5)
+    np.testing.assert_allclose(errors(found), [15.4463, 33.6118, 25.9585], rtol=4e-5)
+    ranef = {"3": -37.0002, "1": -29.4036, "5": -5.1795, "2": 31.5650, "4": 40.0183}
+    wanted = [ranef[name] for name in names]
+    np.testing.assert_allclose(found.agents[:, 0], wanted, atol=4e-4)
+    np.testing.assert_allclose(found.marginal.deviations[:, 0], wanted, atol=4e-4)
+
+
+def test_a_linear_mixed_model_by_restricted_likelihood_is_nlme_s() -> None:
+    names, data = table("orthodont", "Subject")
+
+    def line(own: np.ndarray) -> np.ndarray:
+        return np.asarray(own[0] + own[1] * data["age"])
+
+    model = Curves(line, data["distance"], [0, 1])
+    found = estimate(
+        model, WhiteNoise(), np.array([10.0, 1.0]), spreads(1.0, 1.0, 1.0), restricted=True,
+        tolerance=1e-6,
+    )  # fmt: skip
+    assert found.converged
+    np.testing.assert_allclose(found.theta, [16.7611111, 0.6601852], rtol=1e-7)
+    np.testing.assert_allclose(found.variances.row, [1.3706404, 1.3860379, 0.1492532], rtol=1e-5)
+    # the constant of the restriction is that of nlme: no term log|X'X|
+    np.testing.assert_allclose(found.marginal.loglik, -221.6572901, atol=1e-7)
+    np.testing.assert_allclose(errors(found), [0.7137960, 0.0656052], rtol=1e-5)
+    np.testing.assert_allclose(
+        found.agents[names.index("M16")], [-0.3324690, -0.0553999], rtol=3e-5
+    )
+
+
+def test_a_linear_mixed_model_by_maximum_likelihood_is_nlme_s() -> None:
+    _, data = table("orthodont", "Subject")
+
+    def line(own: np.ndarray) -> np.ndarray:
+        return np.asarray(own[0] + own[1] * data["age"])
+
+    model = Curves(line, data["distance"], [0, 1])
+    found = estimate(
+        model, WhiteNoise(), np.array([10.0, 1.0]), spreads(1.0, 1.0, 1.0), tolerance=1e-6
+    )
+    assert found.converged
+    np.testing.assert_allclose(found.theta, [16.7611111, 0.6601852], rtol=1e-7)
+    np.testing.assert_allclose(found.variances.row, [1.3636123, 1.3511790, 0.1463190], rtol=1e-5)
+    np.testing.assert_allclose(found.marginal.loglik, -219.8691349, atol=1e-7)
