@@ -15,24 +15,26 @@ from functools import cached_property, partial
 from typing import Any, cast
 
 import numpy as np
+import torch
 from scipy.interpolate import CubicSpline
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import clusters, index_of
-from nnode.data.paths import smooth
-from nnode.data.sequence import Sequence, collate
+from nnode.data.paths import smooth, velocity
+from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError
 from nnode.model.differentiate import derivatives
 from nnode.model.formula import inputs_of
 from nnode.model.lane_rates import SAFE, Formulas
-from nnode.model.system import System
-from nnode.model.term import Term
+from nnode.model.scene import Scene
+from nnode.model.system import System, with_parameters
+from nnode.model.term import State, Term
 from nnode.model.terms import own_values, values_of
 from nnode.population.estimate import Estimate, estimate
 from nnode.population.likelihood import Linearised, Noise
 from nnode.simulation.numpy import simulated, strides
-from nnode.simulation.rhs import formula_of
+from nnode.simulation.rhs import formula_of, side_by_side
 
 #: Longest step, s, by the law's order; that of laws which say what holds one step later.
 STEP, MAPPED = {1: 0.4, 2: 0.2}, 0.1
@@ -65,6 +67,7 @@ class Paths:
         second: ``(F,)`` 1 where there is a second vehicle ahead.
         start: ``(2, F)`` smoothed position and speed at the first sample.
         error: standard deviation of the errors of measurement, m.
+        batch: of each follower the smoothed paths of himself and of the one or two vehicles ahead.
     """
 
     x: np.ndarray
@@ -81,6 +84,7 @@ class Paths:
     second: np.ndarray
     start: np.ndarray
     error: float
+    batch: Batch
 
     def remeasured(self, x: np.ndarray, draw: Draw) -> Paths:
         """The paths with other followers, and with leaders as they would be measured and smoothed
@@ -137,7 +141,16 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
         ahead=_ahead(smoothed, sequence, place, times, half, dt), start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
+        batch=collate(_with_those_ahead(sequences[b], smoothed[b], i) for b, i in which),
     )  # fmt: skip
+
+
+def _with_those_ahead(s: Sequence, smoothed: np.ndarray, place: int) -> Sequence:
+    """The smoothed paths of a follower and of the one or two vehicles ahead of him."""
+    x = smoothed[..., None]
+    index = np.arange(s.n_agents)
+    smooth_sequence = replace(s, x=x, v=velocity(x, s.dt))
+    return smooth_sequence.select((index >= place) & (index <= place + 2))
 
 
 def _ahead(
@@ -169,7 +182,6 @@ class Followers:
     Args:
         system: the model; only its parameters that need a gradient are varied.
         paths: the followers.
-        sequences: those that the paths are of.
         random: names of the parameters that differ between drivers, as ``idm.T``.
 
     Attributes:
@@ -181,50 +193,46 @@ class Followers:
         ConfigError: a model that is no formula, or that reads states of other vehicles.
     """
 
-    def __init__(
-        self,
-        system: System,
-        paths: Paths,
-        sequences: list[Sequence],
-        random: list[str] | None = None,
-    ) -> None:
+    def __init__(self, system: System, paths: Paths, random: list[str] | None = None) -> None:
         self.system, self.paths = system, paths
-        lane = formula_of(system)
+        terms = cast(list[Term], list(system.terms))
+        lane, self.code = formula_of(system), None
+        if lane is None and terms and terms[-1].side_by_side:
+            lane, self.code = formula_of(system, -1), terms[-1]
         if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
             raise ConfigError(
                 "drivers who differ need a model of a lane whose law and effects are formulas of "
                 "the positions and speeds of the vehicles ahead; take drivers=none"
             )
-        self.lane, self._terms = lane, cast(list[Term], list(system.terms))
+        self.lane, formulas = lane, terms if self.code is None else terms[:-1]
         self.vector = ParameterVector(system)
-        places = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
-        self._symbols = [places[place] for place in self.vector.places]
+        symbols = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
+        # parameters of code have no symbol
+        self._symbols = [symbols.get(place, place[0]) for place in self.vector.places]
         self.names = [symbol.replace("__", ".", 1) for symbol in self._symbols]
         low, high = self.vector.bounds
         row = self.vector.row.numpy()
-        self.logs = (low >= 0) & (row > 0)
+        law = np.array([name.startswith(f"{terms[0].name}.") for name in self.names], dtype=bool)
+        # a law without a bound leaves it open; its quantities have a sign
+        self.logs = ((low >= 0) | (law & np.isinf(low))) & (row > 0)
         self.random = np.array([self.names.index(name) for name in random or []], dtype=int)
         self.start = self.at(row)
-        self.low, self.high = self._scaled(low), self._scaled(high)
-        batch = collate(sequences)
-        scene = system.scene(batch)
-        which = paths.sequence, paths.place
-        self._fixed: dict[str, Any] = {
-            name: value[which].double().numpy()
-            for name, value in inputs_of(self._terms, lane, scene).items()
-        }
+        least = 1e-3 * np.abs(row)
+        self.low, self.high = self.at(np.maximum(low, least * self.logs)), self.at(high)
+        self._scene = system.scene(paths.batch)
+        inputs = inputs_of(formulas, lane, self._scene)
+        self._fixed: dict[str, Any] = {n: v[:, 0].double().numpy() for n, v in inputs.items()}
         self._fixed |= {
-            "start": batch.start.numpy()[paths.sequence],
+            "start": paths.batch.start.numpy(),
             "dt": 2 * paths.half,
             "second": paths.second,
         }
-        own = {
-            name: value.detach().double() for name, value in own_values(self._terms, lane).items()
-        }
+        own = {name: value.detach().double() for name, value in own_values(formulas, lane).items()}
         values = values_of(lane, own)
-        self._own = {s: float(v) for s, v in zip(lane.owned, values, strict=True)}
+        self._fixed |= {s: float(v) for s, v in zip(lane.owned, values, strict=True)}
         self._rates = Formulas(list(lane.rates.values()))
         self._starts = Formulas(list(lane.starts.values())) if lane.starts else None
+        self._scenes: dict[tuple[int, bool], Scene] = {}
 
     def behind(self, paths: Paths) -> Followers:
         """The same model of other paths of the same followers."""
@@ -240,11 +248,6 @@ class Followers:
         """Parameters in SI units, from those in the scales in which they are varied."""
         return np.where(self.logs, np.exp(np.where(self.logs, theta, 0.0)), theta)
 
-    def _scaled(self, ends: np.ndarray) -> np.ndarray:
-        small = 1e-3 * np.abs(self.vector.row.numpy())
-        found = np.where(self.logs, np.log(np.where(self.logs, np.maximum(ends, small), 1.0)), ends)
-        return found
-
     def simulate(
         self, theta: np.ndarray, start: np.ndarray, pushes: np.ndarray | None = None
     ) -> np.ndarray:
@@ -254,32 +257,102 @@ class Followers:
             theta: ``(R, P, F)`` parameters. start: ``(R, 2, F)`` positions and speeds at the start.
             pushes: ``(H, F)`` on the highest rate, by the times of the paths ahead.
         """
-        paths, lane = self.paths, self.lane
-        natural = self.natural(theta.transpose(0, 2, 1)).transpose(2, 0, 1)
-        given = {**self._fixed, **self._own, **dict(zip(self._symbols, natural, strict=True))}
-        states = list(lane.rates)
-        motion = list(start.transpose(1, 0, 2)[: lane.order])
+        paths, order = self.paths, self.lane.order
+        given = self._given(theta)
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
-            values = {**given, **dict(zip(states, y, strict=True)), **self._ahead(t)}
-            rates = [np.broadcast_to(one, y.shape[1:]) for one in self._rates(values)]
+            rates = self._rate(t, y, given, self._ahead(round(t / paths.half)))
             if pushes is not None:
-                rates[lane.order - 1] = rates[lane.order - 1] + pushes[round(t / paths.half)]
-            return np.stack(rates)
+                rates[order - 1] += pushes[round(t / paths.half)]
+            return rates
 
+        motion = list(start.transpose(1, 0, 2)[:order])
         if self._starts is not None:
-            at = {**given, "x": start[:, 0], "v": start[:, 1], **self._ahead(0.0)}
-            shape = motion[0].shape
-            for one in self._starts(at):
-                motion.append(np.broadcast_to(one, shape))
+            at = {**given, "x": start[:, 0], "v": start[:, 1], "t": 0.0, **self._ahead(0)}
+            motion += [np.broadcast_to(one, motion[0].shape) for one in self._starts(at)]
         with np.errstate(all="ignore"):
             return simulated(
                 rate, np.stack(motion), paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9
             )
 
-    def _ahead(self, t: float) -> dict[str, Any]:
-        x1, v1, x2, v2 = self.paths.ahead[round(t / self.paths.half)]
-        return {"t": t, "x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
+    def rates(self, theta: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """``(K, M, F)`` rates along a run.
+
+        Args:
+            theta: ``(P, F)`` parameters. states: ``(K, M, F)`` at the samples.
+        """
+        with np.errstate(all="ignore"):
+            return self._rate(
+                self._times, states.transpose(1, 0, 2), self._given(theta[None]),
+                self._ahead(self._samples), along=True,
+            ).transpose(1, 0, 2)  # fmt: skip
+
+    def state(self, states: np.ndarray, rates: np.ndarray) -> State:
+        """What terms see along a run, ``(K F, 3, 1)``; simulation f of sample k is k F + f.
+
+        Args:
+            states, rates: ``(K, M, F)`` at the samples.
+        """
+        ahead = self._ahead(self._samples)
+        return self._state(self._times, states[:, 0], rates[:, 0], ahead, along=True)
+
+    @cached_property
+    def _samples(self) -> np.ndarray:
+        """``(K,)`` where the samples are in the paths ahead."""
+        number = self.paths.x.shape[1]
+        return np.round(np.arange(number) * self.paths.dt / self.paths.half).astype(int)
+
+    @cached_property
+    def _times(self) -> np.ndarray:
+        """``(K, 1)`` times of the samples, s."""
+        return self.paths.dt * np.arange(self.paths.x.shape[1])[:, None]
+
+    def _given(self, theta: np.ndarray) -> dict[str, Any]:
+        """What does not change in runs with parameters ``(R, P, F)``."""
+        natural = self.natural(theta.transpose(0, 2, 1)).transpose(2, 0, 1)
+        return {**self._fixed, **dict(zip(self._symbols, natural, strict=True))}
+
+    def _ahead(self, at: Any) -> dict[str, Any]:
+        """The vehicles ahead at one or several of the times of their paths."""
+        x1, v1, x2, v2 = np.moveaxis(self.paths.ahead[at], -2, 0)
+        return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
+
+    def _rate(
+        self, t: Any, y: np.ndarray, given: dict[str, Any], ahead: dict[str, Any], *,
+        along: bool = False,
+    ) -> np.ndarray:  # fmt: skip
+        """``(M, L, F)`` rates of L runs, or along a run of L samples."""
+        values = {**given, **dict(zip(self.lane.rates, y, strict=True)), "t": t, **ahead}
+        found = np.stack([np.broadcast_to(one, y.shape[1:]) for one in self._rates(values)])
+        if self.code is not None:
+            wide = {
+                name.rpartition(".")[2]: torch.from_numpy(given[name]).reshape(-1, 1, 1)
+                for name in self.vector.names
+                if name in given
+            }
+            if along:
+                wide = {name: one.repeat(len(y[0]), 1, 1) for name, one in wide.items()}
+            state = self._state(t, y[0], found[0], ahead, along)
+            with torch.no_grad():
+                added = with_parameters(self.code, wide)(state)
+            found[self.lane.order - 1] += added[:, 0, 0].numpy().reshape(y.shape[1:])
+        return found
+
+    def _state(
+        self, t: Any, x: np.ndarray, speed: np.ndarray, ahead: dict[str, Any], along: bool
+    ) -> State:
+        shape, key = x.shape, (len(x), along)
+        if key not in self._scenes:
+            self._scenes[key] = side_by_side(self._scene, len(x), at_samples=along)
+        every = [
+            np.stack([np.broadcast_to(one, shape) for one in of], -1).reshape(-1, 3, 1)
+            for of in ((x, ahead["x_1"], ahead["x_2"]), (speed, ahead["v_1"], ahead["v_2"]))
+        ]
+        place, rate = (torch.from_numpy(one)[:, : self._scene.agent.shape[1]] for one in every)
+        time = torch.as_tensor(t, dtype=torch.float64)
+        time = time.expand(shape).flatten() if time.ndim else time
+        moving = rate if self.lane.order > 1 else None
+        return State(time, place, moving, self._scenes[key], rate=rate)
 
     def _spread(self, theta: np.ndarray, agents: np.ndarray) -> np.ndarray:
         """``(P, F)`` parameters of each follower."""
@@ -336,15 +409,11 @@ class Followers:
     def _linear(self, own: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The linear response along a run ``(K, M, F)``, by the trapezoidal rule."""
         paths, lane = self.paths, self.lane
-        natural = self.natural(own.T).T
         samples = len(states)
-        index = np.round(np.arange(samples) * paths.dt / paths.half).astype(int)
-        x1, v1, x2, v2 = paths.ahead[index].transpose(1, 0, 2)
         values = {
-            **self._fixed, **self._own, **dict(zip(self._symbols, natural, strict=True)),
+            **self._given(own[None]),
             **dict(zip(lane.rates, states.transpose(1, 0, 2), strict=True)),
-            "t": paths.dt * np.arange(samples)[:, None], "x_1": x1, "v_1": v1, "dx_1": v1,
-            "x_2": x2, "v_2": v2, "measured": v1,
+            "t": self._times, **self._ahead(self._samples),
         }  # fmt: skip
         which, function = self._slopes
         size = max((max(place) for place in which), default=lane.order - 1) + 1

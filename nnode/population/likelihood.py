@@ -122,8 +122,10 @@ class Products:
 class Noise(Protocol):
     """What differs from sample to sample."""
 
-    #: of its parameters, all of them positive.
-    names: tuple[str, ...]
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its parameters, all of them positive."""
+        ...
 
     def products(self, data: Linearised, values: np.ndarray) -> Products:
         """Products of the columns, whitened."""

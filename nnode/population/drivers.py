@@ -1,0 +1,143 @@
+"""Drivers who differ: which of a law's parameters, by how much, and each driver's own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from nnode.errors import ConfigError
+from nnode.model.system import System
+from nnode.population.estimate import Estimate, Variances, estimate
+from nnode.population.followers import Followers, Paths
+from nnode.population.likelihood import Marginal, PushNoise
+
+#: Bounds of standard deviations of logarithms of parameters, and where searches start.
+LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
+#: A parameter differs between drivers if the data leave less than this share of its variance, in
+#: the median over drivers.
+SHRINKAGE = 0.7
+#: Pushes: bounds of their standard deviation, and its start, by the law's order, in m/s or m/s².
+PUSH = {1: (1e-4, 5.0, 0.2), 2: (1e-4, 5.0, 0.1)}
+#: Bounds of the time that pushes last, in sampling intervals and as a share of the record: one that
+#: lasts longer is a difference between drivers. Where searches start, s.
+SHORT, LONG, LASTING = 1.0, 1 / 3, 3.0
+#: Standard deviations of starts: of positions in errors of measurement, of speeds in m/s.
+START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
+#: Step of a parameter's logarithm at most, and how closely estimates converge.
+LONGEST, TOLERANCE = 0.3, 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Population:
+    """A calibrated law, and the drivers that it was calibrated to.
+
+    Attributes:
+        model: the law behind measured leaders.
+        noise: pushes and errors of measurement.
+        estimate: parameters, deviations, variances.
+    """
+
+    model: Followers
+    noise: PushNoise
+    estimate: Estimate
+
+    @property
+    def marginal(self) -> Marginal:
+        """The likelihood, and what follows from it."""
+        return self.estimate.marginal
+
+    @property
+    def random(self) -> list[str]:
+        """Names of the parameters that differ between drivers."""
+        return [self.model.names[q] for q in self.model.random]
+
+
+def fit_drivers(
+    system: System, paths: Paths, drivers: str | Iterable[str] = "auto",
+    begin: Population | None = None,
+) -> Population:  # fmt: skip
+    """Calibrate a law to drivers who differ.
+
+    Args:
+        system: the law, with effects; searches start at its parameters.
+        paths: the followers.
+        drivers: ``auto``: parameters of which the data tell how they differ; ``none``; or names,
+            as ``T``.
+        begin: an estimate with the same parameters, from which variances and deviations are taken
+            at the start.
+
+    Raises:
+        ConfigError: a name that the law does not have, or a model without a formula.
+    """
+    noise, plain = PushNoise(paths.error), Followers(system, paths)
+    own = f"{system.terms[0].name}."
+    law = [n for n, log in zip(plain.names, plain.logs, strict=True) if log and n.startswith(own)]
+    if drivers == "auto" and begin is None:
+        return _differing(system, paths, law, noise)
+    if drivers == "auto":
+        assert begin is not None
+        random = begin.random
+    elif drivers == "none":
+        random = []
+    else:
+        short = {name.rpartition(".")[2]: name for name in law}
+        unknown = [name for name in drivers if name not in short]
+        if unknown:
+            raise ConfigError(
+                f"drivers={unknown[0]} is no parameter of the law that can differ; expected auto, "
+                f"none, or some of {', '.join(short)}"
+            )
+        random = [short[name] for name in drivers]
+    return _estimated(Followers(system, paths, random), noise, begin)
+
+
+def _estimated(model: Followers, noise: PushNoise, begin: Population | None = None) -> Population:
+    known = None
+    if begin is not None and begin.random == [model.names[q] for q in model.random]:
+        known = begin.estimate
+    found = estimate(
+        model, noise, model.start, _variances(model), low=model.low, high=model.high,
+        longest=LONGEST, tolerance=TOLERANCE, begin=known,
+    )  # fmt: skip
+    return Population(model=model, noise=noise, estimate=found)
+
+
+def _differing(system: System, paths: Paths, names: list[str], noise: PushNoise) -> Population:
+    """The law with those parameters that differ between drivers, as far as the data tell.
+
+    Parameters are added one after the other: that which raises the marginal likelihood most, while
+    twice its logarithm rises by more than the logarithm of the number of drivers (Schwarz's
+    criterion).
+    """
+    best = _estimated(Followers(system, paths), noise)
+    price = math.log(max(len(paths.names), 2)) / 2
+    while True:
+        left = [name for name in names if name not in best.random]
+        tried = [_estimated(Followers(system, paths, [*best.random, name]), noise) for name in left]
+        good = [one for one in tried if np.median(one.marginal.shrinkage, 0).max() < SHRINKAGE]
+        better = max(good, key=lambda one: one.marginal.loglik, default=best)
+        if better.marginal.loglik - best.marginal.loglik <= price:
+            return best
+        best = better
+
+
+def _variances(model: Followers) -> Variances:
+    paths, order = model.paths, model.lane.order
+    number, length = len(model.random), paths.dt * paths.x.shape[1]
+    low_push, high_push, push = PUSH[order]
+    short, long = SHORT * paths.dt, max(LONG * length, 2 * SHORT * paths.dt)
+    position = START_POSITION * paths.error
+    low_speed, high_speed, speed = START_SPEED
+    starts, least, most = [position], [position], [position]
+    if order > 1:
+        starts, least, most = [*starts, speed], [*least, low_speed], [*most, high_speed]
+    return Variances(
+        noise=np.array([push, np.clip(LASTING, short, long)]),
+        spread=np.full(number, SPREAD),
+        start=np.array(starts),
+        low=np.array([low_push, short, *[LEAST_SPREAD] * number, *least]),
+        high=np.array([high_push, long, *[MOST_SPREAD] * number, *most]),
+    )

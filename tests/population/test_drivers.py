@@ -1,0 +1,70 @@
+"""Drivers who differ, simulated without the package."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError
+from nnode.model import Traffic, make_law
+from nnode.population.drivers import fit_drivers
+from nnode.population.followers import paths_of
+
+#: Platoons, vehicles, s, sampling interval and step, s, errors of measurement, m.
+PLATOONS, VEHICLES, SECONDS, DT, STEP, ERROR = 8, 5, 30.0, 0.2, 0.02, 0.05
+
+
+def platoons(differ: float, seed: int) -> tuple[list[Sequence], np.ndarray]:
+    """Platoons of v = v0 (1 - 6 m / gap), v0 log-normal around 29 m/s, pushed for 4 s."""
+    rng = np.random.default_rng(seed)
+    v0 = 29.0 * np.exp(differ * rng.normal(size=(PLATOONS, VEHICLES - 1)))
+    keep, every = np.exp(-STEP / 4.0), round(DT / STEP)
+    mean, phase = rng.uniform(11, 17, PLATOONS), rng.uniform(0, 6, PLATOONS)
+    gaps = 6.0 / (1 - mean[:, None] / v0)
+    x = np.concatenate([np.zeros((PLATOONS, 1)), -gaps.cumsum(1)], 1)
+    push, paths = np.zeros_like(v0), []
+    for k in range(round(SECONDS / STEP) + 1):
+        if k % every == 0:
+            paths.append(x + ERROR * rng.normal(size=x.shape))
+        lead = mean + 1.5 * np.sin(2 * np.pi * k * STEP / 13 + phase)
+        speed = v0 * (1 - 6.0 / (x[:, :-1] - x[:, 1:])) + push
+        push = keep * push + 0.2 * np.sqrt(1 - keep**2) * rng.normal(size=push.shape)
+        x = x + STEP * np.concatenate([lead[:, None], speed], 1)
+    every_path = np.array(paths)[:, :, ::-1]
+    time = DT * np.arange(len(paths))
+    found = [
+        Sequence(name=f"{b}", recording=f"{b}", time=time, x=every_path[:, b, :, None])
+        for b in range(PLATOONS)
+    ]
+    return found, v0[:, ::-1]
+
+
+def test_drivers_who_differ_are_found_and_told_apart() -> None:
+    sequences, v0 = platoons(0.15, 1)
+    system = Traffic([make_law("lin")], leader="measured").double()
+    found = fit_drivers(system, paths_of(sequences, 0.2))
+    assert found.random == ["lin.v0"]
+    own = found.estimate.agents[:, 0]
+    assert np.corrcoef(own, np.log(v0).ravel())[0, 1] > 0.9
+    spread, drawn = found.estimate.variances.spread[0], np.log(v0).std()
+    assert spread == pytest.approx(drawn, rel=0.2)
+    error = 1 / np.sqrt(np.diag(found.marginal.information))
+    truth = np.array([np.log(v0).mean(), np.log(6.0)])
+    assert (np.abs(found.estimate.theta - truth) < 4 * error).all()
+
+
+def test_drivers_alike_do_not_differ() -> None:
+    sequences, _ = platoons(0.0, 2)
+    system = Traffic([make_law("lin")], leader="measured").double()
+    found = fit_drivers(system, paths_of(sequences, 0.2))
+    assert found.random == []
+    sigma, _ = found.estimate.variances.noise
+    assert sigma == pytest.approx(0.2, rel=0.2)
+
+
+def test_an_unknown_parameter_is_refused() -> None:
+    sequences, _ = platoons(0.0, 2)
+    system = Traffic([make_law("lin")], leader="measured").double()
+    with pytest.raises(ConfigError, match=r"drivers=T is no parameter .* v0, L"):
+        fit_drivers(system, paths_of(sequences, 0.2), ["T"])

@@ -1,0 +1,88 @@
+"""The Kalman filter and Woodbury's identity against a dense Gaussian."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from nnode.population.likelihood import Linearised, PushNoise, marginal
+
+#: Pushes: standard deviation, time (s); sampling interval, s; errors of measurement, m.
+SIGMA, TAU, DT, ERROR = 0.4, 1.7, 0.2, 0.05
+#: Standard deviations of the agents' and of the starts' deviations.
+SPREAD, START = np.array([0.3, 0.7]), np.array([0.2])
+
+
+def example(seed: int, states: int) -> Linearised:
+    """Three segments of two agents, some samples missing."""
+    rng = np.random.default_rng(seed)
+    segments, samples = 3, 12
+    seen = rng.random((segments, samples)) < 0.8
+    seen[1, 9:] = False
+    step = 0.9 * np.eye(states) + 0.05 * rng.normal(size=(segments, samples - 1, states, states))
+    return Linearised(
+        residual=rng.normal(size=(segments, samples)),
+        fixed=rng.normal(size=(segments, samples, 2)),
+        random=rng.normal(size=(segments, samples, 2)),
+        start=rng.normal(size=(segments, samples, 1)),
+        seen=seen, agent=np.array([0, 1, 0]), step=step,
+        forced=rng.normal(size=(segments, samples - 1, states)), dt=DT,
+    )  # fmt: skip
+
+
+def covariance(data: Linearised) -> np.ndarray:
+    """Of all samples of all segments, without any filter."""
+    segments, samples = data.residual.shape
+    apart = np.abs(np.arange(samples)[:, None] - np.arange(samples)) * DT
+    pushes = SIGMA**2 * np.exp(-apart / TAU)
+    whole = np.zeros((segments * samples, segments * samples))
+    assert data.step is not None
+    assert data.forced is not None
+    for s in range(segments):
+        response = np.zeros((samples, samples))
+        state = np.zeros((data.step.shape[-1], samples))
+        for k in range(samples - 1):
+            both = np.eye(samples)[k] + np.eye(samples)[k + 1]
+            state = data.step[s, k] @ state + np.outer(data.forced[s, k], both)
+            response[k + 1] = state[0]
+        own = slice(s * samples, (s + 1) * samples)
+        start = data.start[s] * START
+        whole[own, own] = response @ pushes @ response.T + ERROR**2 * np.eye(samples)
+        whole[own, own] += start @ start.T
+    random = (data.random * SPREAD).reshape(segments * samples, -1)
+    same = np.equal.outer(*[np.repeat(data.agent, samples)] * 2)
+    found: np.ndarray = whole + same * (random @ random.T)
+    return found
+
+
+@pytest.mark.parametrize("states", [1, 2])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_filter_is_a_dense_gaussian(seed: int, states: int) -> None:
+    data = example(seed, states)
+    seen = data.seen.ravel()
+    v = covariance(data)[np.ix_(seen, seen)]
+    x, w = data.fixed.reshape(-1, 2)[seen], data.residual.ravel()[seen]
+    information = x.T @ np.linalg.solve(v, x)
+    change = np.linalg.solve(information, x.T @ np.linalg.solve(v, w))
+    loglik = multivariate_normal(np.zeros(len(w)), v).logpdf(w - x @ change)
+    # Harville 1977
+    loss = np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
+
+    noise = PushNoise(ERROR)
+    products = noise.products(data, np.array([SIGMA, TAU]))
+    found = marginal(data, products, SPREAD, START)
+    restricted = marginal(data, products, SPREAD, START, restricted=True)
+
+    assert found.loglik == pytest.approx(loglik, rel=1e-8)
+    assert found.each.sum() == pytest.approx(loglik, rel=1e-8)
+    assert restricted.loglik == pytest.approx(loglik + loss, rel=1e-8)
+    np.testing.assert_allclose(found.change, change, rtol=1e-8)
+    np.testing.assert_allclose(found.information, information, rtol=1e-8)
+    agent = np.repeat(data.agent, data.seen.shape[1])[seen]
+    z, rest = data.random.reshape(-1, 2)[seen], np.linalg.solve(v, w - x @ change)
+    for d in range(2):
+        own = z * (agent == d)[:, None]
+        np.testing.assert_allclose(found.deviations[d], SPREAD**2 * (own.T @ rest), rtol=1e-7)
+        left = SPREAD**2 - SPREAD**4 * np.diag(own.T @ np.linalg.solve(v, own))
+        np.testing.assert_allclose(found.variances[d], left, rtol=1e-7)
