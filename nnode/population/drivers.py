@@ -55,10 +55,7 @@ class Population:
         return [self.model.names[q] for q in self.model.random]
 
 
-def fit_drivers(
-    system: System, paths: Paths, drivers: str | Iterable[str] = "auto",
-    begin: Population | None = None,
-) -> Population:  # fmt: skip
+def fit_drivers(system: System, paths: Paths, drivers: str | Iterable[str] = "auto") -> Population:
     """Calibrate a law to drivers who differ.
 
     Args:
@@ -66,53 +63,43 @@ def fit_drivers(
         paths: the followers.
         drivers: ``auto``: parameters of which the data tell how they differ; ``none``; or names,
             as ``T``.
-        begin: an estimate with the same parameters, from which variances and deviations are taken
-            at the start.
 
     Raises:
         ConfigError: a name that the law does not have, or a model without a formula.
     """
-    noise, plain = PushNoise(paths.error), Followers(system, paths)
-    own = f"{system.terms[0].name}."
-    law = [n for n, log in zip(plain.names, plain.logs, strict=True) if log and n.startswith(own)]
-    if drivers == "auto" and begin is None:
-        return _differing(system, paths, law, noise)
+    plain, noise = Followers(system, paths), PushNoise(paths.error)
+    law = [name for name, own in zip(plain.names, plain.logs & plain.law, strict=True) if own]
     if drivers == "auto":
-        assert begin is not None
-        random = begin.random
-    elif drivers == "none":
-        random = []
-    else:
-        short = {name.rpartition(".")[2]: name for name in law}
-        unknown = [name for name in drivers if name not in short]
-        if unknown:
-            raise ConfigError(
-                f"drivers={unknown[0]} is no parameter of the law that can differ; expected auto, "
-                f"none, or some of {', '.join(short)}"
-            )
-        random = [short[name] for name in drivers]
-    return _estimated(Followers(system, paths, random), noise, begin)
+        return _differing(plain, law, noise)
+    if drivers == "none":
+        return _estimated(plain, noise)
+    short = {name.rpartition(".")[2]: name for name in law}
+    unknown = [name for name in drivers if name not in short]
+    if unknown:
+        raise ConfigError(
+            f"drivers={unknown[0]} is no parameter of the law that can differ; expected auto, "
+            f"none, or some of {', '.join(short)}"
+        )
+    return _estimated(Followers(system, paths, [short[name] for name in drivers]), noise)
 
 
-def _estimated(model: Followers, noise: PushNoise, begin: Population | None = None) -> Population:
-    known = None
-    if begin is not None and begin.random == [model.names[q] for q in model.random]:
-        known = begin.estimate
+def _estimated(model: Followers, noise: PushNoise) -> Population:
     found = estimate(
         model, noise, model.start, _variances(model), low=model.low, high=model.high,
-        longest=LONGEST, tolerance=TOLERANCE, begin=known,
+        longest=LONGEST, tolerance=TOLERANCE,
     )  # fmt: skip
     return Population(model=model, noise=noise, estimate=found)
 
 
-def _differing(system: System, paths: Paths, names: list[str], noise: PushNoise) -> Population:
+def _differing(plain: Followers, names: list[str], noise: PushNoise) -> Population:
     """The law with those parameters that differ between drivers, as far as the data tell.
 
     Parameters are added one after the other: that which raises the marginal likelihood most, while
     twice its logarithm rises by more than the logarithm of the number of drivers (Schwarz's
     criterion).
     """
-    best = _estimated(Followers(system, paths), noise)
+    system, paths = plain.system, plain.paths
+    best = _estimated(plain, noise)
     price = math.log(max(len(paths.names), 2)) / 2
     while True:
         left = [name for name in names if name not in best.random]

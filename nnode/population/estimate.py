@@ -101,7 +101,6 @@ def estimate(
     response: Response, noise: Noise, theta: np.ndarray, variances: Variances, *,
     low: np.ndarray | None = None, high: np.ndarray | None = None, restricted: bool = False,
     longest: float = np.inf, steps: int = 40, tolerance: float = 1e-3,
-    begin: Estimate | None = None,
 ) -> Estimate:  # fmt: skip
     """Estimate a model of agents who differ.
 
@@ -117,28 +116,25 @@ def estimate(
         tolerance: the search ends when a step moves no parameter by more than this share of its
             standard error, no standard deviation by more than this share of itself, and no agent's
             deviation by more than this share of their standard deviation.
-        begin: an estimate whose deviations and variances are taken to begin with.
     """
     theta = np.array(theta, dtype=float)
     low = np.full(len(theta), -np.inf) if low is None else low
     high = np.full(len(theta), np.inf) if high is None else high
-    first = response(theta, np.zeros((0, 0)), np.zeros((0, 0))) if begin is None else begin.data
-    number = int(first.agent.max()) + 1
-    agents = np.zeros((number, first.random.shape[-1]))
-    start = np.zeros(first.start.shape[::2])
-    if begin is not None:
-        agents, start, variances = begin.agents, begin.start, begin.variances
-    data, converged, taken = response(theta, agents, start), False, 1
+    data, converged, taken = response(theta, np.zeros((0, 0)), np.zeros((0, 0))), False, 1
+    number = int(data.agent.max()) + 1
+    agents = np.zeros((number, data.random.shape[-1]))
+    start = np.zeros(data.start.shape[::2])
     most, last = 1.0, np.zeros(len(theta))
     for _ in range(steps):
         before = variances
         variances = fit_variances(
             data, noise, variances, restricted=restricted, tolerance=tolerance
         )
-        here = _likelihood(data, noise, variances, restricted)
+        products = noise.products(data, variances.noise)
+        here = marginal(data, products, variances.spread, variances.start, restricted=restricted)
         change = np.clip(here.change, -longest, longest)
         change = np.clip(change, low - theta, high - theta)
-        misfit = _misfit(data, noise, variances, agents, start)
+        misfit = _misfit(data, products, variances, agents, start)
         turned = last @ here.information @ change < 0
         most, last = max(most / 2, LEAST) if turned else min(1.25 * most, 1.0), change
         share, shares, found, there = most, np.full((number, 1), most), None, data
@@ -150,7 +146,7 @@ def estimate(
             )
             there, taken = response(*trial), taken + 1
             fixed = replace(there, step=data.step, forced=data.forced)
-            then = _misfit(fixed, noise, variances, *trial[1:])
+            then = _misfit(fixed, noise.products(fixed, variances.noise), variances, *trial[1:])
             if then.sum() <= misfit.sum():
                 found = trial
                 break
@@ -166,9 +162,11 @@ def estimate(
             converged = bool(moved < tolerance)
             break
     variances = fit_variances(data, noise, variances, restricted=restricted, tolerance=tolerance)
+    products = noise.products(data, variances.noise)
+    final = marginal(data, products, variances.spread, variances.start, restricted=restricted)
     return Estimate(
         theta=theta, agents=agents, start=start, variances=variances, data=data,
-        marginal=_likelihood(data, noise, variances, restricted), steps=taken, converged=converged,
+        marginal=final, steps=taken, converged=converged,
     )  # fmt: skip
 
 
@@ -184,28 +182,27 @@ def fit_variances(
     Args:
         tolerance: the search ends when a step gains less in the logarithm of the likelihood.
     """
-    split, whole = len(variances.noise), np.log(variances.row)
-    free = np.flatnonzero(variances.low < variances.high)
+    whole, free = np.log(variances.row), np.flatnonzero(variances.low < variances.high)
     if not len(free):
         return variances
-    known: dict[tuple[float, ...], Products] = {}
-
-    def at(row: np.ndarray) -> Marginal:
-        logs = whole.copy()
-        logs[free] = row
-        found = variances.filled(np.exp(logs))
-        key = tuple(found.noise)
-        if key not in known:
-            known[key] = noise.products(data, found.noise)
-        return marginal(data, known[key], found.spread, found.start, restricted=restricted)
 
     def slopes(row: np.ndarray) -> tuple[Marginal, list[tuple[Marginal, Marginal]]]:
-        for key in [key for key in known if key != tuple(np.exp(whole[:split]))]:
-            del known[key]
+        """The likelihood, and those on both sides of each standard deviation."""
+        known: dict[tuple[float, ...], Products] = {}  # most sides have the same noise
+
+        def at(row: np.ndarray) -> Marginal:
+            logs = whole.copy()
+            logs[free] = row
+            found = variances.filled(np.exp(logs))
+            key = tuple(found.noise)
+            if key not in known:
+                known[key] = noise.products(data, found.noise)
+            return marginal(data, known[key], found.spread, found.start, restricted=restricted)
+
         steps = DIFFERENCE * np.eye(len(row))
         return at(row), [(at(row + step), at(row - step)) for step in steps]
 
-    sides = slopes(whole[free])[1]
+    first, sides = slopes(whole[free])
     scores = np.stack([(up.each - down.each) / (2 * DIFFERENCE) for up, down in sides])
     scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
 
@@ -215,31 +212,25 @@ def fit_variances(
         return -here.loglik, -slope * scale
 
     low, high = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
-    start = np.clip(whole[free] / scale, low, high)
-    size = max(abs(at(start * scale).loglik), 1.0)
     best = minimize(
-        value, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-        options={"ftol": tolerance / size, "gtol": tolerance},
+        value, whole[free] / scale, jac=True, method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"ftol": tolerance / max(abs(first.loglik), 1.0), "gtol": tolerance},
     )  # fmt: skip
     whole[free] = best.x * scale
     return variances.filled(np.exp(whole))
 
 
 def _misfit(
-    data: Linearised, noise: Noise, variances: Variances, agents: np.ndarray, start: np.ndarray
-) -> np.ndarray:
+    data: Linearised, products: Products, variances: Variances, agents: np.ndarray,
+    start: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """``(D,)`` the agents' penalised sums of squares; infinite where a simulation blows up."""
     number, count = data.fixed.shape[-1], len(agents)
     blown = ~np.isfinite(np.where(data.seen, data.residual, 0.0)).all(1)
     back = -np.concatenate([agents[data.agent], start], 1)
     weights = np.concatenate([np.ones((len(back), 1)), np.zeros((len(back), number)), back], 1)
-    gram = noise.products(data, variances.noise).gram
-    square = np.einsum("si,sij,sj->s", weights, gram, weights)
+    square = np.einsum("si,sij,sj->s", weights, products.gram, weights)
     square = np.where(blown, np.inf, square + ((start / variances.start) ** 2).sum(1))
     tied = ((agents / variances.spread) ** 2).sum(1)
     return np.bincount(data.agent, square, count) + tied
-
-
-def _likelihood(data: Linearised, noise: Noise, variances: Variances, restricted: bool) -> Marginal:
-    products = noise.products(data, variances.noise)
-    return marginal(data, products, variances.spread, variances.start, restricted=restricted)

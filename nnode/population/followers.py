@@ -11,33 +11,29 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, partial
 from typing import Any, cast
 
 import numpy as np
-import torch
 from scipy.interpolate import CubicSpline
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.clusters import clusters, index_of
-from nnode.data.paths import smooth, velocity
+from nnode.data.paths import smooth
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError
 from nnode.model.differentiate import derivatives
 from nnode.model.formula import inputs_of
 from nnode.model.lane_rates import SAFE, Formulas
-from nnode.model.scene import Scene
-from nnode.model.system import System, with_parameters
-from nnode.model.term import State, Term
-from nnode.model.terms import own_values, values_of
+from nnode.model.system import System
+from nnode.model.term import Term
+from nnode.model.terms import LaneDynamics, own_values, values_of
 from nnode.population.estimate import Estimate, estimate
 from nnode.population.likelihood import Linearised, Noise
+from nnode.simulation.linear import trapezoidal
 from nnode.simulation.numpy import simulated, strides
-from nnode.simulation.rhs import formula_of, side_by_side
+from nnode.simulation.rhs import formula_of
 
-#: Longest step, s, by the law's order; that of laws which say what holds one step later.
-STEP, MAPPED = {1: 0.4, 2: 0.2}, 0.1
 #: Least standard deviation of errors of measurement, m: that of a camera.
 FLOOR = 0.01
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
@@ -58,7 +54,7 @@ class Paths:
         x: ``(F, K)`` measured positions of the followers, m.
         seen: ``(F, K)`` True where there is a sample.
         sequence, place: ``(F,)`` the sequence and the place in the platoon.
-        agent, cluster: ``(F,)`` numbers of the follower and of its cluster, from 0.
+        agent: ``(F,)`` number of the follower, from 0.
         names: of the agents.
         smoothed: of each sequence ``(K, N)`` smoothed positions, m.
         dt: sampling interval, s. half: that of ``ahead``, s.
@@ -67,7 +63,7 @@ class Paths:
         second: ``(F,)`` 1 where there is a second vehicle ahead.
         start: ``(2, F)`` smoothed position and speed at the first sample.
         error: standard deviation of the errors of measurement, m.
-        batch: of each follower the smoothed paths of himself and of the one or two vehicles ahead.
+        batch: of each follower the sequence with himself and the one or two vehicles ahead.
     """
 
     x: np.ndarray
@@ -75,7 +71,6 @@ class Paths:
     sequence: np.ndarray
     place: np.ndarray
     agent: np.ndarray
-    cluster: np.ndarray
     names: tuple[str, ...]
     smoothed: list[np.ndarray]
     dt: float
@@ -97,11 +92,13 @@ class Paths:
         measured = x + self.error * draw(x.shape)
         smoothed = [smooth(true + self.error * draw(true.shape)) for true in self.smoothed]
         ahead = _ahead(smoothed, self.sequence, self.place, len(self.ahead), self.half, self.dt)
-        start = np.empty_like(self.start)
-        for f, path in enumerate(measured):
-            own = smooth(path[self.seen[f]])
-            spline = CubicSpline(self.dt * np.arange(len(own)), own)
-            start[:, f] = spline(0.0), spline(0.0, 1)
+        start = np.stack(
+            [
+                _start(smooth(path[seen]), self.dt)
+                for path, seen in zip(measured, self.seen, strict=True)
+            ],
+            1,
+        )
         return replace(self, x=measured, smoothed=smoothed, ahead=ahead, start=start)
 
 
@@ -129,28 +126,28 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
         agent.append(agents[key])
     sequence, place = np.array(which).T
     smoothed = [smooth(s.x[..., 0]) for s in sequences]
-    start = np.empty((2, len(which)))
-    for f, (b, i) in enumerate(which):
-        spline = CubicSpline(dt * np.arange(len(smoothed[b])), smoothed[b][:, i])
-        start[:, f] = spline(0.0), spline(0.0, 1)
+    start = np.stack([_start(smoothed[b][:, i], dt) for b, i in which], 1)
     noise = measured_noise(sequences).position
     return Paths(
         x=x, seen=seen, sequence=sequence, place=place, agent=np.array(agent),
-        cluster=np.unique(clusters(index_of(sequences))[sequence], return_inverse=True)[1],
         names=tuple(names), smoothed=smoothed, dt=dt, half=half,
         ahead=_ahead(smoothed, sequence, place, times, half, dt), start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
-        batch=collate(_with_those_ahead(sequences[b], smoothed[b], i) for b, i in which),
+        batch=collate(_with_those_ahead(sequences[b], i) for b, i in which),
     )  # fmt: skip
 
 
-def _with_those_ahead(s: Sequence, smoothed: np.ndarray, place: int) -> Sequence:
-    """The smoothed paths of a follower and of the one or two vehicles ahead of him."""
-    x = smoothed[..., None]
+def _with_those_ahead(s: Sequence, place: int) -> Sequence:
+    """The sequence of a follower and of the one or two vehicles ahead of him."""
     index = np.arange(s.n_agents)
-    smooth_sequence = replace(s, x=x, v=velocity(x, s.dt))
-    return smooth_sequence.select((index >= place) & (index <= place + 2))
+    return s.select((index >= place) & (index <= place + 2))
+
+
+def _start(path: np.ndarray, dt: float) -> np.ndarray:
+    """``(2,)`` position and speed at the first sample of a smoothed path."""
+    spline = CubicSpline(dt * np.arange(len(path)), path)
+    return np.array([spline(0.0), spline(0.0, 1)])
 
 
 def _ahead(
@@ -174,6 +171,20 @@ def _ahead(
     return found
 
 
+@cache
+def _slopes(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
+    """Derivatives of the rates by the states through which disturbances act: which, and a function
+    of all."""
+    states = list(lane.rates)
+    number = len(states) if len(states) <= lane.order + STATES else lane.order
+    found = [
+        ((p, states.index(name)), slope)
+        for p, state in enumerate(states[:number])
+        for name, slope in derivatives(lane.rates[state], states[:number]).items()
+    ]
+    return [place for place, _ in found], Formulas([slope for _, slope in found])
+
+
 class Followers:
     """A model of a lane, as a response to parameters and to deviations of drivers and starts.
 
@@ -186,7 +197,7 @@ class Followers:
 
     Attributes:
         names: P names of the parameters.
-        logs: ``(P,)`` True for parameters that are varied in logarithms.
+        law: ``(P,)`` True for those of the law; logs: for those that are varied in logarithms.
         random: ``(Q,)`` numbers of those that differ between drivers.
 
     Raises:
@@ -195,44 +206,39 @@ class Followers:
 
     def __init__(self, system: System, paths: Paths, random: list[str] | None = None) -> None:
         self.system, self.paths = system, paths
-        terms = cast(list[Term], list(system.terms))
-        lane, self.code = formula_of(system), None
-        if lane is None and terms and terms[-1].side_by_side:
-            lane, self.code = formula_of(system, -1), terms[-1]
+        terms, lane = cast(list[Term], list(system.terms)), formula_of(system)
         if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
             raise ConfigError(
                 "drivers who differ need a model of a lane whose law and effects are formulas of "
                 "the positions and speeds of the vehicles ahead; take drivers=none"
             )
-        self.lane, formulas = lane, terms if self.code is None else terms[:-1]
+        self.lane = lane
         self.vector = ParameterVector(system)
         symbols = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
-        # parameters of code have no symbol
-        self._symbols = [symbols.get(place, place[0]) for place in self.vector.places]
+        self._symbols = [symbols[place] for place in self.vector.places]
         self.names = [symbol.replace("__", ".", 1) for symbol in self._symbols]
         low, high = self.vector.bounds
         row = self.vector.row.numpy()
-        law = np.array([name.startswith(f"{terms[0].name}.") for name in self.names], dtype=bool)
+        own = f"{terms[0].name}."
+        self.law = np.array([name.startswith(own) for name in self.names], dtype=bool)
         # a law without a bound leaves it open; its quantities have a sign
-        self.logs = ((low >= 0) | (law & np.isinf(low))) & (row > 0)
+        self.logs = ((low >= 0) | (self.law & np.isinf(low))) & (row > 0)
         self.random = np.array([self.names.index(name) for name in random or []], dtype=int)
         self.start = self.at(row)
         least = 1e-3 * np.abs(row)
         self.low, self.high = self.at(np.maximum(low, least * self.logs)), self.at(high)
-        self._scene = system.scene(paths.batch)
-        inputs = inputs_of(formulas, lane, self._scene)
+        inputs = inputs_of(terms, lane, system.scene(paths.batch))
         self._fixed: dict[str, Any] = {n: v[:, 0].double().numpy() for n, v in inputs.items()}
         self._fixed |= {
             "start": paths.batch.start.numpy(),
             "dt": 2 * paths.half,
             "second": paths.second,
         }
-        own = {name: value.detach().double() for name, value in own_values(formulas, lane).items()}
-        values = values_of(lane, own)
+        known = {name: value.detach().double() for name, value in own_values(terms, lane).items()}
+        values = values_of(lane, known)
         self._fixed |= {s: float(v) for s, v in zip(lane.owned, values, strict=True)}
         self._rates = Formulas(list(lane.rates.values()))
         self._starts = Formulas(list(lane.starts.values())) if lane.starts else None
-        self._scenes: dict[tuple[int, bool], Scene] = {}
 
     def behind(self, paths: Paths) -> Followers:
         """The same model of other paths of the same followers."""
@@ -261,10 +267,13 @@ class Followers:
         given = self._given(theta)
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
-            rates = self._rate(t, y, given, self._ahead(round(t / paths.half)))
+            at = round(t / paths.half)
+            values = {**given, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
+            rates = self._rates({**values, **self._ahead(at)})
+            found = np.stack([np.broadcast_to(one, y.shape[1:]) for one in rates])
             if pushes is not None:
-                rates[order - 1] += pushes[round(t / paths.half)]
-            return rates
+                found[order - 1] += pushes[at]
+            return found
 
         motion = list(start.transpose(1, 0, 2)[:order])
         if self._starts is not None:
@@ -275,38 +284,6 @@ class Followers:
                 rate, np.stack(motion), paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9
             )
 
-    def rates(self, theta: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """``(K, M, F)`` rates along a run.
-
-        Args:
-            theta: ``(P, F)`` parameters. states: ``(K, M, F)`` at the samples.
-        """
-        with np.errstate(all="ignore"):
-            return self._rate(
-                self._times, states.transpose(1, 0, 2), self._given(theta[None]),
-                self._ahead(self._samples), along=True,
-            ).transpose(1, 0, 2)  # fmt: skip
-
-    def state(self, states: np.ndarray, rates: np.ndarray) -> State:
-        """What terms see along a run, ``(K F, 3, 1)``; simulation f of sample k is k F + f.
-
-        Args:
-            states, rates: ``(K, M, F)`` at the samples.
-        """
-        ahead = self._ahead(self._samples)
-        return self._state(self._times, states[:, 0], rates[:, 0], ahead, along=True)
-
-    @cached_property
-    def _samples(self) -> np.ndarray:
-        """``(K,)`` where the samples are in the paths ahead."""
-        number = self.paths.x.shape[1]
-        return np.round(np.arange(number) * self.paths.dt / self.paths.half).astype(int)
-
-    @cached_property
-    def _times(self) -> np.ndarray:
-        """``(K, 1)`` times of the samples, s."""
-        return self.paths.dt * np.arange(self.paths.x.shape[1])[:, None]
-
     def _given(self, theta: np.ndarray) -> dict[str, Any]:
         """What does not change in runs with parameters ``(R, P, F)``."""
         natural = self.natural(theta.transpose(0, 2, 1)).transpose(2, 0, 1)
@@ -316,43 +293,6 @@ class Followers:
         """The vehicles ahead at one or several of the times of their paths."""
         x1, v1, x2, v2 = np.moveaxis(self.paths.ahead[at], -2, 0)
         return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
-
-    def _rate(
-        self, t: Any, y: np.ndarray, given: dict[str, Any], ahead: dict[str, Any], *,
-        along: bool = False,
-    ) -> np.ndarray:  # fmt: skip
-        """``(M, L, F)`` rates of L runs, or along a run of L samples."""
-        values = {**given, **dict(zip(self.lane.rates, y, strict=True)), "t": t, **ahead}
-        found = np.stack([np.broadcast_to(one, y.shape[1:]) for one in self._rates(values)])
-        if self.code is not None:
-            wide = {
-                name.rpartition(".")[2]: torch.from_numpy(given[name]).reshape(-1, 1, 1)
-                for name in self.vector.names
-                if name in given
-            }
-            if along:
-                wide = {name: one.repeat(len(y[0]), 1, 1) for name, one in wide.items()}
-            state = self._state(t, y[0], found[0], ahead, along)
-            with torch.no_grad():
-                added = with_parameters(self.code, wide)(state)
-            found[self.lane.order - 1] += added[:, 0, 0].numpy().reshape(y.shape[1:])
-        return found
-
-    def _state(
-        self, t: Any, x: np.ndarray, speed: np.ndarray, ahead: dict[str, Any], along: bool
-    ) -> State:
-        shape, key = x.shape, (len(x), along)
-        if key not in self._scenes:
-            self._scenes[key] = side_by_side(self._scene, len(x), at_samples=along)
-        every = [
-            np.stack([np.broadcast_to(one, shape) for one in of], -1).reshape(-1, 3, 1)
-            for of in ((x, ahead["x_1"], ahead["x_2"]), (speed, ahead["v_1"], ahead["v_2"]))
-        ]
-        place, rate = (torch.from_numpy(one)[:, : self._scene.agent.shape[1]] for one in every)
-        time = torch.as_tensor(t, dtype=torch.float64)
-        time = time.expand(shape).flatten() if time.ndim else time
-        moving = rate if self.lane.order > 1 else None
-        return State(time, place, moving, self._scenes[key], rate=rate)
 
     def _spread(self, theta: np.ndarray, agents: np.ndarray) -> np.ndarray:
         """``(P, F)`` parameters of each follower."""
@@ -392,45 +332,26 @@ class Followers:
             agent=paths.agent, step=moved, forced=forced, dt=paths.dt,
         )  # fmt: skip
 
-    @cached_property
-    def _slopes(self) -> tuple[list[tuple[int, int]], Formulas]:
-        """Derivatives of the rates by the states through which disturbances act."""
-        states = list(self.lane.rates)
-        number = len(states) if len(states) <= self.lane.order + STATES else self.lane.order
-        states = states[:number]
-        found = [
-            ((p, q), slope)
-            for p, state in enumerate(states)
-            for q, name in enumerate(states)
-            if (slope := derivatives(self.lane.rates[state], [name]).get(name)) is not None
-        ]
-        return [place for place, _ in found], Formulas([slope for _, slope in found])
-
     def _linear(self, own: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The linear response along a run ``(K, M, F)``, by the trapezoidal rule."""
         paths, lane = self.paths, self.lane
-        samples = len(states)
+        times = paths.dt * np.arange(len(states))
         values = {
             **self._given(own[None]),
             **dict(zip(lane.rates, states.transpose(1, 0, 2), strict=True)),
-            "t": self._times, **self._ahead(self._samples),
+            "t": times[:, None], **self._ahead(np.round(times / paths.half).astype(int)),
         }  # fmt: skip
-        which, function = self._slopes
-        size = max((max(place) for place in which), default=lane.order - 1) + 1
-        size = max(size, lane.order)
-        matrix = np.zeros((samples, len(paths.agent), size, size))
+        which, function = _slopes(lane)
+        size = max([lane.order, *(max(place) + 1 for place in which)])
+        matrix = np.zeros((len(states), len(paths.agent), size, size))
         with np.errstate(all="ignore"):
             for (p, q), value in zip(which, function(values), strict=True):
                 matrix[..., p, q] = np.broadcast_to(value, matrix.shape[:2])
         # a linearisation that blows up describes no disturbance
-        matrix = np.clip(np.nan_to_num(matrix.transpose(1, 0, 2, 3)), -1 / paths.dt, 1 / paths.dt)
-        half, one = paths.dt / 2, np.eye(size)
-        after = np.linalg.inv(one - half * matrix[:, 1:])
-        push = np.zeros(size)
-        push[lane.order - 1] = half
-        return np.ascontiguousarray(after @ (one + half * matrix[:, :-1])), np.ascontiguousarray(
-            after @ push
-        )
+        matrix = np.clip(np.nan_to_num(matrix), -1 / paths.dt, 1 / paths.dt)
+        step, after = (one.numpy().swapaxes(0, 1) for one in trapezoidal(matrix, paths.dt))
+        forced = paths.dt / 2 * after[..., lane.order - 1]
+        return np.ascontiguousarray(step), np.ascontiguousarray(forced)
 
     def drawn(self, found: Estimate, draw: Draw) -> Paths:
         """Paths that the estimated model would have had.

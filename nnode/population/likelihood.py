@@ -18,7 +18,7 @@ Source:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -122,21 +122,18 @@ class Products:
 class Noise(Protocol):
     """What differs from sample to sample."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of its parameters, all of them positive."""
-        ...
-
     def products(self, data: Linearised, values: np.ndarray) -> Products:
-        """Products of the columns, whitened."""
+        """Products of the columns, whitened.
+
+        Args:
+            values: of its parameters, all of them positive.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class WhiteNoise:
-    """Independent errors of standard deviation ``sigma``."""
-
-    names: tuple[str, ...] = ("sigma",)
+    """Independent errors; the parameter is their standard deviation."""
 
     def products(self, data: Linearised, values: np.ndarray) -> Products:
         columns = data.columns / values[0]
@@ -146,14 +143,15 @@ class WhiteNoise:
 
 @dataclass(frozen=True)
 class PushNoise:
-    """Pushes ``sigma``, ``tau`` (s) on the highest rate, and errors of measurement.
+    """Pushes on the highest rate, and errors of measurement.
+
+    The parameters are the standard deviation of the pushes and the time that they last, s.
 
     Attributes:
         error: standard deviation of the errors of measurement, m.
     """
 
     error: float
-    names: tuple[str, ...] = field(default=("sigma", "tau"))
 
     def products(self, data: Linearised, values: np.ndarray) -> Products:
         assert data.step is not None
@@ -252,6 +250,7 @@ class Marginal:
         information: ``(P, P)`` X' V^-1 X.
         agents: ``(D, 1 + P, 1 + P)`` products of w and X by V^-1, of the agents.
         deviations: ``(D, Q)`` expected deviations b of the agents; variances: their variances.
+        shrinkage: ``(D, Q)`` share of the variance between agents that the data leave.
         start: ``(S, H)`` expected deviations of the starts.
     """
 
@@ -262,21 +261,13 @@ class Marginal:
     agents: np.ndarray
     deviations: np.ndarray
     variances: np.ndarray
+    shrinkage: np.ndarray
     start: np.ndarray
-
-    @property
-    def shrinkage(self) -> np.ndarray:
-        """``(D, Q)`` share of the variance of the agents' deviations that the data leave; NaN where
-        agents do not differ."""
-        with np.errstate(all="ignore"):
-            return self.variances / self._spread**2
-
-    _spread: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def marginal(
     data: Linearised, segments: Products, spread: np.ndarray, start: np.ndarray, *,
-    restricted: bool = False, change: np.ndarray | None = None,
+    restricted: bool = False,
 ) -> Marginal:  # fmt: skip
     """The marginal likelihood, and what follows from it.
 
@@ -285,7 +276,6 @@ def marginal(
         spread: ``(Q,)`` standard deviations of the agents' deviations.
         start: ``(H,)`` of the starts' deviations.
         restricted: whether the parameters' loss of degrees of freedom counts (REML).
-        change: ``(P,)`` of the parameters; None: the best one.
     """
     number = int(data.agent.max()) + 1
     without_start = segments.without(start)
@@ -293,8 +283,7 @@ def marginal(
     rest = agents.without(spread)
     total = rest.gram.sum(0)
     information, score = total[1:, 1:], total[1:, 0]
-    if change is None:
-        change = flat_solve(information, score)
+    change = flat_solve(information, score)
     weights = np.concatenate([[1.0], -change])
     square = np.einsum("i,dij,j->d", weights, rest.gram, weights)
     seen = np.bincount(data.agent, data.seen.sum(1), number)
@@ -307,14 +296,13 @@ def marginal(
     h, _ = segments.factors(start, every)
     return Marginal(
         loglik=loglik, each=each, change=change, information=information, agents=rest.gram,
-        deviations=b, variances=left, start=h, _spread=spread,
+        deviations=b, variances=left, shrinkage=left / spread**2, start=h,
     )  # fmt: skip
 
 
 def flat_solve(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """The solution of a symmetric system, 0 in directions that nothing depends on."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    inverse = np.where(values > FLAT * values.max(initial=0.0), 1 / np.maximum(values, 1e-300), 0.0)
-    found: np.ndarray = (vectors * inverse) @ (vectors.T @ (vector / scale)) / scale
+    inverse = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=FLAT, hermitian=True)
+    found: np.ndarray = inverse @ (vector / scale) / scale
     return found

@@ -55,10 +55,8 @@ class DenseSolver:
     """
 
     def __init__(self, matrix: np.ndarray, width: int, dt: float) -> None:
-        half, one = dt / 2 * torch.from_numpy(matrix), torch.eye(matrix.shape[-1]).double()
         self._width, self._half = width, dt / 2
-        self._after = _inverse(one - half[1:])
-        self._step = self._after @ (one + half[:-1])
+        self._step, self._after = trapezoidal(matrix, dt)
 
     def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
         k, w, n, c, b = source.shape
@@ -181,6 +179,21 @@ class FrontToBackSolver:
         if self._chained:
             np.subtract(d[0, i], right[0, i], out=d[-1, i])
             d[-1, i] /= self._half
+
+
+def trapezoidal(matrix: np.ndarray, dt: float) -> tuple[Tensor, Tensor]:
+    """The trapezoidal rule for d' = A d + s.
+
+    Args:
+        matrix: A, ``(K, ..., M, M)``. dt: sampling interval, s.
+
+    Returns:
+        Two tensors ``(K - 1, ..., M, M)``: the states after an interval by those before, and by
+        ``dt / 2`` times the sum of s at both ends.
+    """
+    half, one = dt / 2 * torch.from_numpy(matrix), torch.eye(matrix.shape[-1]).double()
+    after = _inverse(one - half[1:])
+    return after @ (one + half[:-1]), after
 
 
 def _inverse(matrix: Tensor) -> Tensor:

@@ -104,13 +104,18 @@ def test_orange_trees_that_grow_to_sizes_of_their_own_are_nlme_s() -> None:
     np.testing.assert_allclose(found.marginal.deviations[:, 0], wanted, atol=4e-4)
 
 
-def test_a_linear_mixed_model_by_restricted_likelihood_is_nlme_s() -> None:
+def growth() -> tuple[list[str], Curves]:
+    """Children of the data set Orthodont, who grow along lines of their own."""
     names, data = table("orthodont", "Subject")
 
     def line(own: np.ndarray) -> np.ndarray:
         return np.asarray(own[0] + own[1] * data["age"])
 
-    model = Curves(line, data["distance"], [0, 1])
+    return names, Curves(line, data["distance"], [0, 1])
+
+
+def test_a_linear_mixed_model_by_restricted_likelihood_is_nlme_s() -> None:
+    names, model = growth()
     found = estimate(
         model, WhiteNoise(), np.array([10.0, 1.0]), spreads(1.0, 1.0, 1.0), restricted=True,
         tolerance=1e-6,
@@ -127,12 +132,7 @@ def test_a_linear_mixed_model_by_restricted_likelihood_is_nlme_s() -> None:
 
 
 def test_a_linear_mixed_model_by_maximum_likelihood_is_nlme_s() -> None:
-    _, data = table("orthodont", "Subject")
-
-    def line(own: np.ndarray) -> np.ndarray:
-        return np.asarray(own[0] + own[1] * data["age"])
-
-    model = Curves(line, data["distance"], [0, 1])
+    _, model = growth()
     found = estimate(
         model, WhiteNoise(), np.array([10.0, 1.0]), spreads(1.0, 1.0, 1.0), tolerance=1e-6
     )
