@@ -27,11 +27,12 @@ from nnode.discover.judge.verdict import (
     places,
     structure,
 )
+from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves, weighed
-from nnode.discover.name.search import Search, begun, search, settled, without_steps
+from nnode.discover.name.search import Search, begun, search, settled, wider, without_steps
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.residuals.engine import Engine, of_residuals, square_of
-from nnode.discover.residuals.fit import Fit
+from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.residuals.variables import Curves, Variable
 from nnode.discover.result import (
     Clusters,
@@ -156,11 +157,13 @@ def _diagnosed(
     enough = numbers.open >= numbers.least
     stages.begin("comparing on sealed sequences")
     sealed = Sealed(
-        domain, base_system, [sequences[i] for i in division.open],
+        engine, base_system, [sequences[i] for i in division.open],
         [sequences[i] for i in division.sealed], division.label[division.sealed],
         numbers.sealed, options.seed,
     )  # fmt: skip
     kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
+    if isinstance(engine, FollowersEngine):
+        kinds = []  # that drivers differ is known to the engine
     beside = [individuals(engine, found.fit, kind) for kind in kinds]
     found, leads = sealed.confirmed(engine, found)
     last = (
@@ -275,18 +278,21 @@ def _looked_for(
     Args:
         together: what is simultaneous is one cluster.
     """
-    domain = str(system.domain)
     stages.begin("calibrating")
     division = divide(sequences, options, together=together)
     chosen = [sequences[i] for i in division.open]
-    engine = engine_of(domain, chosen, division.label[division.open])
+    engine = engine_of(system, chosen, division.label[division.open])
     start = begun(engine, copy.deepcopy(system).double())
     if start is None:
         raise SimulationError(
             "the model cannot be simulated on these data: it blows up from its own parameters and "
             "from those near the measured rates; start from others, or look at the data"
         )
-    base = settled(engine, start.system)
+    if isinstance(engine, FollowersEngine):
+        engine.settle_among([*wider(engine, start, effects), start.system])
+        base = refine(engine, start.system)
+    else:
+        base = settled(engine, start.system)
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     stages.begin("locating")

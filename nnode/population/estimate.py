@@ -101,6 +101,7 @@ def estimate(
     response: Response, noise: Noise, theta: np.ndarray, variances: Variances, *,
     low: np.ndarray | None = None, high: np.ndarray | None = None, restricted: bool = False,
     longest: float = np.inf, steps: int = 40, tolerance: float = 1e-3,
+    agents: np.ndarray | None = None, start: np.ndarray | None = None,
 ) -> Estimate:  # fmt: skip
     """Estimate a model of agents who differ.
 
@@ -116,14 +117,16 @@ def estimate(
         tolerance: the search ends when a step moves no parameter by more than this share of its
             standard error, no standard deviation by more than this share of itself, and no agent's
             deviation by more than this share of their standard deviation.
+        agents, start: ``(D, Q)``, ``(S, H)`` deviations that the search starts from; by default 0.
     """
     theta = np.array(theta, dtype=float)
     low = np.full(len(theta), -np.inf) if low is None else low
     high = np.full(len(theta), np.inf) if high is None else high
-    data, converged, taken = response(theta, np.zeros((0, 0)), np.zeros((0, 0))), False, 1
-    number = int(data.agent.max()) + 1
-    agents = np.zeros((number, data.random.shape[-1]))
-    start = np.zeros(data.start.shape[::2])
+    none = np.zeros((0, 0))
+    data = response(theta, none if agents is None else agents, none if start is None else start)
+    converged, taken, number = False, 1, int(data.agent.max()) + 1
+    agents = np.zeros((number, data.random.shape[-1])) if agents is None else agents
+    start = np.zeros(data.start.shape[::2]) if start is None else start
     most, last = 1.0, np.zeros(len(theta))
     for _ in range(steps):
         before = variances

@@ -38,6 +38,9 @@ from nnode.simulation.rhs import formula_of
 FLOOR = 0.01
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
+#: What is added to the highest rate ``(R, F)``, of the number among the times of the paths ahead,
+#: and of states and rates ``(M, R, F)``.
+Push = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 #: Standard normal numbers of a shape.
 Draw = Callable[[tuple[int, ...]], np.ndarray]
 #: How closely modes are found where the parameters are given, see :func:`estimate`.
@@ -60,6 +63,7 @@ class Paths:
         dt: sampling interval, s. half: that of ``ahead``, s.
         ahead: ``(H, 4, F)`` smoothed positions (m) and speeds (m/s) of the first and the second
             vehicle ahead. The second is a safe distance ahead of the first where there is none.
+        ahead_at_samples: ``(K, 4, F)`` the same at the sampling times.
         second: ``(F,)`` 1 where there is a second vehicle ahead.
         start: ``(2, F)`` smoothed position and speed at the first sample.
         error: standard deviation of the errors of measurement, m.
@@ -76,6 +80,7 @@ class Paths:
     dt: float
     half: float
     ahead: np.ndarray
+    ahead_at_samples: np.ndarray
     second: np.ndarray
     start: np.ndarray
     error: float
@@ -91,7 +96,7 @@ class Paths:
         """
         measured = x + self.error * draw(x.shape)
         smoothed = [smooth(true + self.error * draw(true.shape)) for true in self.smoothed]
-        ahead = _ahead(smoothed, self.sequence, self.place, len(self.ahead), self.half, self.dt)
+        which = smoothed, self.sequence, self.place, self.dt
         start = np.stack(
             [
                 _start(smooth(path[seen]), self.dt)
@@ -99,7 +104,11 @@ class Paths:
             ],
             1,
         )
-        return replace(self, x=measured, smoothed=smoothed, ahead=ahead, start=start)
+        return replace(
+            self, x=measured, smoothed=smoothed, start=start,
+            ahead=_ahead(*which, len(self.ahead), self.half),
+            ahead_at_samples=_ahead(*which, x.shape[1], self.dt),
+        )  # fmt: skip
 
 
 def paths_of(sequences: list[Sequence], step: float) -> Paths:
@@ -131,7 +140,8 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
     return Paths(
         x=x, seen=seen, sequence=sequence, place=place, agent=np.array(agent),
         names=tuple(names), smoothed=smoothed, dt=dt, half=half,
-        ahead=_ahead(smoothed, sequence, place, times, half, dt), start=start,
+        ahead=_ahead(smoothed, sequence, place, dt, times, half),
+        ahead_at_samples=_ahead(smoothed, sequence, place, dt, samples, dt), start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
         batch=collate(_with_those_ahead(sequences[b], i) for b, i in which),
@@ -151,14 +161,15 @@ def _start(path: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _ahead(
-    smoothed: list[np.ndarray], sequence: np.ndarray, place: np.ndarray, times: int, half: float,
-    dt: float,
+    smoothed: list[np.ndarray], sequence: np.ndarray, place: np.ndarray, dt: float, times: int,
+    apart: float,
 ) -> np.ndarray:  # fmt: skip
-    """``(H, 4, F)`` as in :class:`Paths`; after the last sample vehicles stay where they were."""
+    """``(H, 4, F)`` as in :class:`Paths`, at so many times so far apart (s); after the last sample
+    vehicles stay where they were."""
     found = np.empty((times, 4, len(sequence)))
     for b, paths in enumerate(smoothed):
         time = dt * np.arange(len(paths))
-        at = np.minimum(half * np.arange(times), time[-1])
+        at = np.minimum(apart * np.arange(times), time[-1])
         spline = CubicSpline(time, paths)
         x, v = spline(at), spline(at, 1)
         for f in np.flatnonzero(sequence == b):
@@ -169,6 +180,12 @@ def _ahead(
                 [x[:, first], v[:, first], x[:, second] + far, v[:, second]], 1
             )
     return found
+
+
+def _named(ahead: np.ndarray) -> dict[str, np.ndarray]:
+    """What formulas call the vehicles ahead ``(..., 4, F)``."""
+    x1, v1, x2, v2 = np.moveaxis(ahead, -2, 0)
+    return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
 @cache
@@ -255,13 +272,13 @@ class Followers:
         return np.where(self.logs, np.exp(np.where(self.logs, theta, 0.0)), theta)
 
     def simulate(
-        self, theta: np.ndarray, start: np.ndarray, pushes: np.ndarray | None = None
+        self, theta: np.ndarray, start: np.ndarray, pushed: Push | None = None
     ) -> np.ndarray:
         """``(K, M, R, F)`` states of R runs.
 
         Args:
             theta: ``(R, P, F)`` parameters. start: ``(R, 2, F)`` positions and speeds at the start.
-            pushes: ``(H, F)`` on the highest rate, by the times of the paths ahead.
+            pushed: what is added to the highest rate.
         """
         paths, order = self.paths, self.lane.order
         given = self._given(theta)
@@ -269,15 +286,15 @@ class Followers:
         def rate(t: float, y: np.ndarray) -> np.ndarray:
             at = round(t / paths.half)
             values = {**given, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
-            rates = self._rates({**values, **self._ahead(at)})
+            rates = self._rates({**values, **_named(paths.ahead[at])})
             found = np.stack([np.broadcast_to(one, y.shape[1:]) for one in rates])
-            if pushes is not None:
-                found[order - 1] += pushes[at]
+            if pushed is not None:
+                found[order - 1] += pushed(at, y, found)
             return found
 
         motion = list(start.transpose(1, 0, 2)[:order])
         if self._starts is not None:
-            at = {**given, "x": start[:, 0], "v": start[:, 1], "t": 0.0, **self._ahead(0)}
+            at = {**given, "x": start[:, 0], "v": start[:, 1], "t": 0.0, **_named(paths.ahead[0])}
             motion += [np.broadcast_to(one, motion[0].shape) for one in self._starts(at)]
         with np.errstate(all="ignore"):
             return simulated(
@@ -289,12 +306,7 @@ class Followers:
         natural = self.natural(theta.transpose(0, 2, 1)).transpose(2, 0, 1)
         return {**self._fixed, **dict(zip(self._symbols, natural, strict=True))}
 
-    def _ahead(self, at: Any) -> dict[str, Any]:
-        """The vehicles ahead at one or several of the times of their paths."""
-        x1, v1, x2, v2 = np.moveaxis(self.paths.ahead[at], -2, 0)
-        return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
-
-    def _spread(self, theta: np.ndarray, agents: np.ndarray) -> np.ndarray:
+    def spread(self, theta: np.ndarray, agents: np.ndarray) -> np.ndarray:
         """``(P, F)`` parameters of each follower."""
         found = np.repeat(theta[:, None], len(self.paths.agent), 1)
         if agents.size:
@@ -303,7 +315,7 @@ class Followers:
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
         paths, order = self.paths, self.lane.order
-        own, begin = self._spread(theta, agents), paths.start.copy()
+        own, begin = self.spread(theta, agents), paths.start.copy()
         begin[:order] += start.T if start.size else 0.0
         number = len(theta)
         runs = np.repeat(own[None], 1 + 2 * (number + order), 0)
@@ -326,32 +338,55 @@ class Followers:
             residual = residual + np.einsum("fkq,fq->fk", random, agents[paths.agent])
         if start.size:
             residual = residual + np.einsum("fkh,fh->fk", first, start)
-        moved, forced = self._linear(own, states[:, :, 0])
+        moved, after = self.linear(own, states[:, :, 0])
+        forced = np.ascontiguousarray(after[..., order - 1])
         return Linearised(
             residual=residual, fixed=fixed, random=random, start=first, seen=paths.seen,
             agent=paths.agent, step=moved, forced=forced, dt=paths.dt,
         )  # fmt: skip
 
-    def _linear(self, own: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The linear response along a run ``(K, M, F)``, by the trapezoidal rule."""
-        paths, lane = self.paths, self.lane
-        times = paths.dt * np.arange(len(states))
-        values = {
+    def rates(self, own: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """``(M, K, F)`` rates along a run.
+
+        Args:
+            own: ``(P, F)`` parameters of each follower. states: ``(K, M, F)`` of the run.
+        """
+        with np.errstate(all="ignore"):
+            found = self._rates(self._along(own, states))
+        return np.stack([np.broadcast_to(one, states[:, 0].shape) for one in found])
+
+    def _along(self, own: np.ndarray, states: np.ndarray) -> dict[str, Any]:
+        """What formulas name along a run."""
+        times = self.paths.dt * np.arange(len(states))
+        return {
             **self._given(own[None]),
-            **dict(zip(lane.rates, states.transpose(1, 0, 2), strict=True)),
-            "t": times[:, None], **self._ahead(np.round(times / paths.half).astype(int)),
-        }  # fmt: skip
+            **dict(zip(self.lane.rates, states.transpose(1, 0, 2), strict=True)),
+            "t": times[:, None],
+            **_named(self.paths.ahead_at_samples),
+        }
+
+    def linear(self, own: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The linear response along a run by the trapezoidal rule, of the M states of motion and
+        of a few that terms remember.
+
+        Args:
+            own, states: as of :meth:`rates`.
+
+        Returns:
+            Two arrays ``(F, K - 1, M, M)``: the states after a sampling interval by those before,
+            and by the sum of the changes of their rates at both ends.
+        """
+        paths, lane = self.paths, self.lane
         which, function = _slopes(lane)
         size = max([lane.order, *(max(place) + 1 for place in which)])
         matrix = np.zeros((len(states), len(paths.agent), size, size))
         with np.errstate(all="ignore"):
-            for (p, q), value in zip(which, function(values), strict=True):
+            for (p, q), value in zip(which, function(self._along(own, states)), strict=True):
                 matrix[..., p, q] = np.broadcast_to(value, matrix.shape[:2])
         # a linearisation that blows up describes no disturbance
         matrix = np.clip(np.nan_to_num(matrix), -1 / paths.dt, 1 / paths.dt)
         step, after = (one.numpy().swapaxes(0, 1) for one in trapezoidal(matrix, paths.dt))
-        forced = paths.dt / 2 * after[..., lane.order - 1]
-        return np.ascontiguousarray(step), np.ascontiguousarray(forced)
+        return np.ascontiguousarray(step), np.ascontiguousarray(paths.dt / 2 * after)
 
     def drawn(self, found: Estimate, draw: Draw) -> Paths:
         """Paths that the estimated model would have had.
@@ -370,8 +405,8 @@ class Followers:
             pushes[k] = keep * pushes[k - 1] + math.sqrt(1 - keep**2) * fresh[k]
         begin = paths.start.copy()
         begin[: self.lane.order] += found.start.T
-        own = self._spread(found.theta, agents)
-        x = self.simulate(own[None], begin[None], pushes)[:, 0, 0].T
+        own = self.spread(found.theta, agents)
+        x = self.simulate(own[None], begin[None], lambda at, *_: pushes[at])[:, 0, 0].T
         return paths.remeasured(x, draw)
 
 

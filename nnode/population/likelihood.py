@@ -128,21 +128,33 @@ class Noise(Protocol):
         Args:
             values: of its parameters, all of them positive.
         """
+        white, logdet = self.whitened(data, data.columns, values)
+        return Products(white.transpose(0, 2, 1) @ white, logdet)
+
+    def whitened(
+        self, data: Linearised, columns: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``(S, K, C)`` columns of independent samples of variance 1, and ``(S,)`` logarithms of
+        the covariances' determinants.
+
+        Args:
+            columns: ``(S, K, C)`` of the samples. values: see :meth:`products`.
+        """
         ...
 
 
 @dataclass(frozen=True)
-class WhiteNoise:
+class WhiteNoise(Noise):
     """Independent errors; the parameter is their standard deviation."""
 
-    def products(self, data: Linearised, values: np.ndarray) -> Products:
-        columns = data.columns / values[0]
-        logdet = 2 * np.log(values[0]) * data.seen.sum(1)
-        return Products(columns.transpose(0, 2, 1) @ columns, logdet)
+    def whitened(
+        self, data: Linearised, columns: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return columns / values[0], 2 * np.log(values[0]) * data.seen.sum(1)
 
 
 @dataclass(frozen=True)
-class PushNoise:
+class PushNoise(Noise):
     """Pushes on the highest rate, and errors of measurement.
 
     The parameters are the standard deviation of the pushes and the time that they last, s.
@@ -153,14 +165,16 @@ class PushNoise:
 
     error: float
 
-    def products(self, data: Linearised, values: np.ndarray) -> Products:
+    def whitened(
+        self, data: Linearised, columns: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         assert data.step is not None
         assert data.forced is not None
-        gram, logdet = _filtered(
-            np.ascontiguousarray(data.columns), data.seen, data.step, data.forced,
+        found: tuple[np.ndarray, np.ndarray] = _filtered(
+            np.ascontiguousarray(columns), data.seen, data.step, data.forced,
             values[0], np.exp(-data.dt / values[1]), self.error**2,
         )  # fmt: skip
-        return Products(gram, logdet)
+        return found
 
 
 @njit(cache=True, nogil=True)
@@ -168,20 +182,19 @@ def _filtered(
     columns: np.ndarray, seen: np.ndarray, step: np.ndarray, forced: np.ndarray,
     sigma: float, keep: float, variance: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Products of columns that a Kalman filter has whitened, and logarithms of determinants.
+    """Columns that a Kalman filter has whitened, and logarithms of determinants.
 
     The state is (d, e); the first element of d is measured.
     """
     number, samples, width = columns.shape
     m = step.shape[-1]
-    gram = np.zeros((number, width, width))
+    white = np.zeros((number, samples, width))
     logdet = np.zeros(number)
-    white = np.empty((samples, width))
     mean, spread = np.empty((m + 1, width)), np.empty((m + 1, m + 1))
     forward, noise = np.zeros((m + 1, m + 1)), np.empty(m + 1)
     forward[m, m], noise[m] = keep, 1.0
     for s in range(number):
-        mean[:], spread[:], white[:] = 0.0, 0.0, 0.0
+        mean[:], spread[:] = 0.0, 0.0
         spread[m, m] = sigma**2
         for k in range(samples):
             if k:
@@ -190,9 +203,8 @@ def _filtered(
                 forward[:m, m] = noise[:m] * (1 + keep)
                 _predict(mean, spread, forward, noise, sigma**2 * (1 - keep**2))
             if seen[s, k]:
-                logdet[s] += _condition(mean, spread, columns[s, k], variance, white[k])
-        gram[s] = white.T @ white
-    return gram, logdet
+                logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k])
+    return white, logdet
 
 
 @njit(cache=True, nogil=True)
@@ -237,6 +249,54 @@ def _condition(
         for j in range(n):
             spread[i, j] -= gain[i] * gain[j] * total
     return float(np.log(total))
+
+
+class Whitening:
+    """Turns columns of samples into such of independent ones: the symmetric root of the inverse of
+    the covariance by deviations of agents and of starts, after that of :class:`Noise`.
+
+    Products of columns that it has turned are those by the inverse of the whole covariance.
+
+    Args:
+        data: linearised samples. noise: what differs from sample to sample.
+        values: of the noise's parameters.
+        spread: ``(Q,)`` standard deviations of the agents' deviations.
+        start: ``(H,)`` of the starts' deviations.
+    """
+
+    def __init__(
+        self, data: Linearised, noise: Noise, values: np.ndarray, spread: np.ndarray,
+        start: np.ndarray,
+    ) -> None:  # fmt: skip
+        self._data, self._noise, self._values = data, noise, values
+        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        segment = np.arange(len(data.agent))
+        for column, deviation, group in (
+            (data.start, start, segment),
+            (data.random, spread, data.agent),
+        ):
+            if column.shape[-1]:
+                self._add(self(column) * deviation, group)
+
+    def __call__(self, columns: np.ndarray) -> np.ndarray:
+        """``(S, K, C)`` of columns ``(S, K, C)``; 0 where there is no sample."""
+        seen = self._data.seen[..., None]
+        white, _ = self._noise.whitened(self._data, np.where(seen, columns, 0.0), self._values)
+        for column, inner, group in self._parts:
+            products = np.zeros((len(inner), column.shape[-1], columns.shape[-1]))
+            np.add.at(products, group, column.transpose(0, 2, 1) @ white)
+            white = white - column @ (inner @ products)[group]
+        return white
+
+    def _add(self, column: np.ndarray, group: np.ndarray) -> None:
+        """Deviations that columns ``(S, K, Q)`` of variance 1 make in groups of segments."""
+        gram = np.zeros((int(group.max()) + 1, *[column.shape[-1]] * 2))
+        np.add.at(gram, group, column.transpose(0, 2, 1) @ column)
+        size, way = np.linalg.eigh(gram)
+        # (1 + B B')^(-1/2) = 1 - B M B', M of the eigenvalues s of B'B: (1 - (1 + s)^(-1/2)) / s
+        root = np.sqrt(1 + np.maximum(size, 0.0))
+        share = 1 / (root * (1 + root))
+        self._parts.append((column, (way * share[:, None]) @ way.transpose(0, 2, 1), group))
 
 
 @dataclass(frozen=True, kw_only=True)

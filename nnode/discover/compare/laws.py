@@ -21,7 +21,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import divide
-from nnode.discover.judge.confirm import engine_of
+from nnode.discover.judge.confirm import engine_of, windows_of
 from nnode.discover.name.search import Search, Step, begun
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
@@ -56,17 +56,17 @@ def compare_laws(
     """
     division = divide(sequences, options)
     chosen, label = [sequences[i] for i in division.open], division.label[division.open]
-    domain = cast(Domain, next(iter(candidates.values())).domain)
-    whole = engine_of(domain, chosen, label, whole=True)
+    one = next(iter(candidates.values()))
+    whole = engine_of(one, chosen, label, whole=True)
     found, refused = _calibrated(whole, candidates)
     if not found:
         return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
     errors = {name: heldout(fit, whole.cluster) / number for name, fit in found.items()}
-    if domain == "crowd":  # whose residuals are no positions
+    if one.domain == "crowd":  # whose residuals are no positions
         errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in found.items()}
     first = min(errors, key=lambda name: float(errors[name].mean()))
-    engine = engine_of(domain, chosen, label)
+    engine = windows_of(one, chosen, label)
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
         engine.settle(found[first].system, ParameterVector(found[first].system).row)
@@ -134,7 +134,7 @@ def imitated(
     Returns:
         The effects, and the one-sided p-value of that comparison.
     """
-    common = engine_of(str(nearer.system.domain), engine.sequences, label)
+    common = windows_of(nearer.system, engine.sequences, label)
     common.settle(nearer.system, ParameterVector(nearer.system).row)
     costs = [
         heldout(refine(common, copy.deepcopy(system)), common.cluster)

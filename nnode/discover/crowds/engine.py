@@ -21,6 +21,7 @@ from nnode.discover.crowds.windows import Windows
 from nnode.discover.found import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
+from nnode.discover.rules import rules
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
@@ -63,7 +64,7 @@ class CrowdEngine:
         window: float = 1.5,
         clusters: np.ndarray | None = None,
     ) -> None:
-        self.sequences = list(sequences)
+        self.sequences, self.least = list(sequences), rules().least
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         which, who = self.windows.person.T

@@ -14,8 +14,6 @@ Sources: Rao 1948 (scores); Marcus, Peritz & Gabriel 1976 (closed tests).
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
@@ -24,25 +22,44 @@ from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
 from nnode.model.system import System
+from nnode.simulation.rhs import formula_of
 
 
 def engine_of(
-    domain: str,
+    system: System,
     sequences: list[Sequence],
     clusters: np.ndarray | None = None,
+    *,
     whole: bool = False,
+    like: Engine | None = None,
 ) -> Engine:
-    """The engine of a domain; ``whole`` compares whole sequences, all errors alike, as most
-    calibrations do; people are compared as always."""
-    if domain == "crowd":
-        return CrowdEngine(sequences, clusters=clusters)
-    if whole:
+    """The engine for a model and its extensions.
+
+    Args:
+        whole: compares whole sequences, all errors alike, as most calibrations do; people are
+            compared as always.
+        like: whose variances hold, where drivers differ.
+    """
+    if whole and system.domain == "traffic":
         return TrafficEngine(sequences, np.inf, clusters, np.inf)
+    if system.domain == "crowd" or formula_of(system) is None:
+        return windows_of(system, sequences, clusters)
+    of = like if isinstance(like, FollowersEngine) else None
+    return FollowersEngine(sequences, clusters, like=of)
+
+
+def windows_of(
+    system: System, sequences: list[Sequence], clusters: np.ndarray | None = None
+) -> Engine:
+    """The engine for models that have nothing in common but their domain, and for code."""
+    if system.domain == "crowd":
+        return CrowdEngine(sequences, clusters=clusters)
     return TrafficEngine(sequences, clusters=clusters)
 
 
@@ -52,38 +69,40 @@ class Comparing:
     Args:
         base: the model around which residuals are whitened and weighted.
         label: ``(S,)`` clusters of the sequences.
+        like: see :func:`engine_of`.
     """
 
     def __init__(
-        self, domain: str, sequences: list[Sequence], base: System, label: np.ndarray
+        self, sequences: list[Sequence], base: System, label: np.ndarray, like: Engine | None = None
     ) -> None:
-        self._domain, self._sequences, self._base, self._label = domain, sequences, base, label
-        self._whole = engine_of(domain, sequences, label, whole=True)
-        self._whole.settle(base, ParameterVector(base).row)
+        self._windows = engine_of(base, sequences, label, like=like)
+        self._windows.settle(base, ParameterVector(base).row)
+        #: whose errors are shown
+        self._shown = self._windows
+        if not isinstance(self._windows, FollowersEngine | CrowdEngine):
+            self._shown = engine_of(base, sequences, label, whole=True)
+
+    @property
+    def drivers(self) -> bool:
+        """Whether drivers differ in the residuals: then errors of positions are mostly those of
+        pushes that last, and tell little."""
+        return isinstance(self._windows, FollowersEngine)
 
     @property
     def floor(self) -> float:
         """Mean square error of positions that is noise of the measurement, m²."""
-        return self._whole.noise_floor()
-
-    @cached_property
-    def _windows(self) -> Engine:
-        if self._domain == "crowd":
-            return self._whole
-        found = engine_of(self._domain, self._sequences, self._label)
-        found.settle(self._base, ParameterVector(self._base).row)
-        return found
+        return self._windows.noise_floor()
 
     def squares(self, system: System) -> np.ndarray:
         """``(S,)`` mean square errors of positions, m²; NaN where nothing is compared."""
-        found = self._whole.squares(system, ParameterVector(system).row).means()
+        found = self._shown.squares(system, ParameterVector(system).row).means()
         # the last ones may be too short to be compared
-        missing = len(self._sequences) - len(found)
+        missing = len(self._shown.names) - len(found)
         return np.pad(found, (0, missing), constant_values=np.nan)
 
     def simulated(self, system: System) -> list[Simulation | None]:
         """The simulations whose errors are :meth:`squares`."""
-        return self._whole.simulated(system, ParameterVector(system).row)
+        return self._shown.simulated(system, ParameterVector(system).row)
 
     def scores(self, system: System) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters: but for a constant twice the

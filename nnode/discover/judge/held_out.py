@@ -70,13 +70,13 @@ def later(
     if not used or not early:
         return None
     try:
-        engine = engine_of(domain, early)
+        engine = engine_of(system, early)
         engine.settle(system, ParameterVector(system).row)
         people, shared = (
             _carried(early, last, numbers(engine, system, one, common=common))
             for common in (False, True)
         )
-        comparing = Comparing(domain, last, system, label[used])
+        comparing = Comparing(last, system, label[used])
         each = {
             MODELS[0]: system,
             MODELS[1]: with_people(system, one, people),

@@ -116,7 +116,7 @@ class Sealed:
 
     def __init__(
         self,
-        domain: str,
+        engine: Engine,
         base: System,
         opened: list[Sequence],
         sealed: list[Sequence],
@@ -124,9 +124,10 @@ class Sealed:
         clusters: int,
         seed: int,
     ) -> None:
-        self.domain, self.base, self.opened, self.sealed = domain, base, opened, sealed
+        self.domain = str(base.domain)
+        self.base, self.opened, self.sealed = base, opened, sealed
         self.label, self.clusters, self.seed = label, clusters, seed
-        self.comparing = Comparing(domain, sealed, base, label)
+        self.comparing = Comparing(sealed, base, label, engine)
         self.before = self.comparing.squares(base)
         self.tried: dict[str, _Tried] = {}
         self._corrected: Fit | None = None
@@ -178,7 +179,8 @@ class Sealed:
         p_value = 1.0 if too_few(self.clusters) else better(self.comparing.leaning(before, after))
         likelier = bool(gains(scores(before), scores(after)).mean() > 0)
         first, last = (float(np.nanmean(squares(one))) for one in (before, after))
-        return _Tried(p_value, likelier, last < first or before is not self.base, first, last)
+        nearer = last < first or before is not self.base or self.comparing.drivers
+        return _Tried(p_value, likelier, nearer, first, last)
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
@@ -292,7 +294,7 @@ class Sealed:
         if self.domain == "crowd":
             return float("nan")
         try:
-            engine = engine_of(self.domain, self.opened, whole=True)
+            engine = engine_of(self.base, self.opened, whole=True)
             found = refine(engine, copy.deepcopy(system)).system
         except SimulationError:
             return float("nan")

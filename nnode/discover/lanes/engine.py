@@ -22,6 +22,7 @@ from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
+from nnode.discover.rules import rules
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of, extended, without
@@ -75,7 +76,7 @@ class TrafficEngine:
         clusters: np.ndarray | None = None,
         large: float = LARGE,
     ) -> None:
-        self.sequences, self.large = sequences, large
+        self.sequences, self.large, self.least = sequences, large, rules().least
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
         self.batch = collate(part[0] for each in parts for part in each)

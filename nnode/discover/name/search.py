@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves
 from nnode.discover.name.candidate import Candidate, calibrated
 from nnode.discover.residuals.comparison import Comparison
@@ -29,8 +30,8 @@ log = logging.getLogger(__name__)
 
 #: A mean square error of positions, m², below which nothing is left to be explained: 1 mm.
 EXACT = 1e-6
-#: At most so many effects are calibrated in a round.
-RIVALS = 5
+#: At most so many effects are calibrated in a round, and with variances of their own.
+RIVALS, LIKELY = 5, 3
 
 
 @dataclass
@@ -79,6 +80,18 @@ def begun(engine: Engine, system: System) -> Fit | None:
         except SimulationError:
             continue
     return min(fits, key=lambda fit: fit.cost, default=None)
+
+
+def wider(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> list[System]:
+    """The model with the effect that explains most of residuals as they are, calibrated; nothing
+    where that cannot be simulated."""
+    look = [trace for effect in effects for trace in traces(engine, fit, effect)]
+    for score in Screen(fit, engine.cluster).scores(look)[:1]:
+        try:
+            return [calibrated(engine, fit, score, 0.0).system]
+        except SimulationError:
+            break
+    return []
 
 
 def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:
@@ -202,10 +215,12 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         # a strong effect is far from linear: held-out clusters may be sure of what no score shows
         if not shown and len(candidates) == 1 and not _sure(candidates[0], screen, len(scores)):
             return None
+    if shown and isinstance(engine, FollowersEngine):
+        candidates = _in_best_variances(engine, candidates, found)
     candidates = _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
     good = [
         c for c in candidates
-        if c.removed >= rules().least
+        if c.removed >= engine.least
         and c.gain.gain > 0
         and c.there < rules().level
         and c.strength_excludes_neutral(screen.label(c.name))
@@ -220,6 +235,22 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         best.score = replace(best.score, p_value=best.there * len(scores))
     tests = [(other, _between(other, best, screen)) for other in candidates if other is not best]
     return Step(best, [(other, test) for other, test in tests if _rivals(best, other, test)])
+
+
+def _in_best_variances(
+    engine: FollowersEngine, candidates: list[Candidate], found: Search
+) -> list[Candidate]:
+    """Candidates in the variances of the likeliest of them: in those of the model without it, a
+    strong effect is taken for pushes that last."""
+    assert found.screen is not None
+    likely = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
+    engine.settle_among([one.fit.system for one in likely])
+    found.fit = refine(engine, found.fit.system)
+    again = []
+    for one in candidates:
+        fit = refine(engine, one.fit.system, tolerance=ROUGH)
+        again.append(_candidate(one.score, fit, found.fit, found.screen, one.removed))
+    return again
 
 
 def _rivals(best: Candidate, other: Candidate, test: Comparison) -> bool:

@@ -59,6 +59,8 @@ class Engine(Protocol):
         unit: ``(n,)`` number of the agents whose own numbers are estimated together.
         people: of each unit, per direction the sequence and the place of the agent it belongs
             to; one entry where all directions belong to one agent.
+        least: share of the squared errors below which nothing is worth a name; none where tests
+            themselves ask for more than the least size that is of interest.
     """
 
     batch: Batch
@@ -70,6 +72,7 @@ class Engine(Protocol):
     component: np.ndarray
     unit: np.ndarray
     people: list[list[tuple[int, int]]]
+    least: float
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` residuals of R runs of one model; NaN where a run blows up.

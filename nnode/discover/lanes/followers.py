@@ -1,0 +1,394 @@
+"""Traffic where drivers differ: every follower is simulated behind his own measured leader.
+
+At the estimates of :mod:`nnode.population`, the deviations b of drivers and h of starts, a model f
+leaves of the measured positions y the residuals
+
+    V^(-1/2) (y - f(theta, b, h) + Z b + H h),    V = V0 + Z Omega Z' + H S H',
+
+V0 of pushes that last and of errors of measurement. Their sum of squares is that of generalised
+least squares. V, Z, H, b and h stay as they were estimated until the next estimate: all models of a
+diagnosis are compared in the same residuals.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.calibrate.parameters import ParameterVector
+from nnode.data.sequence import Sequence
+from nnode.discover.found import Simulation
+from nnode.discover.lanes.engine import LARGE, STEP, TrafficEngine, drawn_in
+from nnode.discover.residuals.engine import Squares, of_residuals
+from nnode.discover.residuals.variables import Curve
+from nnode.model.effects import Effect, Probe
+from nnode.model.extend import extended
+from nnode.model.scene import Scene
+from nnode.model.system import System
+from nnode.model.term import State
+from nnode.population.drivers import LONGEST, TOLERANCE, Population, fit_drivers
+from nnode.population.estimate import estimate
+from nnode.population.followers import Followers, Paths, Push, paths_of
+from nnode.population.likelihood import Whitening
+from nnode.simulation.numpy import strides
+from nnode.simulation.rhs import side_by_side
+
+#: Change of a curve's scale by which derivatives are taken.
+SCALE = 1e-3
+
+
+@dataclass
+class _Run:
+    """A run of a model at the drivers' estimates.
+
+    Attributes:
+        system: the model, with the run's parameters. model: its followers.
+        own: ``(P, F)`` parameters of each follower.
+        states: ``(K, M, F)``.
+        step, after: the linear response, see :meth:`Followers.linear`.
+        weight: ``(n,)`` of the residuals: less than 1 for large ones.
+    """
+
+    system: System
+    model: Followers
+    own: np.ndarray
+    states: np.ndarray
+    step: np.ndarray
+    after: np.ndarray
+    weight: Tensor
+
+
+class FollowersEngine(TrafficEngine):
+    """Residuals of followers; see :class:`~nnode.discover.residuals.engine.Engine`.
+
+    Args:
+        sequences: at least one, of the same sampling interval.
+        clusters: ``(S,)`` of the sequences; None: each is one.
+        large: residuals beyond this count less.
+        like: an engine whose estimates hold here, whatever model is asked for; only deviations of
+            drivers and of starts are estimated.
+
+    Attributes:
+        population: what :meth:`settle` estimated last; None before.
+    """
+
+    def __init__(
+        self,
+        sequences: list[Sequence],
+        clusters: np.ndarray | None = None,
+        large: float = LARGE,
+        like: FollowersEngine | None = None,
+    ) -> None:
+        super().__init__(sequences, np.inf, clusters, large)
+        self.least = -np.inf
+        self._known, self._like = dict[tuple[int, int], Paths](), like
+        self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
+        self.population: Population | None = None
+        self._whitening: Whitening | None = None
+        self._last_run: tuple[System, Tensor, _Run] | None = None
+        paths = self._paths(STEP[2])
+        self._seen = torch.from_numpy(paths.seen)
+        f, k = np.nonzero(paths.seen)
+        self.sequence = paths.sequence[f]
+        self.cluster = of_residuals(clusters, self.sequence)
+        self.clock = np.array([s.time[0] for s in sequences])[self.sequence] + k * paths.dt
+        self.component = np.zeros(len(f), dtype=int)
+        self.unit = self.sequence
+
+    def residuals(self, system: System, rows: Tensor) -> Tensor:
+        """``(R, n)`` whitened residuals, the largest drawn in."""
+        away = self._away(system, rows)[0]
+        return drawn_in(self._whitened(away.transpose(2, 1, 0)), self.large)
+
+    def squares(self, system: System, row: Tensor) -> Squares:
+        """Squared errors of the followers' positions, with the deviations of drivers and starts
+        that are most likely under this model."""
+        return Squares(self._left(system, row)[self._seen.numpy()] ** 2, self.sequence)
+
+    def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
+        """The followers of each sequence, with these deviations."""
+        left, paths = self._left(system, row), self._paths(STEP[2])
+        found: list[Simulation | None] = []
+        for b, s in enumerate(self.sequences):
+            x = np.full_like(s.x[..., 0], np.nan)
+            for f in np.flatnonzero(paths.sequence == b):
+                x[:, paths.place[f]] = paths.x[f, : len(x)] - left[f, : len(x)]
+            found.append(Simulation(s, x[..., None], skip=1))
+        return found
+
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        """``(K, n)`` derivatives of the residuals, by differences."""
+        _, curve = _parts(system)
+        run = self._run_of(system, row)
+        theta = run.model.at(row.numpy()[: len(run.model.names)])
+        columns = run.model(theta, *self._deviations(run.model)).fixed
+        natural = run.model.natural(theta)
+        columns = columns / np.where(run.model.logs, natural, 1.0)
+        if curve is not None:
+            sides = torch.stack([row, row])
+            sides[0, -1] += SCALE
+            sides[1, -1] -= SCALE
+            higher, lower = self._simulated(system, sides)[1][:, 0].transpose(1, 2, 0)
+            scale = ((higher - lower) / (2 * SCALE))[..., None]
+            columns = np.concatenate([columns, scale], -1)
+        return self._moved(run, columns)
+
+    def screen_columns(
+        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(S, n)`` derivatives of the residuals with respect to a probe's strengths: by linear
+        response; of an effect with a memory, the change by it as a whole."""
+        run, changes = self._run_of(system, row), []
+        if effect.remembers():
+            values, amount = dict(probe.options), 1.0
+            for name, size in probe.steps.items():
+                values[name], amount = effect.strengths[name].neutral + size, size
+            changed, _ = extended(run.system, effect(**values))
+            return self._moved(run, self._finite(run, changed)[..., None] / amount)
+        base = run.model.rates(run.own, run.states)
+        for name, size in probe.steps.items() or [("", 1.0)]:
+            values = dict(probe.options)
+            if name:
+                values[name] = effect.strengths[name].neutral + size
+            changed, _ = extended(run.system, effect(**values))
+            model = self._model(changed, ParameterVector(changed).row)
+            own = model.spread(model.start, self._deviations(model)[0])
+            changes.append((model.rates(own, run.states) - base) / size)
+        return self._moved(run, self._propagated(run, np.stack(changes, 2)))
+
+    def response(
+        self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
+    ) -> Tensor:
+        """``(M, n)`` derivatives of the residuals with respect to factors of M further speeds.
+
+        Args:
+            rates: of a state M speeds ``(B, N, 1)``, m/s.
+        """
+        run = self._run_of(system, row)
+        paths, (k, _, f) = run.model.paths, run.states.shape
+        speed = run.model.rates(run.own, run.states)[0]
+        time = torch.arange(k, dtype=torch.float64).repeat_interleave(f) * paths.dt
+        scene = side_by_side(self._scene(run.model), k, at_samples=True)
+        state = _seen(run.model, time, run.states[:, 0], speed, paths.ahead_at_samples, scene)
+        found = [one[:, 0, 0].reshape(k, f).numpy() for one in rates(state)]
+        source = np.zeros((run.model.lane.order, k, len(found), f))
+        source[-1] = np.stack(found, 1)
+        return self._moved(run, self._propagated(run, source))
+
+    def settle(self, system: System, row: Tensor) -> None:
+        """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
+        if self._like is not None and self._like.population is not None:
+            there = self._like.population
+            system, values = there.model.system, there.model.natural(there.estimate.theta)
+            row = torch.from_numpy(values)
+        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+        paths, last = self._paths(self._longest(fixed, row[None])), self.population
+        before = last
+        if before is None and self._like is not None:
+            before = self._like.population
+        if before is None:
+            self.population = fit_drivers(fixed, paths)
+        else:
+            model = Followers(fixed, paths, before.random)
+            variances, low, high = before.estimate.variances, model.low, model.high
+            if self._like is not None:
+                variances = replace(variances, low=variances.row, high=variances.row)
+                low = high = model.start
+            found = estimate(
+                model, before.noise, model.start, variances, low=low, high=high, longest=LONGEST,
+                tolerance=TOLERANCE, agents=None if last is None else last.estimate.agents,
+                start=None if last is None else last.estimate.start,
+            )  # fmt: skip
+            self.population = Population(model=model, noise=before.noise, estimate=found)
+        found, own = self.population.estimate, self.population.estimate.variances
+        self._whitening = Whitening(
+            found.data, self.population.noise, own.noise, own.spread, own.start
+        )
+        self._last_run = None
+
+    def settle_among(self, systems: list[System]) -> None:
+        """Estimate with each of some models, and keep what the best of them says, by Schwarz's
+        criterion: what a missing effect does would be taken for pushes that last, and hidden."""
+        best, level = self, -np.inf
+        for system in systems:
+            one = copy.copy(best)
+            row = ParameterVector(system).row
+            one.settle(system, row)
+            assert one.population is not None
+            price = len(row) * np.log(max(len(one.population.estimate.agents), 2)) / 2
+            if (likelihood := one.population.marginal.loglik - price) > level:
+                best, level = one, likelihood
+        self.population, self._whitening = best.population, best._whitening
+        self._last_run = None
+
+    # -- parts -----------------------------------------------------------------------------------
+
+    def _paths(self, longest: float) -> Paths:
+        """The followers, for simulations of steps of at most so many s. Of a driver who belongs to
+        several clusters, nothing that they have in common is used: clusters are independent."""
+        key = strides(self.batch.dt, longest)
+        if key not in self._known:
+            paths = paths_of(self.sequences, longest)
+            both = np.stack([paths.agent, self._label[paths.sequence]])
+            own, agent = np.unique(both, axis=1, return_inverse=True)
+            names = tuple(paths.names[i] for i in own[0])
+            self._known[key] = replace(paths, agent=agent.reshape(-1), names=names)
+        return self._known[key]
+
+    def _model(self, system: System, row: Tensor) -> Followers:
+        random = [] if self.population is None else self.population.random
+        paths = self._paths(self._longest(system, row[None]))
+        model = Followers(system, paths)
+        if set(random) <= set(model.names):
+            model.random = np.array([model.names.index(name) for name in random], dtype=int)
+        return model
+
+    def _deviations(self, model: Followers) -> tuple[np.ndarray, np.ndarray]:
+        """Estimated deviations of drivers ``(D, Q)`` and of starts ``(F, H)``; none for another
+        law than the one they were estimated with."""
+        known = self.population
+        if known is None or len(known.model.random) != len(model.random):
+            return np.zeros((0, 0)), np.zeros((0, 0))
+        return known.estimate.agents, known.estimate.start
+
+    def _simulated(self, system: System, rows: Tensor) -> tuple[Followers, np.ndarray]:
+        """``(K, M, R, F)`` states of R runs at the drivers' estimates."""
+        plain, curve = _parts(system)
+        model = self._model(plain, rows.amin(0)[: len(rows[0]) - (curve is not None)])
+        agents, start = self._deviations(model)
+        number, begin = len(model.names), model.paths.start.copy()
+        if start.size:
+            begin[: model.lane.order] += start.T
+        theta = [model.spread(model.at(row.numpy()[:number]), agents) for row in rows]
+        pushed = None if curve is None else self._pushed(model, curve, rows[:, -1])
+        return model, model.simulate(np.stack(theta), np.stack([begin] * len(rows)), pushed)
+
+    def _away(self, system: System, rows: Tensor) -> tuple[np.ndarray, Followers, np.ndarray]:
+        """``(R, F, K)`` y - f + Z b + H h; the model, and its states ``(K, M, R, F)``."""
+        model, states = self._simulated(system, rows)
+        away = model.paths.x - states[:, 0].transpose(1, 2, 0)
+        agents, start = self._deviations(model)
+        if self.population is not None and start.size:
+            data = self.population.estimate.data
+            away = away + np.einsum("fkq,fq->fk", data.random, agents[model.paths.agent])
+            away = away + np.einsum("fkh,fh->fk", data.start, start)
+        return away, model, states
+
+    def _left(self, system: System, row: Tensor) -> np.ndarray:
+        """``(F, K)`` errors of positions, m, with deviations by generalised least squares."""
+        away, model, _ = self._away(system, row[None])
+        left: np.ndarray = away[0]
+        if self._whitening is None or self.population is None:
+            return left
+        data, own = self.population.estimate.data, self.population.estimate.variances
+        white = self._whitening(left[..., None])
+        for column, deviation, group in (
+            (data.start, own.start, np.arange(len(left))),
+            (data.random, own.spread, model.paths.agent),
+        ):
+            products = np.zeros((int(group.max()) + 1, column.shape[-1]))
+            both = np.einsum("fkq,fk->fq", self._whitening(column), white[..., 0])
+            np.add.at(products, group, both)
+            left = left - np.einsum("fkq,fq->fk", column, (deviation**2 * products)[group])
+        return left
+
+    def _whitened(self, columns: np.ndarray) -> Tensor:
+        """``(C, n)`` of columns ``(K, F, C)``."""
+        columns = columns.transpose(1, 0, 2)
+        white = columns if self._whitening is None else self._whitening(columns)
+        return torch.from_numpy(white)[self._seen].T
+
+    def _moved(self, run: _Run, columns: np.ndarray) -> Tensor:
+        """``(C, n)`` changes of the residuals by positions moved ``(F, K, C)``."""
+        white = self._whitened(-np.nan_to_num(columns).transpose(1, 0, 2))
+        return torch.nan_to_num(white * run.weight)
+
+    def _run_of(self, system: System, row: Tensor) -> _Run:
+        """A run, kept until another one is asked for."""
+        known = self._last_run
+        if known is not None and known[0] is system and torch.equal(known[1], row):
+            return known[2]
+        away, model, states = self._away(system, row[None])
+        plain, _ = _parts(system)
+        fixed = ParameterVector(copy.deepcopy(plain)).fill_(row[: len(model.names)])
+        own = model.spread(model.at(row.numpy()[: len(model.names)]), self._deviations(model)[0])
+        step, after = model.linear(own, states[:, :, 0])
+        size = self._whitened(away.transpose(2, 1, 0))[0]
+        near = drawn_in(size, self.large).abs()
+        weight = torch.where(size.abs() <= self.large, 1.0, self.large / near)
+        found = _Run(fixed, model, own, states[:, :, 0], step, after, weight)
+        self._last_run = system, row.clone(), found
+        return found
+
+    def _propagated(self, run: _Run, source: np.ndarray) -> np.ndarray:
+        """``(F, K, C)`` positions moved by changes ``(W, K, C, F)`` of the first W states' rates."""
+        f, between, m, _ = run.after.shape
+        source = source[:m]
+        both = (source[:, 1:] + source[:, :-1]).transpose(1, 3, 0, 2)
+        state = np.zeros((f, m, source.shape[2]))
+        found = np.zeros((between + 1, *state[:, 0].shape))
+        for k in range(between):
+            state = run.step[:, k] @ state + run.after[:, k, :, : len(source)] @ both[k]
+            found[k + 1] = state[:, 0]
+        return found.transpose(1, 0, 2)
+
+    def _finite(self, run: _Run, changed: System) -> np.ndarray:
+        """``(F, K)`` by how much a changed model moves positions, m; zero where that is more than
+        all the road that was seen: that is no small change."""
+        x = self._simulated(changed, ParameterVector(changed).row[None])[1][:, 0, 0]
+        paths = run.model.paths
+        moved: np.ndarray = (x - run.states[:, 0]).T
+        if not float(np.abs(moved[paths.seen]).max()) <= float(np.ptp(paths.x[paths.seen])):
+            return np.zeros_like(moved)
+        return moved
+
+    def _scene(self, model: Followers) -> Scene:
+        return model.system.scene(model.paths.batch)
+
+    def _pushed(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
+        """What a curve adds to the highest rate in runs of it with several scales."""
+        paths = model.paths
+        scene = side_by_side(self._scene(model), len(scale))
+
+        def pushed(at: int, y: np.ndarray, rates: np.ndarray) -> np.ndarray:
+            time = torch.tensor(at * paths.half, dtype=torch.float64)
+            ahead = np.repeat(paths.ahead[at][None], len(scale), 0)
+            state = _seen(model, time, y[0], rates[0], ahead, scene)
+            height = curve.variable.curve(curve.variable.value(state), curve.amounts)
+            change = height[..., None] * curve.variable.direction(state)
+            found: np.ndarray = change[:, 0, 0].reshape(len(scale), -1).numpy()
+            return found * scale.numpy()[:, None]
+
+        return pushed
+
+
+def _parts(system: System) -> tuple[System, Curve | None]:
+    """A model without the curve that is its last term, and the curve."""
+    last = system.terms[-1]
+    if not isinstance(last, Curve):
+        return system, None
+    plain = copy.deepcopy(system)
+    del plain.terms[-1]
+    return plain, last
+
+
+def _seen(
+    model: Followers, time: Tensor, x: np.ndarray, speed: np.ndarray, ahead: np.ndarray,
+    scene: Scene,
+) -> State:  # fmt: skip
+    """What terms see of every follower and of the one or two vehicles ahead of him.
+
+    Args:
+        time: s. x, speed: ``(L, F)`` of the followers, m and m/s. ahead: ``(L, 4, F)``.
+    """
+    several = model.paths.batch.x.shape[2]
+    place = np.stack([x, ahead[:, 0], ahead[:, 2]][:several], -1)
+    rate = np.stack([speed, ahead[:, 1], ahead[:, 3]][:several], -1)
+    places, rates = (torch.from_numpy(one.reshape(-1, several, 1)) for one in (place, rate))
+    second = model.lane.order > 1
+    return State(time, places, rates if second else None, scene, rate=rates)
