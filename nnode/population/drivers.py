@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from nnode.errors import ConfigError
 from nnode.model.system import System
-from nnode.population.estimate import Estimate, Variances, estimate
+from nnode.population.estimate import Estimate, Variances, estimate, fit_variances
 from nnode.population.followers import Followers, Paths
-from nnode.population.likelihood import Marginal, PushNoise
+from nnode.population.likelihood import Marginal, PushNoise, marginal
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
@@ -83,9 +83,17 @@ def fit_drivers(system: System, paths: Paths, drivers: str | Iterable[str] = "au
     return _estimated(Followers(system, paths, [short[name] for name in drivers]), noise)
 
 
-def _estimated(model: Followers, noise: PushNoise) -> Population:
+def _estimated(model: Followers, noise: PushNoise, begin: Population | None = None) -> Population:
+    """The estimate of a model.
+
+    Args:
+        begin: that with one parameter less that differs, where the search starts.
+    """
+    theta, variances = model.start, _variances(model)
+    if begin is not None:
+        theta, variances = begin.estimate.theta, _widened(begin.estimate.variances)
     found = estimate(
-        model, noise, model.start, _variances(model), low=model.low, high=model.high,
+        model, noise, theta, variances, low=model.low, high=model.high,
         longest=LONGEST, tolerance=TOLERANCE,
     )  # fmt: skip
     return Population(model=model, noise=noise, estimate=found)
@@ -94,21 +102,47 @@ def _estimated(model: Followers, noise: PushNoise) -> Population:
 def _differing(plain: Followers, names: list[str], noise: PushNoise) -> Population:
     """The law with those parameters that differ between drivers, as far as the data tell.
 
-    Parameters are added one after the other: that which raises the marginal likelihood most, while
-    twice its logarithm rises by more than the logarithm of the number of drivers (Schwarz's
-    criterion).
+    Parameters are added one after the other, while twice the logarithm of the marginal likelihood
+    rises by more than the logarithm of the number of drivers (Schwarz's criterion). Candidates are
+    ranked by the marginal likelihood of the samples as they are linearised without them, with
+    variances of their own; only the best is then estimated.
     """
-    system, paths = plain.system, plain.paths
     best = _estimated(plain, noise)
-    price = math.log(max(len(paths.names), 2)) / 2
-    while True:
-        left = [name for name in names if name not in best.random]
-        tried = [_estimated(Followers(system, paths, [*best.random, name]), noise) for name in left]
-        good = [one for one in tried if np.median(one.marginal.shrinkage, 0).max() < SHRINKAGE]
-        better = max(good, key=lambda one: one.marginal.loglik, default=best)
-        if better.marginal.loglik - best.marginal.loglik <= price:
-            return best
+    price = math.log(max(len(plain.paths.names), 2)) / 2
+    while (better := _better(best, names, price)) is not None:
         best = better
+    return best
+
+
+def _better(best: Population, names: list[str], price: float) -> Population | None:
+    """With one more parameter that differs; None: no parameter raises the likelihood enough."""
+    limit = best.marginal.loglik + price
+    ranked = [(_linearised(best, name), name) for name in names if name not in best.random]
+    for value, name in sorted(ranked, reverse=True):
+        if value <= limit:
+            break
+        system, paths = best.model.system, best.model.paths
+        found = _estimated(Followers(system, paths, [*best.random, name]), best.noise, best)
+        if _differs(found.marginal) and found.marginal.loglik > limit:
+            return found
+    return None
+
+
+def _linearised(best: Population, name: str) -> float:
+    """The logarithm of the marginal likelihood with one more parameter that differs, the samples'
+    linearisation kept; minus infinity where the data do not tell how it differs."""
+    model, found = best.model, best.estimate
+    random = [*model.random, model.names.index(name)]
+    data = replace(found.data, random=found.data.fixed[..., random])
+    variances = fit_variances(data, best.noise, _widened(found.variances), tolerance=TOLERANCE)
+    products = best.noise.products(data, variances.noise)
+    there = marginal(data, products, variances.spread, variances.start)
+    return there.loglik if _differs(there) else -math.inf
+
+
+def _differs(found: Marginal) -> bool:
+    """Whether the data tell how each of the parameters differs."""
+    return bool((np.median(found.shrinkage, 0) < SHRINKAGE).all())
 
 
 def _variances(model: Followers) -> Variances:
@@ -127,4 +161,15 @@ def _variances(model: Followers) -> Variances:
         start=np.array(starts),
         low=np.array([low_push, short, *[LEAST_SPREAD] * number, *least]),
         high=np.array([high_push, long, *[MOST_SPREAD] * number, *most]),
+    )
+
+
+def _widened(variances: Variances) -> Variances:
+    """With one more parameter that differs."""
+    at = len(variances.noise) + len(variances.spread)
+    return replace(
+        variances,
+        spread=np.append(variances.spread, SPREAD),
+        low=np.insert(variances.low, at, LEAST_SPREAD),
+        high=np.insert(variances.high, at, MOST_SPREAD),
     )
