@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from nnode.errors import ConfigError
 from nnode.model.system import System
-from nnode.population.estimate import Estimate, Variances, estimate
-from nnode.population.followers import Followers, Paths
-from nnode.population.likelihood import Marginal, PushNoise
+from nnode.population.estimate import Estimate, Variances, estimate, fit_variances
+from nnode.population.followers import MODES, Followers, Paths, score_bias
+from nnode.population.likelihood import Marginal, PushNoise, marginal
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
@@ -28,6 +29,11 @@ SHORT, LONG, LASTING = 1.0, 1 / 3, 3.0
 START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 #: Step of a parameter's logarithm at most, and how closely estimates converge.
 LONGEST, TOLERANCE = 0.3, 1e-2
+#: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
+#: estimate's standard error.
+PAIRS = 2
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +44,14 @@ class Population:
         model: the law behind measured leaders.
         noise: pushes and errors of measurement.
         estimate: parameters, deviations, variances.
+        bias: ``(P,)`` by how much the parameters were too large before they were corrected, in the
+            scales in which they are varied.
     """
 
     model: Followers
     noise: PushNoise
     estimate: Estimate
+    bias: np.ndarray
 
     @property
     def marginal(self) -> Marginal:
@@ -55,7 +64,10 @@ class Population:
         return [self.model.names[q] for q in self.model.random]
 
 
-def fit_drivers(system: System, paths: Paths, drivers: str | Iterable[str] = "auto") -> Population:
+def fit_drivers(
+    system: System, paths: Paths, drivers: str | Iterable[str] = "auto", *, seed: int = 0,
+    pairs: int = PAIRS,
+) -> Population:  # fmt: skip
     """Calibrate a law to drivers who differ.
 
     Args:
@@ -63,6 +75,9 @@ def fit_drivers(system: System, paths: Paths, drivers: str | Iterable[str] = "au
         paths: the followers.
         drivers: ``auto``: parameters of which the data tell how they differ; ``none``; or names,
             as ``T``.
+        seed: of the simulations that tell the bias.
+        pairs: of these simulations, see :func:`nnode.population.followers.score_bias`; 0: the
+            estimates are not corrected.
 
     Raises:
         ConfigError: a name that the law does not have, or a model without a formula.
@@ -70,9 +85,23 @@ def fit_drivers(system: System, paths: Paths, drivers: str | Iterable[str] = "au
     plain, noise = Followers(system, paths), PushNoise(paths.error)
     law = [name for name, own in zip(plain.names, plain.logs & plain.law, strict=True) if own]
     if drivers == "auto":
-        return _differing(plain, law, noise)
-    if drivers == "none":
-        return _estimated(plain, noise)
+        found = _differing(plain, law, noise)
+    else:
+        names = [] if drivers == "none" else known_names(drivers, law)
+        model = Followers(system, paths, names) if names else plain
+        found = _estimated(model, noise)
+    return _corrected(found, np.random.default_rng(seed), pairs) if pairs else found
+
+
+def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
+    """Names of a law's parameters, with the law's, from those without.
+
+    Args:
+        law: the parameters' names with the law's, as ``idm.T``.
+
+    Raises:
+        ConfigError: a name that the law does not have.
+    """
     short = {name.rpartition(".")[2]: name for name in law}
     unknown = [name for name in drivers if name not in short]
     if unknown:
@@ -80,35 +109,89 @@ def fit_drivers(system: System, paths: Paths, drivers: str | Iterable[str] = "au
             f"drivers={unknown[0]} is no parameter of the law that can differ; expected auto, "
             f"none, or some of {', '.join(short)}"
         )
-    return _estimated(Followers(system, paths, [short[name] for name in drivers]), noise)
+    return [short[name] for name in drivers]
 
 
-def _estimated(model: Followers, noise: PushNoise) -> Population:
+def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Population:
+    """Without the bias of the parameters that simulations of the estimated model show.
+
+    The linearisation at the modes and the errors of smoothed leaders shift estimates. Standard
+    deviations stay as they are: their bias is smaller than what few simulations add to their error.
+    """
+    model, noise, before = found.model, found.noise, found.estimate
+    try:
+        bias = score_bias(model, noise, before, rng, pairs)
+    except (ValueError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
+        log.warning("parameters are not corrected for their bias: simulated drivers left the road")
+        return found
+    bias = np.clip(bias, -LONGEST, LONGEST)
+    theta = np.clip(before.theta - bias, model.low, model.high)
+    fixed = replace(before.variances, low=before.variances.row, high=before.variances.row)
+    there = estimate(model, noise, theta, fixed, low=theta, high=theta, tolerance=MODES)
+    there = replace(there, variances=before.variances, converged=before.converged)
+    return replace(found, estimate=there, bias=before.theta - theta)
+
+
+def _estimated(model: Followers, noise: PushNoise, begin: Population | None = None) -> Population:
+    """The estimate of a model.
+
+    Args:
+        begin: that with one parameter less that differs, where the search starts.
+    """
+    theta, variances = model.start, _variances(model)
+    if begin is not None:
+        theta, variances = begin.estimate.theta, _widened(begin.estimate.variances)
     found = estimate(
-        model, noise, model.start, _variances(model), low=model.low, high=model.high,
+        model, noise, theta, variances, low=model.low, high=model.high,
         longest=LONGEST, tolerance=TOLERANCE,
     )  # fmt: skip
-    return Population(model=model, noise=noise, estimate=found)
+    return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
 
 
 def _differing(plain: Followers, names: list[str], noise: PushNoise) -> Population:
     """The law with those parameters that differ between drivers, as far as the data tell.
 
-    Parameters are added one after the other: that which raises the marginal likelihood most, while
-    twice its logarithm rises by more than the logarithm of the number of drivers (Schwarz's
-    criterion).
+    Parameters are added one after the other, while twice the logarithm of the marginal likelihood
+    rises by more than the logarithm of the number of drivers (Schwarz's criterion). Candidates are
+    ranked by the marginal likelihood of the samples as they are linearised without them, with
+    variances of their own; only the best is then estimated.
     """
-    system, paths = plain.system, plain.paths
     best = _estimated(plain, noise)
-    price = math.log(max(len(paths.names), 2)) / 2
-    while True:
-        left = [name for name in names if name not in best.random]
-        tried = [_estimated(Followers(system, paths, [*best.random, name]), noise) for name in left]
-        good = [one for one in tried if np.median(one.marginal.shrinkage, 0).max() < SHRINKAGE]
-        better = max(good, key=lambda one: one.marginal.loglik, default=best)
-        if better.marginal.loglik - best.marginal.loglik <= price:
-            return best
+    price = math.log(max(len(plain.paths.names), 2)) / 2
+    while (better := _better(best, names, price)) is not None:
         best = better
+    return best
+
+
+def _better(best: Population, names: list[str], price: float) -> Population | None:
+    """With one more parameter that differs; None: no parameter raises the likelihood enough."""
+    limit = best.marginal.loglik + price
+    ranked = [(_linearised(best, name), name) for name in names if name not in best.random]
+    for value, name in sorted(ranked, reverse=True):
+        if value <= limit:
+            break
+        system, paths = best.model.system, best.model.paths
+        found = _estimated(Followers(system, paths, [*best.random, name]), best.noise, best)
+        if _differs(found.marginal) and found.marginal.loglik > limit:
+            return found
+    return None
+
+
+def _linearised(best: Population, name: str) -> float:
+    """The logarithm of the marginal likelihood with one more parameter that differs, the samples'
+    linearisation kept; minus infinity where the data do not tell how it differs."""
+    model, found = best.model, best.estimate
+    random = [*model.random, model.names.index(name)]
+    data = replace(found.data, random=found.data.fixed[..., random])
+    variances = fit_variances(data, best.noise, _widened(found.variances), tolerance=TOLERANCE)
+    products = best.noise.products(data, variances.noise)
+    there = marginal(data, products, variances.spread, variances.start)
+    return there.loglik if _differs(there) else -math.inf
+
+
+def _differs(found: Marginal) -> bool:
+    """Whether the data tell how each of the parameters differs."""
+    return bool((np.median(found.shrinkage, 0) < SHRINKAGE).all())
 
 
 def _variances(model: Followers) -> Variances:
@@ -127,4 +210,15 @@ def _variances(model: Followers) -> Variances:
         start=np.array(starts),
         low=np.array([low_push, short, *[LEAST_SPREAD] * number, *least]),
         high=np.array([high_push, long, *[MOST_SPREAD] * number, *most]),
+    )
+
+
+def _widened(variances: Variances) -> Variances:
+    """With one more parameter that differs."""
+    at = len(variances.noise) + len(variances.spread)
+    return replace(
+        variances,
+        spread=np.append(variances.spread, SPREAD),
+        low=np.insert(variances.low, at, LEAST_SPREAD),
+        high=np.insert(variances.high, at, MOST_SPREAD),
     )

@@ -10,6 +10,7 @@ from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
 from nnode.population.drivers import fit_drivers
 from nnode.population.followers import paths_of
+from nnode.population.intervals import deviation_intervals, influence
 
 #: Platoons, vehicles, s, sampling interval and step, s, errors of measurement, m.
 PLATOONS, VEHICLES, SECONDS, DT, STEP, ERROR = 8, 5, 30.0, 0.2, 0.02, 0.05
@@ -52,6 +53,13 @@ def test_drivers_who_differ_are_found_and_told_apart() -> None:
     error = 1 / np.sqrt(np.diag(found.marginal.information))
     truth = np.array([np.log(v0).mean(), np.log(6.0)])
     assert (np.abs(found.estimate.theta - truth) < 4 * error).all()
+    half = influence(found, found.model.paths.sequence)[0].half_widths()
+    assert (np.abs(found.estimate.theta - truth) < half).all()
+    assert (half < 0.1).all()
+    push, lasting, differ, start = deviation_intervals(found)
+    for (low, high), true in ((push, 0.2), (lasting, 4.0), (differ, drawn)):
+        assert low < true < high < 2.5 * low
+    assert np.isnan(start).all()  # it is given
 
 
 def test_drivers_alike_do_not_differ() -> None:
