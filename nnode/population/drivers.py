@@ -83,14 +83,37 @@ def fit_drivers(
         ConfigError: a name that the law does not have, or a model without a formula.
     """
     plain, noise = Followers(system, paths), PushNoise(paths.error)
-    law = [name for name, own in zip(plain.names, plain.logs & plain.law, strict=True) if own]
+    law = plain.that_may_differ
     if drivers == "auto":
-        found = _differing(plain, law, noise)
+        found = _differing(_estimated(plain, noise))
     else:
         names = [] if drivers == "none" else known_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
         found = _estimated(model, noise)
     return _corrected(found, np.random.default_rng(seed), pairs) if pairs else found
+
+
+def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) -> Population:
+    """Calibrate another model to drivers, from an estimate of a model of the same law.
+
+    Args:
+        before: where the search starts; further parameters may differ.
+        system, paths: the model and the followers.
+        fixed: only deviations are estimated; parameters are the system's, variances those before.
+    """
+    model, known = Followers(system, paths, before.random), before.estimate
+    variances, low, high = known.variances, model.low, model.high
+    if fixed:
+        variances = replace(variances, low=variances.row, high=variances.row)
+        low = high = model.start
+    same = before.model.paths.names == paths.names and len(known.start) == len(paths.agent)
+    found = estimate(
+        model, before.noise, model.start, variances, low=low, high=high,
+        longest=LONGEST, tolerance=TOLERANCE,
+        agents=known.agents if same else None, start=known.start if same else None,
+    )  # fmt: skip
+    again = replace(before, model=model, estimate=found, bias=np.zeros(len(found.theta)))
+    return again if fixed else _differing(again)
 
 
 def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
@@ -148,25 +171,25 @@ def _estimated(model: Followers, noise: PushNoise, begin: Population | None = No
     return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
 
 
-def _differing(plain: Followers, names: list[str], noise: PushNoise) -> Population:
-    """The law with those parameters that differ between drivers, as far as the data tell.
+def _differing(best: Population) -> Population:
+    """With those further parameters that differ between drivers, as far as the data tell.
 
     Parameters are added one after the other, while twice the logarithm of the marginal likelihood
     rises by more than the logarithm of the number of drivers (Schwarz's criterion). Candidates are
     ranked by the marginal likelihood of the samples as they are linearised without them, with
     variances of their own; only the best is then estimated.
     """
-    best = _estimated(plain, noise)
-    price = math.log(max(len(plain.paths.names), 2)) / 2
-    while (better := _better(best, names, price)) is not None:
+    price = math.log(max(len(best.model.paths.names), 2)) / 2
+    while (better := _better(best, price)) is not None:
         best = better
     return best
 
 
-def _better(best: Population, names: list[str], price: float) -> Population | None:
+def _better(best: Population, price: float) -> Population | None:
     """With one more parameter that differs; None: no parameter raises the likelihood enough."""
     limit = best.marginal.loglik + price
-    ranked = [(_linearised(best, name), name) for name in names if name not in best.random]
+    left = [name for name in best.model.that_may_differ if name not in best.random]
+    ranked = [(_linearised(best, name), name) for name in left]
     for value, name in sorted(ranked, reverse=True):
         if value <= limit:
             break

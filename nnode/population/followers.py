@@ -257,6 +257,12 @@ class Followers:
         self._rates = Formulas(list(lane.rates.values()))
         self._starts = Formulas(list(lane.starts.values())) if lane.starts else None
 
+    @property
+    def that_may_differ(self) -> list[str]:
+        """Names of the law's parameters that are varied in logarithms."""
+        own = zip(self.names, self.logs & self.law, strict=True)
+        return [name for name, differs in own if differs]
+
     def behind(self, paths: Paths) -> Followers:
         """The same model of other paths of the same followers."""
         found = copy.copy(self)

@@ -31,8 +31,7 @@ from nnode.model.extend import extended
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
-from nnode.population.drivers import LONGEST, TOLERANCE, Population, fit_drivers
-from nnode.population.estimate import estimate
+from nnode.population.drivers import Population, fit_again, fit_drivers
 from nnode.population.followers import Followers, Paths, Push, paths_of
 from nnode.population.likelihood import Whitening
 from nnode.simulation.numpy import strides
@@ -192,19 +191,9 @@ class FollowersEngine(TrafficEngine):
         if before is None and self._like is not None:
             before = self._like.population
         if before is None:
-            self.population = fit_drivers(fixed, paths)
+            self.population = fit_drivers(fixed, paths, pairs=0)
         else:
-            model = Followers(fixed, paths, before.random)
-            variances, low, high = before.estimate.variances, model.low, model.high
-            if self._like is not None:
-                variances = replace(variances, low=variances.row, high=variances.row)
-                low = high = model.start
-            found = estimate(
-                model, before.noise, model.start, variances, low=low, high=high, longest=LONGEST,
-                tolerance=TOLERANCE, agents=None if last is None else last.estimate.agents,
-                start=None if last is None else last.estimate.start,
-            )  # fmt: skip
-            self.population = Population(model=model, noise=before.noise, estimate=found)
+            self.population = fit_again(before, fixed, paths, fixed=self._like is not None)
         found, own = self.population.estimate, self.population.estimate.variances
         self._whitening = Whitening(
             found.data, self.population.noise, own.noise, own.spread, own.start
