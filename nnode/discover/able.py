@@ -13,6 +13,7 @@ from nnode.model.formula import crowd_of
 from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
 from nnode.model.terms import SMALLEST
+from nnode.simulation.rhs import formula_of
 
 
 def check_effect(effect: type[Effect]) -> None:
@@ -39,6 +40,8 @@ def not_offered(effect: type[Effect], system: System) -> str:
         )
     if effect.acts_on == "force" and not effect.finds(system.terms):
         return "the law has no force between people of its own that it could change"
+    if effect.of_drivers and drivers_differ(system):
+        return "the diagnosis estimates how drivers differ together with the law"
     if system.domain != "traffic" or system.order == 1:
         return ""
     try:
@@ -46,6 +49,13 @@ def not_offered(effect: type[Effect], system: System) -> str:
     except ConfigError as error:
         return str(error).removeprefix("model.effects: ")
     return ""
+
+
+def drivers_differ(system: System) -> bool:
+    """Whether how drivers differ is estimated with a model: with formulas of the positions and the
+    speeds of a driver and of the vehicles ahead."""
+    lane = formula_of(system)
+    return lane is not None and all(name in ("x", "v") for name, _ in lane.ahead)
 
 
 def check_model(system: System) -> None:

@@ -10,6 +10,7 @@ from itertools import count
 from typing import Any, cast
 
 import numpy as np
+import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
@@ -40,6 +41,7 @@ from nnode.discover.result import (
     FirstScreen,
     NamedEffect,
     Place,
+    Variation,
     Verdict,
 )
 from nnode.discover.rules import applied, rules
@@ -49,6 +51,7 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
+from nnode.population.intervals import variations
 from nnode.progress import Stages
 
 #: Effects that are described where nothing can be tested.
@@ -162,8 +165,6 @@ def _diagnosed(
         numbers.sealed, options.seed,
     )  # fmt: skip
     kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
-    if isinstance(engine, FollowersEngine):
-        kinds = []  # that drivers differ is known to the engine
     beside = [individuals(engine, found.fit, kind) for kind in kinds]
     found, leads = sealed.confirmed(engine, found)
     last = (
@@ -193,16 +194,15 @@ def _diagnosed(
     gap, each, simulated = sealed.gap(extended, own)
     clock.lap("sealed")
     removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
-    order = final.system.order
     effects_found = [
         *(named(engine, final, s, sealed.tried[s.chosen.name].p_value) for s in found.steps),
-        *(named_agents(one, agent.confirmed, order) for one, agent in both if agent.named),
+        *(named_agents(one, a.confirmed, system.order) for one, a in both if a.named),
     ]
     others = [pair for pair in both if pair[1].found and not pair[1].named]
     leads_found = [
         *leads,
         *imitations,
-        *(named_agents(one, agent.confirmed, order) for one, agent in others),
+        *(named_agents(one, agent.confirmed, system.order) for one, agent in others),
     ]
     diagnosis = Diagnosis(
         verdict=_verdict(
@@ -216,6 +216,7 @@ def _diagnosed(
         effects=effects_found,
         leads=leads_found,
         agents=agents,
+        drivers=_drivers(engine, found.fit),
         data_faults=[],
         not_testable=[one.name for one in absent if not one.testable],
         absences=absent,
@@ -241,6 +242,15 @@ def _diagnosed(
         sealed=division.sealed,
         simulated=simulated,
     )
+
+
+def _drivers(engine: Engine, fit: Fit) -> list[Variation]:
+    """What differs between drivers and over time, under the model with all that was found."""
+    if not isinstance(engine, FollowersEngine):
+        return []
+    engine.settle(fit.system, torch.from_numpy(fit.row))
+    assert engine.population is not None
+    return [Variation(name, **row) for name, row in variations(engine.population).items()]
 
 
 def _without_imitations(

@@ -271,6 +271,29 @@ class Agents:
 
 
 @dataclass
+class Variation:
+    """A standard deviation, or a time, of what a law does not explain.
+
+    Attributes:
+        name: a parameter that differs between drivers, in % of the typical driver's; ``push``: of
+            disturbances of the highest rate; ``push_time``: how long they last; ``measurement``:
+            of errors of positions.
+        estimate: with its interval of 95 % from ``lower`` to ``upper``, in ``unit``; NaN where the
+            data tell none.
+        at_bound: ``low`` or ``high`` where it is at the end of what is allowed.
+        shrinkage: share of a driver's variance that the data leave, median over drivers.
+    """
+
+    name: str
+    estimate: float
+    lower: float
+    upper: float
+    unit: str
+    at_bound: str
+    shrinkage: float
+
+
+@dataclass
 class Structure:
     """What is left where nothing in the catalogue passes.
 
@@ -345,6 +368,7 @@ class Diagnosis:
     effects: list[NamedEffect]
     leads: list[NamedEffect]  # found in open clusters, not confirmed by sealed ones
     agents: list[Agents]
+    drivers: list[Variation]
     data_faults: list[DataFault]
     not_testable: list[str]
     absences: list[Absence]

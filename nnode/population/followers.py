@@ -183,8 +183,8 @@ def _ahead(
 
 
 def _named(ahead: np.ndarray) -> dict[str, np.ndarray]:
-    """What formulas call the vehicles ahead ``(..., 4, F)``."""
-    x1, v1, x2, v2 = np.moveaxis(ahead, -2, 0)
+    """What formulas call the vehicles ahead ``(4, ..., F)``."""
+    x1, v1, x2, v2 = ahead
     return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
@@ -292,8 +292,10 @@ class Followers:
         def rate(t: float, y: np.ndarray) -> np.ndarray:
             at = round(t / paths.half)
             values = {**given, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
+            found = np.empty_like(y)
             rates = self._rates({**values, **_named(paths.ahead[at])})
-            found = np.stack([np.broadcast_to(one, y.shape[1:]) for one in rates])
+            for own, one in zip(found, rates, strict=True):
+                own[...] = one
             if pushed is not None:
                 found[order - 1] += pushed(at, y, found)
             return found
@@ -368,7 +370,7 @@ class Followers:
             **self._given(own[None]),
             **dict(zip(self.lane.rates, states.transpose(1, 0, 2), strict=True)),
             "t": times[:, None],
-            **_named(self.paths.ahead_at_samples),
+            **_named(self.paths.ahead_at_samples.swapaxes(0, 1)),
         }
 
     def linear(self, own: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -433,9 +435,7 @@ def score_bias(
     fixed = replace(fixed, low=fixed.row, high=fixed.row)
     changes = []
     for _ in range(pairs):
-        seed = rng.integers(2**63)
-        for sign in (1.0, -1.0):
-            draw = partial(_signed, np.random.default_rng(seed), sign)
+        for draw in opposite(int(rng.integers(2**63))):
             paths = model.drawn(found, draw)
             again = estimate(
                 model.behind(paths), noise, found.theta, fixed, low=found.theta, high=found.theta,
@@ -443,6 +443,11 @@ def score_bias(
             )  # fmt: skip
             changes.append(again.marginal.change)
     return np.asarray(np.mean(changes, 0))
+
+
+def opposite(seed: int) -> list[Draw]:
+    """Two draws of opposite signs, in which all that is linear in them cancels."""
+    return [partial(_signed, np.random.default_rng(seed), sign) for sign in (1.0, -1.0)]
 
 
 def _signed(rng: np.random.Generator, sign: float, shape: tuple[int, ...]) -> np.ndarray:

@@ -7,10 +7,13 @@ deviations follow from the curvature of the marginal likelihood over their logar
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.stats import norm
 
 from nnode.calibrate.intervals import LEVEL, ClusterInfluence
+from nnode.model.term import short_names
 from nnode.population.drivers import Population
 from nnode.population.likelihood import Products, marginal
 
@@ -70,3 +73,35 @@ def deviation_intervals(found: Population) -> np.ndarray:
     if size and np.linalg.eigvalsh(curved).min() > 0:
         half[free] = norm.ppf(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curved)))
     return np.exp(logs[:, None] + half[:, None] * np.array([-1.0, 1.0]))
+
+
+def variations(found: Population) -> dict[str, dict[str, Any]]:
+    """Standard deviations of drivers' parameters (%), of pushes and of errors, and the time that
+    pushes last, by name: ``estimate``, the interval from ``lower`` to ``upper``, ``unit``,
+    ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over drivers. NaN where
+    the data tell none."""
+    variances, order = found.estimate.variances, found.model.lane.order
+    short = short_names(found.model.names)
+    names = ["push", "push_time", *(short[name] for name in found.random)]
+    units = ["m/s" if order == 1 else "m/s²", "s", *["%"] * len(found.random)]
+    factor = np.array([1.0, 1.0, *[100.0] * len(found.random)])
+    number = len(names)  # the standard deviations of starts come after these
+    values, lowest, highest = (
+        row[:number] for row in (variances.row, variances.low, variances.high)
+    )
+    ends = deviation_intervals(found)[:number]
+    left = [np.nan, np.nan, *np.median(found.marginal.shrinkage, 0)]
+    table: dict[str, dict[str, Any]] = {}
+    for k, name in enumerate(names):
+        bound = "low" if values[k] <= lowest[k] * (1 + NEAR) else ""
+        bound = "high" if values[k] >= highest[k] / (1 + NEAR) else bound
+        lower, upper = (float(factor[k] * end) for end in ends[k])
+        table[name] = {
+            "estimate": float(factor[k] * values[k]), "lower": lower, "upper": upper,
+            "unit": units[k], "at_bound": bound, "shrinkage": float(left[k]),
+        }  # fmt: skip
+    table["measurement"] = {
+        "estimate": found.noise.error, "lower": np.nan, "upper": np.nan, "unit": "m",
+        "at_bound": "", "shrinkage": np.nan,
+    }  # fmt: skip
+    return table

@@ -19,6 +19,7 @@ import numpy as np
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
+from nnode.discover.able import drivers_differ
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import TrafficEngine
@@ -28,7 +29,6 @@ from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
 from nnode.model.system import System
-from nnode.simulation.rhs import formula_of
 
 
 def engine_of(
@@ -48,7 +48,7 @@ def engine_of(
     """
     if whole and system.domain == "traffic":
         return TrafficEngine(sequences, np.inf, clusters, np.inf)
-    if system.domain == "crowd" or formula_of(system) is None:
+    if not drivers_differ(system):
         return windows_of(system, sequences, clusters)
     of = like if isinstance(like, FollowersEngine) else None
     return FollowersEngine(sequences, clusters, like=of)

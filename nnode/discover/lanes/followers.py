@@ -32,7 +32,7 @@ from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
 from nnode.population.drivers import Population, fit_again, fit_drivers
-from nnode.population.followers import Followers, Paths, Push, paths_of
+from nnode.population.followers import Followers, Paths, Push, opposite, paths_of
 from nnode.population.likelihood import Whitening
 from nnode.simulation.numpy import strides
 from nnode.simulation.rhs import side_by_side
@@ -191,14 +191,9 @@ class FollowersEngine(TrafficEngine):
         if before is None and self._like is not None:
             before = self._like.population
         if before is None:
-            self.population = fit_drivers(fixed, paths, pairs=0)
+            self._take(fit_drivers(fixed, paths, pairs=0))
         else:
-            self.population = fit_again(before, fixed, paths, fixed=self._like is not None)
-        found, own = self.population.estimate, self.population.estimate.variances
-        self._whitening = Whitening(
-            found.data, self.population.noise, own.noise, own.spread, own.start
-        )
-        self._last_run = None
+            self._take(fit_again(before, fixed, paths, fixed=self._like is not None))
 
     def settle_among(self, systems: list[System]) -> None:
         """Estimate with each of some models, and keep what the best of them says, by Schwarz's
@@ -212,8 +207,24 @@ class FollowersEngine(TrafficEngine):
             price = len(row) * np.log(max(len(one.population.estimate.agents), 2)) / 2
             if (likelihood := one.population.marginal.loglik - price) > level:
                 best, level = one, likelihood
-        self.population, self._whitening = best.population, best._whitening
-        self._last_run = None
+        assert best.population is not None
+        self._take(best.population)
+
+    def drawn(self, fit_system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
+        """Engines of paths that a model would have had, with deviations of drivers, pushes and
+        errors of measurement as they were estimated under it: two draws of opposite signs."""
+        null = copy.copy(self)
+        null.settle(fit_system, row)
+        assert null.population is not None
+        before, found = null.population, []
+        model = before.model
+        for draw in opposite(seed):
+            one = copy.copy(null)
+            paths = model.drawn(before.estimate, draw)
+            one._known = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
+            one._take(fit_again(before, model.system, paths, fixed=True))
+            found.append(one)
+        return found
 
     # -- parts -----------------------------------------------------------------------------------
 
@@ -268,6 +279,12 @@ class FollowersEngine(TrafficEngine):
             away = away + np.einsum("fkh,fh->fk", data.start, start)
         return away, model, states
 
+    def _take(self, population: Population) -> None:
+        found, own = population.estimate, population.estimate.variances
+        self.population = population
+        self._whitening = Whitening(found.data, population.noise, own.noise, own.spread, own.start)
+        self._last_run = None
+
     def _left(self, system: System, row: Tensor) -> np.ndarray:
         """``(F, K)`` errors of positions, m, with deviations by generalised least squares."""
         away, model, _ = self._away(system, row[None])
@@ -315,7 +332,7 @@ class FollowersEngine(TrafficEngine):
         return found
 
     def _propagated(self, run: _Run, source: np.ndarray) -> np.ndarray:
-        """``(F, K, C)`` positions moved by changes ``(W, K, C, F)`` of the first W states' rates."""
+        """``(F, K, C)`` positions moved by changes ``(W, K, C, F)`` of the first W rates."""
         f, between, m, _ = run.after.shape
         source = source[:m]
         both = (source[:, 1:] + source[:, :-1]).transpose(1, 3, 0, 2)

@@ -222,7 +222,9 @@ def _clusters(d: Diagnosis) -> list[Block]:
 
 
 def _agents(d: Diagnosis) -> list[Block]:
-    """What agents have numbers of their own for, beside the effects of the population."""
+    """Whether agents differ, beside the effects of the population."""
+    if d.drivers:
+        return [Heading("Do drivers differ?"), tables.drivers_table(d)]
     if not d.agents:
         return []
     words = [

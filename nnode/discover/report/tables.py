@@ -134,6 +134,32 @@ def agents_table(d: Diagnosis) -> TableBlock:
     )
 
 
+def drivers_table(d: Diagnosis) -> TableBlock:
+    """What differs between drivers and over time."""
+    known = {
+        "push": "pushes", "push_time": "time that pushes last", "measurement": "measured positions",
+    }  # fmt: skip
+    rows = [
+        {
+            "what": known.get(one.name, f"{one.name} between drivers"),
+            "standard deviation or time": amount(one.estimate),
+            "95 % interval": "not estimable" if math.isnan(one.lower)
+            else f"[{amount(one.lower)}, {amount(one.upper)}]",
+            "unit": _unit(one.unit),
+            "left open per driver": _percent(one.shrinkage),
+        }
+        for one in d.drivers
+    ]  # fmt: skip
+    return _table(
+        "drivers",
+        rows,
+        "Estimated together with the law. Parameters that are not listed do not differ between "
+        "drivers as far as these data tell. *Pushes*: what drives speeds (first order) or "
+        "accelerations (second order) away from the law for some time. *Left open per driver*: the "
+        "share of the variance between drivers that a driver's own data leave, in the median.",
+    )
+
+
 def later_table(d: Diagnosis) -> TableBlock:
     """Who predicts the last part of sealed sequences."""
     rows = [

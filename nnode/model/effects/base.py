@@ -93,6 +93,7 @@ class Effect(Term):
         settings: parameter name to :class:`Setting`.
         tried: one setting to the values, or one strength to the amounts, of a probe each; empty:
             there is one probe, of all strengths at the settings' own values.
+        of_drivers: whether it says no more than that drivers differ.
         acts_on: what of the laws of people it changes, ``force`` or ``drive``, see
             :class:`nnode.model.terms.Rule`; empty: it acts on every model.
         rank: place in the sum of terms; one that modifies the sum before it comes later.
@@ -125,6 +126,7 @@ class Effect(Term):
     consecutive: ClassVar[bool] = False
     covariate: ClassVar[str | None] = None
     individual: ClassVar[bool] = False
+    of_drivers: ClassVar[bool] = False
     searched_orders: ClassVar[tuple[int, ...]] = (1, 2)
     built_into_laws: ClassVar[bool] = False
     sets_desired_speed: ClassVar[bool] = False

@@ -224,6 +224,7 @@ class DriverHeterogeneity(LaneEffect, IndividualEffect):
     """
 
     name = "driver_heterogeneity"
+    of_drivers = True
     rules = {
         1: Rule(rate="W + eta*W", inputs={"eta": "1"}),
         2: Rule(rate="W + law(T=T*(1 + eta)) - law()", inputs={"eta": "1"}),
@@ -504,6 +505,7 @@ class LastingTimeGap(LaneEffect):
     """
 
     name = "lasting_time_gap"
+    of_drivers = True
     rules = {
         2: Rule(
             rate="W + law(T=T + share*(q - T)) - law()",
