@@ -133,6 +133,7 @@ def diagnose(
             confirmation=Confirmation(0.01, number, True),
             effects=[effect],
             leads=[],
+            drivers=[],
             agents=[drivers()] if traffic else [],
             data_faults=[],
             not_testable=["reaction_delay"] if traffic else [],

@@ -77,16 +77,20 @@ Pair = tuple[Simulation | None, Simulation | None]
 _SIMULATED = {
     "traffic": "of each follower at each sample after the first. The platoon is simulated from its "
     "first positions behind its leader's measured path, both smoothed",
+    "drivers": "of each follower at each sample after the first. They are simulated behind the "
+    "measured paths of the vehicles ahead, smoothed, each with the parameters and the start that "
+    "are most likely for that driver",
     "crowd": "of each person at each compared sample. Everyone is simulated for about 1.5 s at a "
     "time among the measured paths of the others, and what an unknown start state explains is "
     "taken out",
 }
 
 
-def defined(domain: str, own: bool) -> str:
+def defined(compared: str, own: bool) -> str:
     """The definition of the error that a report states before and after.
 
     Args:
+        compared: people (``crowd``), platoons (``traffic``), or followers one by one (``drivers``).
         own: whether agents have numbers of their own.
     """
     part = (
@@ -95,7 +99,7 @@ def defined(domain: str, own: bool) -> str:
     )
     return (
         "The error is the mean square distance between measured and simulated position (m²) "
-        f"{_SIMULATED[domain]}. It is averaged within each sealed sequence, then over the sealed "
+        f"{_SIMULATED[compared]}. It is averaged within each sealed sequence, then over the sealed "
         f"sequences.{part if own else ''}"
     )
 
@@ -281,7 +285,8 @@ class Sealed:
             {"name": self.sealed[i].name, "before": float(a), "after": float(b)}
             for i, a, b in zip(used, before, after, strict=True)
         ]
-        gap = Gap(first, last, floor, closed, definition=defined(self.domain, bool(own)))
+        compared = "drivers" if self.comparing.drivers else self.domain
+        gap = Gap(first, last, floor, closed, definition=defined(compared, bool(own)))
         if not own:
             gap.plain = gap.plain_after = self._plain(self.base)
             if extended is not self.base:

@@ -105,9 +105,11 @@ class FollowersEngine(TrafficEngine):
         return drawn_in(self._whitened(away.transpose(2, 1, 0)), self.large)
 
     def squares(self, system: System, row: Tensor) -> Squares:
-        """Squared errors of the followers' positions, with the deviations of drivers and starts
-        that are most likely under this model."""
-        return Squares(self._left(system, row)[self._seen.numpy()] ** 2, self.sequence)
+        """Squared errors of the followers' positions after the first sample, with the deviations
+        of drivers and starts that are most likely under this model."""
+        later = self._seen.numpy() & (np.arange(self._seen.shape[1]) > 0)
+        sequence = np.repeat(self._paths(STEP[2]).sequence, later.sum(1))
+        return Squares(self._left(system, row)[later] ** 2, sequence)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The followers of each sequence, with these deviations."""

@@ -16,7 +16,6 @@ import torch
 
 from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence
-from nnode.data.synthetic.platoons import platoon_table
 from nnode.discover.diagnose import diagnose
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
@@ -52,36 +51,19 @@ def wind(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
     return np.broadcast_to([0.0, 0.35], x.shape)
 
 
-def _of_table(path: Path) -> list[Sequence]:
-    table = pd.read_csv(path)
-    found = []
-    for name, part in table.groupby("sequence"):
-        x = part.pivot(index="time", columns="agent", values="x")
-        found.append(
-            Sequence(
-                name=f"r/{name}", recording="r", time=np.array(x.index), x=np.array(x)[..., None]
-            )
-        )
-    return found
-
-
-def _made(case: str, folder: Path) -> tuple[list[Sequence], Any, DiscoverOptions]:
+def _made(case: str) -> tuple[list[Sequence], Any, DiscoverOptions]:
     if case == "lane":
         made = platoons(relative_speed(0.4), number=16, seconds=12.0, driver=0.1)
         return made, "lin", DiscoverOptions(effects=["relative_speed"], structure=False)
-    if case == "drivers":
-        path = platoon_table(folder / "p.csv", seed=1, platoons=24, cars=4, duration=24.0)
-        effects = ["speed_zone", "driver_heterogeneity"]
-        return _of_table(path), "lin", DiscoverOptions(effects=effects, structure=False)
     made = walkers.crowd(wind, sequences=17, samples=40)
     model = {"term": "social_force", "A": walkers.A, "B": walkers.B}
     return made, model, DiscoverOptions(effects=["side_preference"], structure=False)
 
 
-@pytest.fixture(scope="module", params=["lane", "drivers", "crowd"])
+@pytest.fixture(scope="module", params=["lane", "crowd"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp(request.param)
-    sequences, model, options = _made(request.param, folder)
+    sequences, model, options = _made(request.param)
     domain = "crowd" if request.param == "crowd" else "traffic"
     torch.manual_seed(0)
     found = diagnose(build_model(model_options(model, "measured")), sequences, options)
@@ -91,8 +73,6 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     )
     draw(inputs, found, options, CONFIG, [], folder)()
     write_report(plain_report(found.diagnosis), folder / "report.json")
-    if request.param == "drivers":
-        assert [one.name for one in found.diagnosis.effects][-1] == "driver_heterogeneity"
     return Run(found, sequences, folder)
 
 
