@@ -80,17 +80,22 @@ def entries() -> dict[str, dict[str, Any]]:
     return dict(sorted(found.items(), key=lambda item: (item[1].get("rank", 100), item[0])))
 
 
-def _described(keys: Sequence[str], states: set[str]) -> dict[str, dict[str, Any]]:
+def _of_people(rate: Any) -> bool:
+    return isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
+
+
+def _described(people: bool) -> dict[str, dict[str, Any]]:
+    keys = _CROWD_KEYS if people else _KEYS
     return {
         name: {key: value for key, value in entry.items() if key in keys}
         for name, entry in entries().items()
-        if "model" not in entry and states & set(entry["rate"])
+        if "model" not in entry and _of_people(entry["rate"]) is people
     }
 
 
 #: Name of a law to its description as ``model.law``.
-CAR_FOLLOWING_LAWS = _described(_KEYS, {"v"})
-PEDESTRIAN_LAWS = _described(_CROWD_KEYS, {"vx", "y"})
+CAR_FOLLOWING_LAWS = _described(people=False)
+PEDESTRIAN_LAWS = _described(people=True)
 #: Neurons of the hidden layer of those that are networks.
 NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
 #: Name of a law to the options of the model that consists of it.
@@ -616,8 +621,7 @@ def law_from(
             "rate: {x: v0*(1 - L/gap)}}"
         )
     check_names("model.name", [name])
-    rate = description["rate"]
-    people = isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
+    people = _of_people(description["rate"])
     keys = _CROWD_KEYS if people else _KEYS
     unknown = sorted(set(map(str, description)) - set(keys))
     if unknown:
