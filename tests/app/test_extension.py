@@ -22,6 +22,7 @@ from benchmarks.recovery import by_sumo
 from nnode.data.options import SumoOptions
 from nnode.data.readers.sumo import read_sumo
 from tests.app.conftest import ROOT, Script, start_script
+from tests.discover import walkers
 from tests.discover.platoons import platoons
 
 #: Of vehicles and of people, of both orders.
@@ -36,9 +37,10 @@ LAWS = {
 """,
     "polite": """
   parameters: {A: 2 m/s², B: 40 cm, tau: 0.7 s}
-  where: {push: A*exp((2*r - d)/B)}
+  where: {push: A*exp((2*r - d)/B)/people, wall: A*exp((r - d)/B)/points}
   others: {push_x: push*n_x, push_y: push*n_y}
-  rate: {vx: (speed*way_x - vx)/tau + push_x, vy: (speed*way_y - vy)/tau + push_y}
+  points: {wall_x: wall*n_x, wall_y: wall*n_y}
+  rate: {vx: (speed*way_x - vx)/tau + push_x + wall_x, vy: (speed*way_y - vy)/tau + push_y + wall_y}
 """,
     "strolling": """
   parameters: {A: 0.5 m/s, B: 40 cm}
@@ -60,16 +62,16 @@ class Hills(Effect):
     rules = {1: Rule(rate="W + w*sin(x/long)", constants={"long": (60.0, "m")})}
     strengths = {"w": Strength(0.0, 0.2, Interval(-6.0, 6.0), "m/s", min_effect_size=1.0)}
 """
-CURRENT = """
+WAVES = """
 
 @CATALOGUE.add
-class Current(Effect):
-    name, domain, source, rank = "current", "crowd", "none", 20
-    rules = {2: Rule(rate=("c*vy", "-c*vx"))}
-    strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "1/s", min_effect_size=0.2)}
+class Waves(Effect):
+    name, domain, source, rank = "waves", "crowd", "none", 20
+    rules = {2: Rule(rate=("c*sin(x/long)", "c*cos(x/long)"), constants={"long": (1.5, "m")})}
+    strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "m/s²", min_effect_size=0.2)}
 """
-#: What the made-up drivers do.
-V0, REACH, W = 27.0, 14.0, 2.5
+#: What the made-up drivers and people do.
+V0, REACH, W, C = 27.0, 14.0, 2.5, 0.6
 TRUTH = {"saturating.v0": V0, "saturating.reach": REACH, "hills.w": W}
 #: Run in the copy: every engine, and what SUMO's vehicles are given in a step. The generated code
 #: of lanes runs in the interpreter here; a training compiles it.
@@ -93,7 +95,7 @@ for law, effects in (("saturating", ["hills"]), ("hurrying", [])):
                 options = model_options(law, leader, [{"name": e, "w": 1.5} for e in effect])
                 parts = engines.compiled, engines.ensemble, engines.by_tangents
                 engines.check(build_model(options), engines.platoons(), method, *parts)
-for law, effects in (("polite", ["current"]), ("strolling", [])):
+for law, effects in (("polite", ["waves"]), ("strolling", [])):
     for effect in ([], effects):
         options = model_options(law, None, [{"name": e, "c": 0.3} for e in effect])
         system = build_model({**options, "desired": "direction"})
@@ -117,6 +119,12 @@ def speeds(x: np.ndarray) -> np.ndarray:
     return law + W * np.sin(x[:-1] / 60)
 
 
+def waves(x: np.ndarray) -> np.ndarray:
+    """Of people at ``(..., 2)``, m/s²."""
+    phase = x[..., 0] / 1.5
+    return C * np.stack([np.sin(phase), np.cos(phase)], -1)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a copy of the package that has the new files, and tables of both domains."""
@@ -126,7 +134,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for rank, (name, text) in enumerate(LAWS.items(), 90):
         head = f"  about: A law.\n  source: none\n  rank: {rank}"
         (found / "nnode" / "model" / "laws" / f"{name}.yaml").write_text(head + text, "utf-8")
-    for name, text in (("lane", HILLS), ("crowd", CURRENT)):
+    for name, text in (("lane", HILLS), ("crowd", WAVES)):
         with (found / "nnode" / "model" / "effects" / f"{name}.py").open("a") as file:
             file.write(text)
     driven = platoons(lambda x, *_: speeds(x), number=20, seconds=25.0, seed=4)
@@ -142,9 +150,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for i, one in enumerate(driven)
     ]
     pd.concat(frames).to_csv(found / "platoons.csv", index=False)
-    time, agent = np.repeat(0.1 * np.arange(20), 4), np.tile(np.arange(4), 20)
-    walked = {"time": time, "agent": agent, "x": (1 - 2 * (agent % 2)) * time, "y": 0.6 * agent}
-    pd.DataFrame({"sequence": 0, **walked}).to_csv(found / "people.csv", index=False)
+    walked = walkers.crowd(lambda x, *_: waves(x), sequences=17, samples=40)
+    frames = [
+        pd.DataFrame(
+            {
+                "sequence": i,
+                "time": np.repeat(one.time, one.n_agents),
+                "agent": np.tile(np.arange(6) + 6 * i, len(one.time)),
+                **dict(zip("xy", one.x.reshape(-1, 2).T, strict=True)),
+                **dict(zip(("dest_x", "dest_y"), np.tile(one.destination.T, 40), strict=True)),
+            }
+        )
+        for i, one in enumerate(walked)
+        if one.destination is not None
+    ]
+    pd.concat(frames).to_csv(found / "people.csv", index=False)
+    walls = pd.DataFrame(walkers.WALLS, columns=["x1", "y1", "x2", "y2"])
+    walls.to_csv(found / "walls.csv", index=False)
     return found
 
 
@@ -214,34 +236,45 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
 @pytest.mark.parametrize("law", ["polite", "strolling"])
 def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) -> None:
     done = copy(
-        "train", f"model={law}", *["model.effects=[current]"] * (law == "polite"), "data=table",
-        "data.domain=crowd", f"data.path={folder / 'people.csv'}", "data.split.heldout=0",
+        "train", f"model={law}", *["model.effects=[waves]"] * (law == "polite"), "data=table",
+        "data.domain=crowd", f"data.path={folder / 'people.csv'}",
+        f"data.walls={folder / 'walls.csv'}",
         "solver=fused", "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["solver"] == {"name": "fused", "uncompiled": None}
     assert {f"{law}.A", f"{law}.B"} <= set(result["summary"])
-    assert ("current.c" in result["summary"]) is (law == "polite")
+    assert ("waves.c" in result["summary"]) is (law == "polite")
 
 
-def test_it_is_found_and_shown(copy: Copy, folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("law", "effect", "strength", "value", "data"),
+    [
+        ("saturating", "hills", "w", W, ("traffic", "platoons.csv")),
+        ("polite", "waves", "c", C, ("crowd", "people.csv", "data.walls=walls.csv")),
+    ],
+)
+def test_it_is_found_and_shown(
+    copy: Copy, law: str, effect: str, strength: str, value: float, data: tuple[str, ...],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    domain, table, *walls = data
+    leader = ["model.leader=measured"] * (domain == "traffic")
     done = copy(
-        "discover", "model=saturating", "model.leader=measured", "data=table",
-        "data.domain=traffic", f"data.path={folder / 'platoons.csv'}", "discover.compare=[]",
-        "discover.structure=false", f"hydra.run.dir={tmp_path}",
+        "discover", f"model={law}", *leader, "data=table", f"data.domain={domain}",
+        f"data.path={table}", *walls, "discover.compare=[]", "discover.structure=false",
+        f"hydra.run.dir={tmp_path}",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "report.json").read_text())
-    assert (found["verdict"], [effect["name"] for effect in found["effects"]]) == (
-        "named", ["hills"],
-    )  # fmt: skip
-    coefficient = found["effects"][0]["coefficients"]["w"]
-    assert coefficient["low"] < W < coefficient["high"]
+    assert (found["verdict"], [one["name"] for one in found["effects"]]) == ("named", [effect])
+    (named,) = found["effects"]
+    assert named["coefficients"][strength]["low"] < value < named["coefficients"][strength]["high"]
     page = html.unescape((tmp_path / "report.html").read_text())
-    assert "hills" in page
-    assert "sin" in found["effects"][0]["formula"]
-    assert found["effects"][0]["formula"] in page
+    assert effect in page
+    assert "sin" in named["formula"]
+    assert named["formula"] in page
 
 
 def test_it_drives_in_sumo(copy: Copy, trained: Path, tmp_path: Path) -> None:
