@@ -290,8 +290,12 @@ class Law(Term):
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        sizes = [getattr(self, module).sizes for module in self.networks]
-        return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
+        return (*self._shape_called, *(getattr(self, module).sizes for module in self.networks))
+
+    @property
+    def _shape_called(self) -> tuple[Any, ...]:
+        """What its formula depends on where networks stay functions."""
+        return (*super().shape, self.name, self._key, *self.units.items())
 
     def rule_for(self, order: int) -> Rule | None:
         return self.rule
@@ -348,7 +352,7 @@ class Law(Term):
 
     def dynamics(self, called: bool = False) -> Any:
         """Its formulas alone, as its entry says them; of a crowd flat."""
-        key = (*self.shape, called)
+        key = (called, *(self._shape_called if called else self.shape))
         if key not in _KNOWN:
             empty = CrowdDynamics() if self.domain == "crowd" else LaneDynamics(order=self.order)
             found = self.written(empty, self.name, 0, self.formulas, called)
@@ -372,7 +376,8 @@ class Law(Term):
         second order the least such speed of an acceleration that is not negative at rest, up to
         100 m/s."""
         if self.of_gap:
-            return self.evaluated({"gap": gap}).expand_as(gap)
+            found = self.evaluated({"gap": gap})
+            return found if found.shape == gap.shape else found.expand_as(gap)
         zero = torch.zeros_like(gap)
         known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
         lane = self.dynamics(called=True).flat()
@@ -441,7 +446,11 @@ def _names_gap_alone(lane: LaneDynamics) -> bool:
 
 def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
     """A network, layer by layer."""
-    out: Tensor = network(torch.stack(torch.broadcast_tensors(*inputs), -1))
+    if len(inputs) == 1:  # as the paper's laws call it in every step
+        joined = inputs[0][..., None]
+    else:
+        joined = torch.stack(torch.broadcast_tensors(*inputs), -1)
+    out: Tensor = network(joined)
     return out
 
 
