@@ -71,6 +71,8 @@ class ResidualProblem:
         physical: ``(P,)`` False for the weights of networks.
         start, low, high: ``(P,)`` the system's own values, and the admissible set.
         simulations: how many there were, without those of tangents.
+        last_speeds: ``(B, N)`` the first speeds (m/s) from which the next search for the best ones
+            goes on.
 
     Raises:
         ConfigError: vehicles whose model is no formula; first speeds of people, or of a law of
@@ -125,7 +127,7 @@ class ResidualProblem:
         given = self.system.given(self.batch)
         driven = self.batch.agent if given is None else self.batch.agent & ~given
         self.fitted, self._given = driven.numpy(), self.batch.v[0, ..., 0].double().numpy()
-        self._last = self._given
+        self.last_speeds = self._given
 
     # -- costs and derivatives of every sequence -------------------------------------------------
 
@@ -140,7 +142,7 @@ class ResidualProblem:
         """Costs and their derivatives, of parameters as in :meth:`costs`."""
         if self.fitted is None:
             return self._quadratic(*self.linearised(rows))
-        self._last = start = self._settled(rows).row
+        self.last_speeds = start = self._settled(rows).row
         cost, away, slope = self.linearised(rows, start)
         both = torch.cat([slope, self._by_start(rows, start, away)])
         return self._quadratic(cost, away, both).profiled(len(slope))
@@ -150,8 +152,8 @@ class ResidualProblem:
         they are given."""
         if self.fitted is None:
             return {}
-        self._last = self._settled(rows).row
-        found, agents = self._last.tolist(), self.batch.agent.sum(1).tolist()
+        self.last_speeds = self._settled(rows).row
+        found, agents = self.last_speeds.tolist(), self.batch.agent.sum(1).tolist()
         return {name: v[:n] for name, v, n in zip(self.batch.names, found, agents, strict=True)}
 
     def complain(self, cost: np.ndarray) -> None:
@@ -219,8 +221,8 @@ class ResidualProblem:
         def quadratic(start: np.ndarray) -> Quadratic:
             return self._quadratic(best, away, self._by_start(rows, start, away))
 
-        given, last = costs(self._given[None])[0], costs(self._last[None])[0]
-        start = np.where((last < given)[:, None], self._last, self._given)
+        given, last = costs(self._given[None])[0], costs(self.last_speeds[None])[0]
+        start = np.where((last < given)[:, None], self.last_speeds, self._given)
         low = np.where(self.fitted, 0.0, self._given)
         high = np.where(self.fitted, math.inf, self._given)
         return least_squares(quadratic, costs, start, low, high, steps=_TURNS, tolerance=_SETTLED)

@@ -59,12 +59,14 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
 
 
-def start_script(name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
+def start_script(
+    name: str, *overrides: str, cwd: Path = ROOT, **env: str
+) -> subprocess.CompletedProcess[str]:
     """What :func:`started` gives; in place of a script's name may stand code, of several lines."""
     what = ["-c", name] if "\n" in name else [f"scripts/{name}.py"]
     return subprocess.run(
         [sys.executable, *what, *overrides],
-        cwd=ROOT,
+        cwd=cwd,
         env={**environment(), **env},
         capture_output=True,
         text=True,

@@ -1,71 +1,116 @@
 """A new law is one YAML file, and a new effect is one class with one rule: with nothing else
-written, both work in every engine, in training, in the diagnosis, on its page and in a drive."""
+written, both work in every engine, in training, in the diagnosis, on its page and in a drive.
+
+The files lie in a copy of the package, or where a user's own files lie.
+"""
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Iterator
+import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from subprocess import CompletedProcess
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
-import yaml
 
-import nnode
-from nnode.data.sequence import collate
-from nnode.discover.options import DiscoverOptions
-from nnode.exchange.drivers import Drivers, Seen
-from nnode.model import System, build_model
-from nnode.model.effects import CATALOGUE
-from nnode.model.effects.own import load_own
-from nnode.simulation import FusedSolver, TorchdiffeqSolver
-from tests.app.conftest import Script
+from benchmarks.recovery import by_sumo
+from nnode.data.options import SumoOptions
+from nnode.data.readers.sumo import read_sumo
+from tests.app.conftest import ROOT, Script, start_script
+from tests.discover import walkers
 from tests.discover.platoons import platoons
-from tests.model.test_forces import people
 
-LANE = """
-defaults: [formula_schema, _self_]
-name: saturating
-leader: measured
-law:
+#: Of vehicles and of people, of both orders.
+LAWS = {
+    "saturating": """
   parameters: {v0: {value: 25 m/s, low: 1 m/s}, reach: {value: 15 m, low: 1 m}}
   rate: {x: v0*(1 - exp(-gap/reach))}
-"""
-CROWD = """
-defaults: [formula_schema, _self_]
-name: polite
-law:
+""",
+    "hurrying": """
+  parameters: {v0: {value: 25 m/s, low: 1 m/s}, reach: {value: 15 m, low: 1 m}, tau: 1.5 s}
+  rate: {v: (v0*(1 - exp(-gap/reach)) - v)/tau}
+""",
+    "polite": """
   parameters: {A: 2 m/s², B: 40 cm, tau: 0.7 s}
+  where: {push: A*exp((2*r - d)/B)/people, wall: A*exp((r - d)/B)/points}
+  others: {push_x: push*n_x, push_y: push*n_y}
+  points: {wall_x: wall*n_x, wall_y: wall*n_y}
+  rate: {vx: (speed*way_x - vx)/tau + push_x + wall_x, vy: (speed*way_y - vy)/tau + push_y + wall_y}
+""",
+    "strolling": """
+  parameters: {A: 0.5 m/s, B: 40 cm}
   where: {push: A*exp((2*r - d)/B)}
   others: {push_x: push*n_x, push_y: push*n_y}
-  rate: {vx: (speed*way_x - vx)/tau + push_x, vy: (speed*way_y - vy)/tau + push_y}
-"""
-EFFECTS = """
+  rate: {x: pace*way_x + push_x, y: pace*way_y + push_y}
+""",
+}
+IMPORTS = """
 from nnode.model.effects import CATALOGUE, Effect, Strength
 from nnode.model.term import Interval
 from nnode.model.terms import Rule
-
+"""
+HILLS = """
 
 @CATALOGUE.add
 class Hills(Effect):
     name, domain, source, rank = "hills", "traffic", "none", 20
     rules = {1: Rule(rate="W + w*sin(x/long)", constants={"long": (60.0, "m")})}
     strengths = {"w": Strength(0.0, 0.2, Interval(-6.0, 6.0), "m/s", min_effect_size=1.0)}
-
+"""
+WAVES = """
 
 @CATALOGUE.add
-class Current(Effect):
-    name, domain, source, rank = "current", "crowd", "none", 20
-    rules = {2: Rule(rate=("c*vy", "-c*vx"))}
-    strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "1/s", min_effect_size=0.2)}
+class Waves(Effect):
+    name, domain, source, rank = "waves", "crowd", "none", 20
+    rules = {2: Rule(rate=("c*sin(x/long)", "c*cos(x/long)"), constants={"long": (1.5, "m")})}
+    strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "m/s²", min_effect_size=0.2)}
 """
-NAMES = ("hills", "current")
-#: What the made-up drivers do.
-V0, REACH, W = 27.0, 14.0, 2.5
+#: What the made-up drivers and people do.
+V0, REACH, W, C = 27.0, 14.0, 2.5, 0.6
+TRUTH = {"saturating.v0": V0, "saturating.reach": REACH, "hills.w": W}
+#: Run in the copy: every engine, and what SUMO's vehicles are given in a step. The generated code
+#: of lanes runs in the interpreter here; a training compiles it.
+PROGRAM = """
+import json
+import numpy as np
+import nnode
+from nnode.app.python.inputs import model_options
+from nnode.exchange.drivers import Drivers, Seen
+from nnode.model import build_model
+from nnode.model.steps import METHODS
+from nnode.simulation.kernels import lanes
+from tests.simulation import test_engines as engines
+from tests.simulation.kernels.interpreted import interpreted
+
+lanes.compiled = interpreted
+for law, effects in (("saturating", ["hills"]), ("hurrying", [])):
+    for effect in ([], effects):
+        for method in METHODS:
+            for leader in ("constant", "measured"):
+                options = model_options(law, leader, [{"name": e, "w": 1.5} for e in effect])
+                parts = engines.compiled, engines.ensemble, engines.by_tangents
+                engines.check(build_model(options), engines.platoons(), method, *parts)
+for law, effects in (("polite", ["waves"]), ("strolling", [])):
+    for effect in ([], effects):
+        options = model_options(law, None, [{"name": e, "c": 0.3} for e in effect])
+        system = build_model({**options, "desired": "direction"})
+        engines.check(system, engines.room(), "euler", engines.compiled, engines.threaded)
+
+model = build_model(model_options("saturating", "measured", [{"name": "hills", "w": 2.5}]))
+drivers = Drivers(model, 0.1, "euler")
+drivers.enter([(), ()])
+gap, nobody = np.array([20.0, 30.0]), np.full(2, np.inf)
+seen = Seen(v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np.full(2, 5.0),
+            lead=np.full(2, -1), gap_1=nobody, v_2=np.full(2, 9.0), x=np.array([35.0, 80.0]))
+print(json.dumps({"package": nnode.__file__, "speeds": drivers.speeds(0.0, seen).tolist()}))
+"""
+
+Copy = Callable[..., CompletedProcess[str]]
 
 
 def speeds(x: np.ndarray) -> np.ndarray:
@@ -74,15 +119,25 @@ def speeds(x: np.ndarray) -> np.ndarray:
     return law + W * np.sin(x[:-1] / 60)
 
 
+def waves(x: np.ndarray) -> np.ndarray:
+    """Of people at ``(..., 2)``, m/s²."""
+    phase = x[..., 0] / 1.5
+    return C * np.stack([np.sin(phase), np.cos(phase)], -1)
+
+
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with both laws, the effects, and a table of platoons; the effects are known."""
-    folder = tmp_path_factory.mktemp("own")
-    (folder / "conf" / "model").mkdir(parents=True)
-    for name, text in (("saturating", LANE), ("polite", CROWD)):
-        (folder / "conf" / "model" / f"{name}.yaml").write_text(text)
-    (folder / "effects.py").write_text(EFFECTS)
-    found = platoons(lambda x, *_: speeds(x), number=20, seconds=25.0, seed=4)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a copy of the package that has the new files, and tables of both domains."""
+    found = tmp_path_factory.mktemp("extended")
+    for part in ("nnode", "conf", "scripts"):
+        shutil.copytree(ROOT / part, found / part, ignore=shutil.ignore_patterns("__pycache__"))
+    for rank, (name, text) in enumerate(LAWS.items(), 90):
+        head = f"  about: A law.\n  source: none\n  rank: {rank}"
+        (found / "nnode" / "model" / "laws" / f"{name}.yaml").write_text(head + text, "utf-8")
+    for name, text in (("lane", HILLS), ("crowd", WAVES)):
+        with (found / "nnode" / "model" / "effects" / f"{name}.py").open("a") as file:
+            file.write(text)
+    driven = platoons(lambda x, *_: speeds(x), number=20, seconds=25.0, seed=4)
     frames = [
         pd.DataFrame(
             {
@@ -92,96 +147,151 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
                 "x": one.x.ravel(),
             }
         )
-        for i, one in enumerate(found)
+        for i, one in enumerate(driven)
     ]
-    pd.concat(frames).to_csv(folder / "table.csv", index=False)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("NNODE_EFFECTS", str(folder / "effects.py"))
-        load_own()
-        yield folder
-    for name in NAMES:
-        del CATALOGUE.effects[name]
+    pd.concat(frames).to_csv(found / "platoons.csv", index=False)
+    walked = walkers.crowd(lambda x, *_: waves(x), sequences=17, samples=40)
+    frames = [
+        pd.DataFrame(
+            {
+                "sequence": i,
+                "time": np.repeat(one.time, one.n_agents),
+                "agent": np.tile(np.arange(6) + 6 * i, len(one.time)),
+                **dict(zip("xy", one.x.reshape(-1, 2).T, strict=True)),
+                **dict(zip(("dest_x", "dest_y"), np.tile(one.destination.T, 40), strict=True)),
+            }
+        )
+        for i, one in enumerate(walked)
+        if one.destination is not None
+    ]
+    pd.concat(frames).to_csv(found / "people.csv", index=False)
+    walls = pd.DataFrame(walkers.WALLS, columns=["x1", "y1", "x2", "y2"])
+    walls.to_csv(found / "walls.csv", index=False)
+    return found
 
 
-def options(text: str, *effects: dict[str, Any]) -> dict[str, Any]:
-    """Of the model that a file describes."""
-    found = yaml.safe_load(text)
-    del found["defaults"]
-    return {"term": "formula", "leader": "measured", **found, "effects": list(effects)}
+@pytest.fixture(scope="module")
+def copy(folder: Path) -> Copy:
+    """Run a script of the copy, or code."""
+
+    def run(name: str, *words: str, **env: str) -> CompletedProcess[str]:
+        path = os.pathsep.join([str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")])
+        return start_script(name, *words, cwd=folder, PYTHONPATH=path, PYTHONSAFEPATH="1", **env)
+
+    return run
 
 
-@pytest.mark.usefixtures("written")
-@pytest.mark.parametrize("text", [LANE, CROWD], ids=["lane", "crowd"])
-@pytest.mark.parametrize("own", [False, True], ids=["law", "effect"])
-def test_compiled_code_is_pytorch(text: str, own: bool) -> None:
-    lane = text == LANE
-    effect = {"name": "hills", "w": 1.5} if lane else {"name": "current", "c": 0.3}
-    model = build_model(options(text, *[effect] * own)).double()
-    batch = collate(platoons(number=2, seconds=1.0) if lane else [people(5, 1), people(3, 2)])
-    found = []
-    for solver in (TorchdiffeqSolver("euler", "discrete", 0.02), FusedSolver(0.02, method="euler")):
-        x = solver(model, batch).x[batch.valid]
-        slopes = torch.autograd.grad(x.square().sum(), list(model.parameters()))
-        found.append((x.detach(), torch.stack(slopes)))
-        assert not getattr(solver, "uncompiled", "")
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(other, one, rtol=1e-9, atol=1e-9)
-    assert (found[0][1] != 0).all()
+def test_every_engine_and_what_drivers_do(copy: Copy, folder: Path) -> None:
+    done = copy(PROGRAM)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert Path(found["package"]).parents[1] == folder
+    x, gap = np.array([35.0, 80.0]), np.array([20.0, 30.0])
+    wanted = 25 * (1 - np.exp(-gap / 15)) + W * np.sin(x / 60)
+    np.testing.assert_allclose(found["speeds"], wanted, rtol=1e-6)
 
 
-def test_a_calibration_by_tangents_recovers_the_truth(written: Path) -> None:
-    model = {k: v for k, v in options(LANE).items() if k not in ("effects", "leader")}
-    run = nnode.Calibrator(model, effects=["hills"], leader="measured", optimizer="gauss_newton")
-    run.fit(written / "table.csv")
-    estimate = run.parameters_["estimate"]
-    truth = {"saturating.v0": V0, "saturating.reach": REACH, "hills.w": W}
-    for name, value in truth.items():
-        assert estimate[name] == pytest.approx(value, rel=0.02), name
+@pytest.fixture(scope="module")
+def trained(copy: Copy, folder: Path) -> Path:
+    """The folder of a run."""
+    run = folder / "run"
+    done = copy(
+        "train", "model=saturating", "model.leader=measured", "model.effects=[hills]",
+        "data=table", "data.domain=traffic", f"data.path={folder / 'platoons.csv'}",
+        "solver=fused", "optimizer=gauss_newton", "trainer.max_epochs=30", f"hydra.run.dir={run}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return run
 
 
-def test_it_is_trained_by_the_command(written: Path, script: Script, tmp_path: Path) -> None:
+def estimates(run: Path) -> dict[str, float]:
+    result = json.loads((run / "result.json").read_text())
+    assert result["solver"] == {"name": "fused", "uncompiled": None}
+    return {
+        name: result["summary"][name] for name in ("saturating.v0", "saturating.reach", "hills.w")
+    }
+
+
+def test_training_recovers_the_truth(trained: Path) -> None:
+    assert estimates(trained) == pytest.approx(TRUTH, rel=0.02)
+
+
+def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path) -> None:
+    """The law stands in a folder of configurations, the effect in a file of ``NNODE_EFFECTS``."""
+    conf = tmp_path / "conf" / "model"
+    conf.mkdir(parents=True)
+    head = "defaults: [formula_schema, _self_]\nname: saturating\nleader: measured\nlaw:"
+    (conf / "mine.yaml").write_text(head + LAWS["saturating"], "utf-8")
+    (tmp_path / "effects.py").write_text(IMPORTS + HILLS)
     done = script(
-        "train", "--config-dir", str(written / "conf"), "model=saturating", "data=table",
-        "data.domain=traffic", f"data.path={written / 'table.csv'}", "solver=fused",
-        "optimizer=lbfgs", "model.effects=[{name: hills, w: 0.1}]", "trainer.max_epochs=4",
-        f"hydra.run.dir={tmp_path}", NNODE_EFFECTS=str(written / "effects.py"),
+        "train", "--config-dir", str(conf.parent), "model=mine", "model.effects=[hills]",
+        "data=table", "data.domain=traffic", f"data.path={folder / 'platoons.csv'}",
+        "solver=fused", "optimizer=lbfgs", "trainer.max_epochs=30",
+        f"hydra.run.dir={tmp_path / 'run'}", NNODE_EFFECTS=str(tmp_path / "effects.py"),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert estimates(tmp_path / "run") == pytest.approx(TRUTH, rel=0.02)
+
+
+@pytest.mark.parametrize("law", ["polite", "strolling"])
+def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) -> None:
+    done = copy(
+        "train", f"model={law}", *["model.effects=[waves]"] * (law == "polite"), "data=table",
+        "data.domain=crowd", f"data.path={folder / 'people.csv'}",
+        f"data.walls={folder / 'walls.csv'}",
+        "solver=fused", "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["solver"] == {"name": "fused", "uncompiled": None}
-    assert {"saturating.v0", "saturating.reach", "hills.w"} <= set(result["summary"])
-    again = nnode.load(tmp_path / "checkpoints" / "best.pt")
-    assert set(again.physical()) == {"saturating.v0", "saturating.reach", "hills.w"}
+    assert {f"{law}.A", f"{law}.B"} <= set(result["summary"])
+    assert ("waves.c" in result["summary"]) is (law == "polite")
 
 
-def test_it_is_found_and_shown(written: Path, tmp_path: Path) -> None:
-    model = {k: v for k, v in options(LANE).items() if k not in ("effects", "leader")}
-    chosen = DiscoverOptions(compare=[], structure=False, replay=False)
-    found = nnode.diagnose(
-        written / "table.csv", "traffic", model=model, folder=tmp_path, options=chosen
-    )
-    assert (found.verdict, [effect.name for effect in found.effects]) == ("named", ["hills"])
-    coefficient = found.effects[0].coefficients["w"]
-    assert coefficient.low < W < coefficient.high
-    page = html.unescape((tmp_path / "report.html").read_text())
-    assert "hills" in page
-    assert "sin" in found.effects[0].formula
-    assert found.effects[0].formula in page
-
-
-@pytest.mark.usefixtures("written")
-def test_it_drives() -> None:
-    """What SUMO's vehicles are given in a step, without SUMO."""
-    model: System = build_model(options(LANE, {"name": "hills", "w": W})).double()
-    with torch.no_grad():
-        for name, value in (("v0", V0), ("reach", REACH)):
-            getattr(model.terms[0], name).fill_(value)
-    drivers = Drivers(model, 0.1, "euler")
-    drivers.enter([(), ()])
-    x, gap, nobody = np.array([35.0, 80.0]), np.array([20.0, 30.0]), np.full(2, np.inf)
-    seen = Seen(
-        v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np.full(2, 5.0),
-        lead=np.full(2, -1), gap_1=nobody, v_2=np.full(2, 9.0), x=x,
+@pytest.mark.parametrize(
+    ("law", "effect", "strength", "value", "data"),
+    [
+        ("saturating", "hills", "w", W, ("traffic", "platoons.csv")),
+        ("polite", "waves", "c", C, ("crowd", "people.csv", "data.walls=walls.csv")),
+    ],
+)
+def test_it_is_found_and_shown(
+    copy: Copy, law: str, effect: str, strength: str, value: float, data: tuple[str, ...],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    domain, table, *walls = data
+    leader = ["model.leader=measured"] * (domain == "traffic")
+    done = copy(
+        "discover", f"model={law}", *leader, "data=table", f"data.domain={domain}",
+        f"data.path={table}", *walls, "discover.compare=[]", "discover.structure=false",
+        f"hydra.run.dir={tmp_path}",
     )  # fmt: skip
-    wanted = V0 * (1 - np.exp(-gap / REACH)) + W * np.sin(x / 60)
-    np.testing.assert_allclose(drivers.speeds(0.0, seen), wanted, rtol=1e-6)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert (found["verdict"], [one["name"] for one in found["effects"]]) == ("named", [effect])
+    (named,) = found["effects"]
+    assert named["coefficients"][strength]["low"] < value < named["coefficients"][strength]["high"]
+    page = html.unescape((tmp_path / "report.html").read_text())
+    assert effect in page
+    assert "sin" in named["formula"]
+    assert named["formula"] in page
+
+
+def test_it_drives_in_sumo(copy: Copy, trained: Path, tmp_path: Path) -> None:
+    by_sumo.write_scene(
+        Path(pytest.importorskip("sumo").SUMO_HOME), tmp_path, "Krauss", {"decel": 4.5}
+    )
+    (tmp_path / "a.sumocfg").write_text(
+        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
+        '</input><time><step-length value="0.1"/><end value="20"/></time></configuration>'
+    )
+    done = copy(
+        "drive", f"run={trained}", f"sumo={tmp_path / 'a.sumocfg'}", "vehicles=own",
+        "steps=scenario", f"hydra.run.dir={tmp_path / 'out'}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (seen,) = read_sumo(tmp_path / "out" / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
+    v0, reach, w = estimates(trained).values()
+    x = seen.x[..., 0]
+    wanted = v0 * (1 - np.exp(-np.diff(x) / reach)) + w * np.sin(x[:, :-1] / 60)
+    np.testing.assert_allclose(np.diff(x[1:, :-1], axis=0) / 0.1, wanted[1:-1], atol=1e-6)

@@ -10,6 +10,7 @@ import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
+from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.options import StartSpeeds
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.sequence import Batch, Sequence, collate
@@ -177,6 +178,19 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
             )
         )  # fmt: skip
     return found
+
+
+def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> None:
+    """The loop attaches a new copy of the batch before each step. The law of Krauss is a map whose
+    cost has several minima over the first speeds, so the search has to go on from the last ones."""
+    batch = collate([replace(s, time=s.time[:81], x=s.x[:81]) for s in noisy(0.05)[:4]])
+    system, costs = EVERY["krauss"].system(), []
+    optimizer = GaussNewton(system)
+    for _ in range(8):
+        optimizer.attach(FusedSolver(), batch.to(), Convention.integral, StartSpeeds.fitted)
+        costs.append(optimizer.step())
+    assert costs[-1] < costs[0] / 10
+    np.testing.assert_array_less(costs[1:], np.array(costs[:-1]) * (1 + 1e-9))
 
 
 @pytest.mark.thorough

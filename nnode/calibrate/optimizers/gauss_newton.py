@@ -76,6 +76,7 @@ class GaussNewton(Optimizer):
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
         self._problem = ResidualProblem(self.system, batch, solver, convention, starts)
+        self._problem.last_speeds = self.started(batch).v[0, ..., 0].double().numpy()
         if self._problem.lane is None and not self._problem.physical.all():
             raise ConfigError(
                 "optimizer=gauss_newton needs a model of people whose terms are formulas without "

@@ -80,17 +80,22 @@ def entries() -> dict[str, dict[str, Any]]:
     return dict(sorted(found.items(), key=lambda item: (item[1].get("rank", 100), item[0])))
 
 
-def _described(keys: Sequence[str], states: set[str]) -> dict[str, dict[str, Any]]:
+def _of_people(rate: Any) -> bool:
+    return isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
+
+
+def _described(people: bool) -> dict[str, dict[str, Any]]:
+    keys = _CROWD_KEYS if people else _KEYS
     return {
         name: {key: value for key, value in entry.items() if key in keys}
         for name, entry in entries().items()
-        if "model" not in entry and states & set(entry["rate"])
+        if "model" not in entry and _of_people(entry["rate"]) is people
     }
 
 
 #: Name of a law to its description as ``model.law``.
-CAR_FOLLOWING_LAWS = _described(_KEYS, {"v"})
-PEDESTRIAN_LAWS = _described(_CROWD_KEYS, {"vx", "y"})
+CAR_FOLLOWING_LAWS = _described(people=False)
+PEDESTRIAN_LAWS = _described(people=True)
 #: Neurons of the hidden layer of those that are networks.
 NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
 #: Name of a law to the options of the model that consists of it.
@@ -285,8 +290,12 @@ class Law(Term):
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        sizes = [getattr(self, module).sizes for module in self.networks]
-        return (*super().shape, self.name, self._key, *self.units.items(), *sizes)
+        return (*self._shape_called, *(getattr(self, module).sizes for module in self.networks))
+
+    @property
+    def _shape_called(self) -> tuple[Any, ...]:
+        """What its formula depends on where networks stay functions."""
+        return (*super().shape, self.name, self._key, *self.units.items())
 
     def rule_for(self, order: int) -> Rule | None:
         return self.rule
@@ -343,7 +352,7 @@ class Law(Term):
 
     def dynamics(self, called: bool = False) -> Any:
         """Its formulas alone, as its entry says them; of a crowd flat."""
-        key = (*self.shape, called)
+        key = (called, *(self._shape_called if called else self.shape))
         if key not in _KNOWN:
             empty = CrowdDynamics() if self.domain == "crowd" else LaneDynamics(order=self.order)
             found = self.written(empty, self.name, 0, self.formulas, called)
@@ -367,7 +376,8 @@ class Law(Term):
         second order the least such speed of an acceleration that is not negative at rest, up to
         100 m/s."""
         if self.of_gap:
-            return self.evaluated({"gap": gap}).expand_as(gap)
+            found = self.evaluated({"gap": gap})
+            return found if found.shape == gap.shape else found.expand_as(gap)
         zero = torch.zeros_like(gap)
         known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
         lane = self.dynamics(called=True).flat()
@@ -436,7 +446,11 @@ def _names_gap_alone(lane: LaneDynamics) -> bool:
 
 def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
     """A network, layer by layer."""
-    out: Tensor = network(torch.stack(torch.broadcast_tensors(*inputs), -1))
+    if len(inputs) == 1:  # as the paper's laws call it in every step
+        joined = inputs[0][..., None]
+    else:
+        joined = torch.stack(torch.broadcast_tensors(*inputs), -1)
+    out: Tensor = network(joined)
     return out
 
 
@@ -616,8 +630,7 @@ def law_from(
             "rate: {x: v0*(1 - L/gap)}}"
         )
     check_names("model.name", [name])
-    rate = description["rate"]
-    people = isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
+    people = _of_people(description["rate"])
     keys = _CROWD_KEYS if people else _KEYS
     unknown = sorted(set(map(str, description)) - set(keys))
     if unknown:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.sequence import Batch
 from nnode.model.build import build_model
@@ -46,16 +47,12 @@ def new_system(model: str, seed: int = 0, dtype: torch.dtype = torch.float64) ->
 
 def system_of(model: str, row: np.ndarray | list[float]) -> System:
     """A model of OPTIONS with parameters ``row`` (K,)."""
-    system = new_system(model)
-    torch.nn.utils.vector_to_parameters(
-        torch.as_tensor(np.array(row), dtype=torch.float64), system.parameters()
-    )
-    return system
+    return ParameterVector(new_system(model)).fill_(np.array(row))
 
 
 def row_of(system: System) -> np.ndarray:
     """``(K,)`` the parameters of a system."""
-    return torch.nn.utils.parameters_to_vector(system.parameters()).detach().double().numpy()
+    return ParameterVector(system).row.numpy()
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ def calibrate(
     if grow:
         begin = problem.begin(begin, GROWTH[model], steps=min(steps, SHORT_STEPS[model]), **options)
     found = pooled(problem, begin, steps=steps, **options)
-    row = row_of(problem.vector.fill_(found.row))
+    row = row_of(problem.vector.fill_(found.row).requires_grad_())  # those that were held, too
     return Fitted(row, float(found.cost), problem.simulations)
 
 

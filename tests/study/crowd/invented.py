@@ -66,7 +66,7 @@ def fit(
     system = new_system("sf" if kind == "sf" else "nn", seed)
     if kind == "wall":
         silence(system)
-    row = FORCE[horizon] if kind == "sf" else row_of(system).tolist()
+    row = FORCE[horizon] if kind == "sf" else row_of(system.requires_grad_()).tolist()
     if start is not None and kind != "sf":
         assert row == start
     every = sequences(folder)

@@ -1,0 +1,114 @@
+"""The linear response of people in contact, where the derivative of the social force jumps.
+
+The force of the equation, its integration by small steps and the differences are written out here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import Sequence, collate
+from nnode.model import Crowd, make_law
+from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
+
+#: Of the force, in the units of its law: A, k, kappa.
+STRENGTHS = np.array([2.0, 30.0, 20.0])
+B, R, TAU = 0.1, 0.25, 0.5
+GOAL = np.array([20.0, 0.0])
+#: Of the one who walks, and of two whom he meets, the first one in contact: m, m/s.
+START, OTHERS = np.array([0.0, 0.0, 1.3, 0.0]), np.array([[2.6, 0.32], [4.0, -0.6]])
+PACE, SECONDS = np.array([-1.2, 0.0]), 2.0
+
+
+def acceleration(t: float, y: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+    """Of him, m/s²: relaxation, repulsion, contact and sliding of N = 3 people."""
+    big, k, kappa = strengths
+    x, v = y[:2], y[2:]
+    ahead = (GOAL - x) / np.linalg.norm(GOAL - x)
+    found = (np.linalg.norm(v) * ahead - v) / TAU
+    for place in OTHERS + PACE * t:
+        d = float(np.linalg.norm(x - place))
+        n, touch = (x - place) / d, max(2 * R - d, 0.0)
+        along = np.array([-n[1], n[0]])
+        push = (big * np.exp((2 * R - d) / B) + k * touch) * n
+        found += (push + kappa * touch * ((PACE - v) @ along) * along) / 3
+    return found
+
+
+def integrated(change: np.ndarray, steps: int, fine: int, contact: float) -> np.ndarray:
+    """``(steps + 1, 2)`` positions by Runge and Kutta's method in small steps.
+
+    Args:
+        change: of x, y, vx and vy at the start, of A, k and kappa, and of the size of a push.
+        contact: factor of k and kappa.
+    """
+    h, strengths = SECONDS / steps / fine, STRENGTHS * [1.0, contact, contact] + change[4:7]
+    y = START + change[:4]
+    found = [y[:2]]
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        return np.append(y[2:], acceleration(t, y, strengths) + change[7] * pushed(t))
+
+    for i in range(steps * fine):
+        t = i * h
+        k1 = rate(t, y)
+        k2 = rate(t + h / 2, y + h / 2 * k1)
+        k3 = rate(t + h / 2, y + h / 2 * k2)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(t + h, y + h * k3))
+        if (i + 1) % fine == 0:
+            found.append(y[:2])
+    return np.stack(found)
+
+
+def pushed(t: float) -> np.ndarray:
+    return np.array([np.cos(3 * t), np.sin(5 * t)])
+
+
+def run(steps: int, contact: float) -> RunAlone:
+    """The model's own simulation of him among the paths of the others."""
+    time = np.linspace(0.0, SECONDS, 2 * steps + 1)
+    place = OTHERS + PACE * time[:, None, None]
+    mine = START[:2] + START[2:] * time[:, None]
+    x = np.concatenate([mine[:, None], place], 1)
+    v = np.broadcast_to(np.stack([START[2:], PACE, PACE]), x.shape)
+    goals = np.stack([GOAL, -GOAL, -GOAL])
+    batch = collate([Sequence(name="s", recording="r", time=time, x=x, v=v, destination=goals)])
+    big, k, kappa = STRENGTHS
+    system = Crowd(
+        [make_law("relaxation", tau=TAU),
+         make_law("social_force", A=big, k=k * contact, kappa=kappa * contact, B=B, r=R,
+                  walls=False)]
+    ).double()  # fmt: skip
+    window = torch.zeros(1, dtype=torch.long)
+    around = Surroundings(system.scene(batch), batch.x, batch.v, window, window, SECONDS / steps)
+    own = {name: p.detach()[None] for name, p in system.named_parameters()}
+    start = torch.cat([batch.x[0], batch.v[0]], -1)
+    states = PersonAlone(around, system, own).simulated(start, steps)[:, 0]
+    return RunAlone(around, system, states)
+
+
+def errors(steps: int, contact: float) -> np.ndarray:
+    """Of the responses to each change, the largest by the size of the response."""
+    one = run(steps, contact)
+    by_start, by_push = (part[0].numpy() for part in one.unit_responses())
+    columns = [one.of_people(field)[0].numpy() for field in one.parameters([1e-4] * 3)]
+    columns.append(np.concatenate([pushed(t) for t in np.linspace(0.0, SECONDS, steps + 1)]))
+    found = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
+    fine, small = 1600 // steps, 1e-5
+    away = []
+    for unit, response in zip(np.eye(8), found, strict=True):
+        after, before = (integrated(s * small * unit, steps, fine, contact) for s in (1, -1))
+        wanted = (after - before) / (2 * small)
+        away.append(np.abs(response - wanted).max() / np.abs(wanted).max())
+    return np.array(away)
+
+
+@pytest.mark.parametrize(("contact", "order", "most"), [(0.0, 2, 0.01), (1.0, 1, 0.1)])
+def test_responses_are_differences_of_simulations(contact: float, order: int, most: float) -> None:
+    """Where the force has no corner, the error has the order of the interpolation of its derivative
+    between the steps. At a contact this derivative jumps within a step."""
+    coarse, fine = errors(25, contact), errors(100, contact)
+    assert fine.max() < most
+    assert fine.max() < 2 * coarse.max() / 4**order
