@@ -102,11 +102,12 @@ def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) 
         fixed: only deviations are estimated; parameters are the system's, variances those before.
     """
     model, known = Followers(system, paths, before.random), before.estimate
-    variances, low, high = known.variances, model.low, model.high
+    variances, low, high = _started(known.variances, model), model.low, model.high
     if fixed:
         variances = replace(variances, low=variances.row, high=variances.row)
         low = high = model.start
-    same = before.model.paths.names == paths.names and len(known.start) == len(paths.agent)
+    same = before.model.paths.names == paths.names
+    same &= known.start.shape == (len(paths.agent), model.starts)
     found = estimate(
         model, before.noise, model.start, variances, low=low, high=high,
         longest=LONGEST, tolerance=TOLERANCE,
@@ -225,7 +226,7 @@ def _variances(model: Followers) -> Variances:
     position = START_POSITION * paths.error
     low_speed, high_speed, speed = START_SPEED
     starts, least, most = [position], [position], [position]
-    if order > 1:
+    for _ in range(model.starts - 1):  # of speeds, and of what terms remember
         starts, least, most = [*starts, speed], [*least, low_speed], [*most, high_speed]
     return Variances(
         noise=np.array([push, np.clip(LASTING, short, long)]),
@@ -234,6 +235,19 @@ def _variances(model: Followers) -> Variances:
         low=np.array([low_push, short, *[LEAST_SPREAD] * number, *least]),
         high=np.array([high_push, long, *[MOST_SPREAD] * number, *most]),
     )
+
+
+def _started(variances: Variances, model: Followers) -> Variances:
+    """With the standard deviations of as many starts as a model has."""
+    number, usual = len(variances.start), _variances(model)
+    if number == model.starts:
+        return variances
+    kept = min(number, model.starts)
+    start = np.append(variances.start[:kept], usual.start[kept:])
+    ends = len(variances.row) - number
+    low = np.append(variances.low[:ends], usual.low[-model.starts :])
+    high = np.append(variances.high[:ends], usual.high[-model.starts :])
+    return replace(variances, start=start, low=low, high=high)
 
 
 def _widened(variances: Variances) -> Variances:

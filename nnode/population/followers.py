@@ -188,12 +188,18 @@ def _named(ahead: np.ndarray) -> dict[str, np.ndarray]:
     return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
+def _followed(lane: LaneDynamics) -> int:
+    """States through which disturbances act, those at the start as well."""
+    number = len(lane.rates)
+    return number if number <= lane.order + STATES else lane.order
+
+
 @cache
 def _slopes(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
     """Derivatives of the rates by the states through which disturbances act: which, and a function
     of all."""
     states = list(lane.rates)
-    number = len(states) if len(states) <= lane.order + STATES else lane.order
+    number = _followed(lane)
     found = [
         ((p, states.index(name)), slope)
         for p, state in enumerate(states[:number])
@@ -215,6 +221,7 @@ class Followers:
     Attributes:
         names: P names of the parameters.
         law: ``(P,)`` True for those of the law; logs: for those that are varied in logarithms.
+        starts: number H of states whose start is estimated.
         random: ``(Q,)`` numbers of those that differ between drivers.
 
     Raises:
@@ -229,7 +236,7 @@ class Followers:
                 "drivers who differ need a model of a lane whose law and effects are formulas of "
                 "the positions and speeds of the vehicles ahead; take drivers=none"
             )
-        self.lane = lane
+        self.lane, self.starts = lane, _followed(lane)
         self.vector = ParameterVector(system)
         symbols = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
         self._symbols = [symbols[place] for place in self.vector.places]
@@ -283,7 +290,9 @@ class Followers:
         """``(K, M, R, F)`` states of R runs.
 
         Args:
-            theta: ``(R, P, F)`` parameters. start: ``(R, 2, F)`` positions and speeds at the start.
+            theta: ``(R, P, F)`` parameters.
+            start: ``(R, H, F)`` deviations of the first H states at the start, from what was
+                measured and from what terms begin with.
             pushed: what is added to the highest rate.
         """
         paths, order = self.paths, self.lane.order
@@ -300,14 +309,18 @@ class Followers:
                 found[order - 1] += pushed(at, y, found)
             return found
 
-        motion = list(start.transpose(1, 0, 2)[:order])
+        shape = len(theta), len(paths.agent)
+        begin = np.stack([np.broadcast_to(one, shape) for one in paths.start[:order]])
+        begin += start.transpose(1, 0, 2)[:order]
         if self._starts is not None:
-            at = {**given, "x": start[:, 0], "v": start[:, 1], "t": 0.0, **_named(paths.ahead[0])}
-            motion += [np.broadcast_to(one, motion[0].shape) for one in self._starts(at)]
+            at = {**given, "x": begin[0], "v": begin[-1], "t": 0.0, **_named(paths.ahead[0])}
+            if order == 1:
+                at["v"] = np.broadcast_to(paths.start[1], shape)
+            added = [np.broadcast_to(one, shape) for one in self._starts(at)]
+            begin = np.concatenate([begin, np.stack(added)])
+            begin[order : start.shape[1]] += start.transpose(1, 0, 2)[order:]
         with np.errstate(all="ignore"):
-            return simulated(
-                rate, np.stack(motion), paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9
-            )
+            return simulated(rate, begin, paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9)
 
     def _given(self, theta: np.ndarray) -> dict[str, Any]:
         """What does not change in runs with parameters ``(R, P, F)``."""
@@ -323,21 +336,20 @@ class Followers:
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
         paths, order = self.paths, self.lane.order
-        own, begin = self.spread(theta, agents), paths.start.copy()
-        begin[:order] += start.T if start.size else 0.0
-        number = len(theta)
-        runs = np.repeat(own[None], 1 + 2 * (number + order), 0)
+        own, number, several = self.spread(theta, agents), len(theta), self.starts
+        begin = start.T if start.size else np.zeros((several, len(paths.agent)))
+        runs = np.repeat(own[None], 1 + 2 * (number + several), 0)
         begins = np.repeat(begin[None], len(runs), 0)
         for p in range(number):
             runs[1 + 2 * p, p] += DIFFERENCE
             runs[2 + 2 * p, p] -= DIFFERENCE
-        for h in range(order):
+        for h in range(several):
             begins[1 + 2 * (number + h), h] += START_DIFFERENCE
             begins[2 + 2 * (number + h), h] -= START_DIFFERENCE
         states = self.simulate(runs, begins)
         x = states[:, 0].transpose(1, 2, 0)  # (R, F, K)
         higher, lower = x[1::2], x[2::2]
-        step = np.repeat([DIFFERENCE, START_DIFFERENCE], [number, order])
+        step = np.repeat([DIFFERENCE, START_DIFFERENCE], [number, several])
         columns = ((higher - lower) / (2 * step[:, None, None])).transpose(1, 2, 0)
         fixed, first = columns[..., :number], columns[..., number:]
         random = fixed[..., self.random]
@@ -411,10 +423,8 @@ class Followers:
         pushes = fresh.copy()
         for k in range(1, shape[0]):
             pushes[k] = keep * pushes[k - 1] + math.sqrt(1 - keep**2) * fresh[k]
-        begin = paths.start.copy()
-        begin[: self.lane.order] += found.start.T
         own = self.spread(found.theta, agents)
-        x = self.simulate(own[None], begin[None], lambda at, *_: pushes[at])[:, 0, 0].T
+        x = self.simulate(own[None], found.start.T[None], lambda at, *_: pushes[at])[:, 0, 0].T
         return paths.remeasured(x, draw)
 
 

@@ -127,7 +127,8 @@ class FollowersEngine(TrafficEngine):
         _, curve = _parts(system)
         run = self._run_of(system, row)
         theta = run.model.at(row.numpy()[: len(run.model.names)])
-        columns = run.model(theta, *self._deviations(run.model)).fixed
+        agents, start = self._deviations(run.model)
+        columns = run.model(theta, agents, start).fixed
         natural = run.model.natural(theta)
         columns = columns / np.where(run.model.logs, natural, 1.0)
         if curve is not None:
@@ -253,19 +254,21 @@ class FollowersEngine(TrafficEngine):
     def _deviations(self, model: Followers) -> tuple[np.ndarray, np.ndarray]:
         """Estimated deviations of drivers ``(D, Q)`` and of starts ``(F, H)``; none for another
         law than the one they were estimated with."""
-        known = self.population
+        known, start = self.population, np.zeros((len(model.paths.agent), model.starts))
         if known is None or len(known.model.random) != len(model.random):
-            return np.zeros((0, 0)), np.zeros((0, 0))
-        return known.estimate.agents, known.estimate.start
+            return np.zeros((0, 0)), start
+        # what other terms remember at the start is nothing to this model's
+        same = model.starts == known.model.starts
+        shared = model.starts if same else model.lane.order
+        start[:, :shared] = known.estimate.start[:, :shared]
+        return known.estimate.agents, start
 
     def _simulated(self, system: System, rows: Tensor) -> tuple[Followers, np.ndarray]:
         """``(K, M, R, F)`` states of R runs at the drivers' estimates."""
         plain, curve = _parts(system)
         model = self._model(plain, rows.amin(0)[: len(rows[0]) - (curve is not None)])
         agents, start = self._deviations(model)
-        number, begin = len(model.names), model.paths.start.copy()
-        if start.size:
-            begin[: model.lane.order] += start.T
+        number, begin = len(model.names), start.T
         theta = [model.spread(model.at(row.numpy()[:number]), agents) for row in rows]
         pushed = None if curve is None else self._pushed(model, curve, rows[:, -1])
         return model, model.simulate(np.stack(theta), np.stack([begin] * len(rows)), pushed)
@@ -275,10 +278,12 @@ class FollowersEngine(TrafficEngine):
         model, states = self._simulated(system, rows)
         away = model.paths.x - states[:, 0].transpose(1, 2, 0)
         agents, start = self._deviations(model)
-        if self.population is not None and start.size:
+        if self.population is not None:
             data = self.population.estimate.data
-            away = away + np.einsum("fkq,fq->fk", data.random, agents[model.paths.agent])
-            away = away + np.einsum("fkh,fh->fk", data.start, start)
+            both = min(data.start.shape[-1], start.shape[-1])
+            away = away + np.einsum("fkh,fh->fk", data.start[..., :both], start[:, :both])
+            if agents.size:
+                away = away + np.einsum("fkq,fq->fk", data.random, agents[model.paths.agent])
         return away, model, states
 
     def _take(self, population: Population) -> None:

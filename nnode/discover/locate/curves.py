@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,12 +12,11 @@ from scipy import stats
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.discover.lanes.followers import FollowersEngine
+from nnode.discover.lanes.bias import made, score_bias
 from nnode.discover.residuals.engine import Engine, square_of
-from nnode.discover.residuals.fit import ROUGH, Fit, evaluated, grams, refine, sums
+from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
 from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.leverage import orthonormal
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
@@ -77,32 +77,14 @@ def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> l
         first += len(look.squares)
         p_value = float((least <= own + 1e-12).mean())
         if p_value < rules().sure and not look.variable.lengths:
-            drawn = _simulated(engine, fit, seed) if drawn is None else drawn
-            look = _Look(engine, fit, screen, look.variable, _bias(drawn, look.variable))
+            drawn = made(engine, fit, seed) if drawn is None else drawn
+            columns = partial(columns_of, variable=look.variable)
+            bias = score_bias(drawn, columns, engine.cluster)
+            look = _Look(engine, fit, screen, look.variable, bias)
             own = min(at_least(row)[0] for row in look.squares)
             p_value = float((least <= own + 1e-12).mean())
         found.append(look.best(before, p_value))
     return sorted(found, key=lambda one: -one.gain.gain)
-
-
-def _simulated(engine: Engine, fit: Fit, seed: int) -> list[tuple[Engine, Fit]]:
-    """What the model would leave of paths that it has made itself; nothing where an engine makes
-    none."""
-    if not isinstance(engine, FollowersEngine):
-        return []
-    drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
-    return [(one, evaluated(one, fit.system)) for one in drawn]
-
-
-def _bias(drawn: list[tuple[Engine, Fit]], variable: Variable) -> np.ndarray | float:
-    """``(G, M)`` scores of a curve's weights where there is none: the linearisation at drivers'
-    estimates and the errors of smoothed leaders make some."""
-    parts = []
-    for engine, fit in drawn:
-        basis, columns = orthonormal(fit.tangents), columns_of(engine, fit, variable)
-        rest = columns - basis @ (basis.T @ columns)
-        parts.append(sums(rest, engine.cluster, fit.residual))
-    return np.mean(parts, 0) if parts else 0.0
 
 
 class _Look:

@@ -6,10 +6,12 @@ import copy
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.discover.lanes.bias import Made, made, score_bias
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves
 from nnode.discover.name.candidate import Candidate, calibrated
@@ -20,7 +22,7 @@ from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import compare, heldout, outdone, there
 from nnode.discover.statistics.profile import moved
-from nnode.discover.statistics.score import Score, Screen, traces
+from nnode.discover.statistics.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of, without
@@ -139,7 +141,7 @@ def search(
     found, levels = Search(fit), levels or {}
     doubtful: Search | None = None  # as it was before an effect that a curve outdoes
     while True:
-        screen = _screened(engine, found, effects, seed, levels, within)
+        screen = _screened(engine, found, effects, seed, levels, within, alpha)
         found.first = found.first or found.scores
         if len(found.steps) >= most:
             break
@@ -164,7 +166,7 @@ def search(
         log.info("added %s", step.chosen.name)
     if doubtful is not None:  # the filter is that of a model with more effects
         found = replace(doubtful, fit=settled(engine, doubtful.fit.system, rounds=1))
-        _screened(engine, found, effects, seed, levels, within)
+        _screened(engine, found, effects, seed, levels, within, alpha)
     return _pruned(engine, found)
 
 
@@ -175,6 +177,7 @@ def _screened(
     seed: int,
     levels: dict[str, np.ndarray],
     within: Callable[[float], None],
+    alpha: float,
 ) -> Screen:
     """Give all effects that a model lacks their scores."""
     own = {effect.name for effect in effects_of(found.fit.system)}
@@ -185,7 +188,27 @@ def _screened(
     within((begun + 0.5) / (begun + 2))
     found.screen = Screen(found.fit, engine.cluster, seed + begun, levels=levels)
     found.scores = found.screen.scores(look)
+    shown = {score.effect.name for score in found.scores if score.p_value <= alpha}
+    if shown and (drawn := made(engine, found.fit, seed)):
+        for effect in left:
+            if effect.name in shown:
+                _unbiased(look, effect, drawn, found.screen)
+        found.screen = Screen(found.fit, engine.cluster, seed + begun, levels=levels)
+        found.scores = found.screen.scores(look)
     return found.screen
+
+
+def _unbiased(look: list[Trace], effect: type[Effect], drawn: Made, screen: Screen) -> None:
+    """Note in an effect's traces what they show in paths that the model has made."""
+    label = screen.label(effect.name)
+    again = {id(fit): traces(engine, fit, effect) for engine, fit in drawn}
+    for k, trace in enumerate(one for one in look if one.effect is effect):
+        columns = {own: every[k].columns for own, every in again.items()}
+        trace.bias = score_bias(drawn, partial(_columns, columns), label)
+
+
+def _columns(known: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
+    return known[id(fit)]
 
 
 def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> Step | None:

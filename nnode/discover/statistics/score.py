@@ -48,11 +48,13 @@ class Trace:
         effect: its class.
         probes: one; or the neighbouring cells of an effect on an interval.
         columns: ``(n, k)`` per unit of each strength of the probe, or per cell.
+        bias: ``(G, k)`` scores where there is no effect.
     """
 
     effect: type[Effect]
     probes: list[Probe]
     columns: np.ndarray
+    bias: np.ndarray | float = 0.0
 
 
 @dataclass
@@ -239,7 +241,7 @@ class Screen:
 
     def _single(self, trace: Trace) -> Score:
         z, label = self.beyond(trace.columns), self.label(trace.effect.name)
-        parts = self.parts(z, label)
+        parts = self.parts(z, label) - trace.bias
         grams = grams_of(z, label)
         minimal = minimal_of(trace.effect, z.shape[1])
         less = _less(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
@@ -270,7 +272,7 @@ class Screen:
     def _interval(self, trace: Trace) -> list[Score]:
         """The best interval of neighbouring cells."""
         z, label = self.beyond(trace.columns), self.label(trace.effect.name)
-        parts = self.parts(z, label)
+        parts = self.parts(z, label) - trace.bias
         grams = grams_of(z, label)
         cells = z.shape[1]
         first, last = np.triu_indices(cells)

@@ -1,0 +1,52 @@
+"""Scores of effects where there are none, by simulation.
+
+The linearisation at drivers' estimates and the errors of smoothed leaders shift scores a little,
+which many data would tell from nothing. So the calibrated model makes paths of its own; what is
+scored there is the shift. Draws come in pairs of opposite signs, in which what is linear in pushes,
+deviations and errors cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from nnode.discover.lanes.followers import FollowersEngine
+from nnode.discover.residuals.engine import Engine
+from nnode.discover.residuals.fit import Fit, evaluated, sums
+from nnode.discover.statistics.leverage import orthonormal
+
+#: Engines of paths that a model has made, and what it leaves of them.
+Made = list[tuple[Engine, Fit]]
+
+
+def made(engine: Engine, fit: Fit, seed: int) -> Made:
+    """What a calibrated model leaves of paths that it has made; nothing where the engine makes
+    none, or where the model blows up.
+
+    Args:
+        seed: of the draws.
+    """
+    if not isinstance(engine, FollowersEngine):
+        return []
+    drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
+    found: Made = [(one, evaluated(one, fit.system)) for one in drawn]
+    return found if all(np.isfinite(own.residual).all() for _, own in found) else []
+
+
+def score_bias(
+    drawn: Made, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
+) -> np.ndarray | float:
+    """``(G, k)`` mean scores of directions by cluster in paths that a model has made.
+
+    Args:
+        columns: of an engine and a fit the directions ``(n, k)``.
+        label: ``(n,)`` clusters.
+    """
+    parts = []
+    for engine, fit in drawn:
+        basis, every = orthonormal(fit.tangents), columns(engine, fit)
+        parts.append(sums(every - basis @ (basis.T @ every), label, fit.residual))
+    return np.asarray(np.mean(parts, 0)) if parts else 0.0
