@@ -1,0 +1,194 @@
+"""The diagnosis of lanes where drivers differ: ``python -m benchmarks.drivers --seed N --cases K``.
+
+Every case is 40 platoons of six vehicles for 30 s at 5 Hz, by ``lin`` or ``idm``, in which one
+effect is hidden or none. Drivers' parameters are log-normal (``lin``: v0; ``idm``: T and v0) with a
+standard deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of
+0.06 m. Paths are integrated here, in steps of 0.02 s by Euler's method; everything else is the
+package's public interface. The cases of a run are fixed by its seed. The table has a row per case;
+what is printed last counts them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import nnode
+from nnode.discover.options import DiscoverOptions
+
+#: Platoons, vehicles, s, step and sampling interval, s, errors of measurement, m.
+PLATOONS, VEHICLES, SECONDS, STEP, DT, ERROR = 40, 6, 30.0, 0.02, 0.2, 0.06
+#: s that pushes last; their standard deviation by law, m/s and m/s².
+LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06}
+#: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s.
+HIDDEN = {
+    "lin": {
+        "speed_zone": 0.9, "relative_speed": 0.2, "multi_anticipation": 0.2, "inertia": 0.3,
+        "reaction_delay": 0.3,
+    },
+    "idm": {
+        "speed_zone": 0.6, "relative_speed": 0.2, "multi_anticipation": 0.2, "reaction_delay": 0.6,
+    },
+}  # fmt: skip
+ZONE = (250.0, 420.0)
+V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
+
+
+def platoons(law: str, effect: str, spread: float, seed: int) -> pd.DataFrame:
+    """A tidy table of measured positions, m.
+
+    Args:
+        effect: a name of :data:`HIDDEN`, or ``none``.
+        spread: standard deviation of the logarithms of drivers' parameters.
+    """
+    rng = np.random.default_rng(seed)
+    shape, size = (PLATOONS, VEHICLES - 1), HIDDEN[law].get(effect, 0.0)
+    own_v0, own_t = (np.exp(spread * rng.normal(size=shape)) for _ in range(2))
+    mean, phase = rng.uniform(11, 17, (PLATOONS, 1)), rng.random((PLATOONS, 4))
+    height, period = rng.normal(0, 1.3, (PLATOONS, 4)), np.array([7.0, 13.0, 21.0, 34.0])
+    v0, gap_time = V0 * own_v0, T * own_t
+    gap = LENGTH / np.maximum(1 - mean / v0, 0.15)
+    if law == "idm":
+        gap = CAR + (S0 + mean * gap_time) / np.sqrt(np.maximum(1 - (mean / v0) ** 4, 0.2))
+    gap = gap * rng.uniform(0.9, 1.2, shape)
+    x = rng.uniform(0, 300, (PLATOONS, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
+    v, push = np.repeat(mean, VEHICLES, 1), PUSH[law] * rng.normal(size=shape)
+    keep, late = np.exp(-STEP / LASTS), round(size / STEP) if effect == "reaction_delay" else 0
+    past: list[tuple[np.ndarray, np.ndarray]] = []
+    slow, rows = np.repeat(mean, VEHICLES - 1, 1), []
+    for k in range(round(SECONDS / STEP) + 1):
+        if k % round(DT / STEP) == 0:
+            rows.append(x + ERROR * rng.normal(size=x.shape))
+        angle = 2 * np.pi * (k * STEP / period + phase)
+        lead = np.maximum(mean[:, 0] + (height * np.sin(angle)).sum(1), 2.0)
+        v[:, 0] = lead
+        past = [*past, (x, v.copy())][-late - 1 :]
+        at, speed = past[0] if late else (x, v)
+        wish = v0.copy()
+        if effect == "speed_zone":
+            wish[(x[:, 1:] > ZONE[0]) & (x[:, 1:] < ZONE[1])] *= size
+        if law == "lin":
+            wanted = _wanted(at, wish, effect, size)
+            slow = slow + STEP / size * (wanted - slow) if effect == "inertia" else wanted
+            after = np.maximum(slow + push, 0.0)
+            if effect == "relative_speed":
+                ahead = lead
+                for i in range(VEHICLES - 1):
+                    ahead = after[:, i] = after[:, i] + size * (ahead - slow[:, i])
+            v = np.column_stack([lead, after])
+            x = x + STEP * v
+        else:
+            rate = _rate(at, speed, wish, gap_time, effect, size) + push
+            after = np.maximum(v[:, 1:] + STEP * np.clip(rate, -8.0, 5.0), 0.0)
+            x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
+            v = np.column_stack([lead, after])
+        push = keep * push + PUSH[law] * np.sqrt(1 - keep**2) * rng.normal(size=shape)
+    return _table(law, np.array(rows))
+
+
+def _wanted(x: np.ndarray, v0: np.ndarray, effect: str, size: float) -> np.ndarray:
+    gap = np.maximum(x[:, :-1] - x[:, 1:], 0.6 * LENGTH)
+    found = v0 * (1 - LENGTH / gap)
+    if effect == "multi_anticipation":
+        found[:, 1:] += size * (v0[:, 1:] * (1 - LENGTH / gap[:, :-1]) - found[:, 1:])
+    return found
+
+
+def _rate(
+    x: np.ndarray, v: np.ndarray, v0: np.ndarray, gap_time: np.ndarray, effect: str, size: float
+) -> np.ndarray:
+    own, ahead, gap = v[:, 1:], v[:, :-1], np.maximum(x[:, :-1] - x[:, 1:] - CAR, 0.3)
+
+    def law(gap: np.ndarray, ahead: np.ndarray, at: slice) -> np.ndarray:
+        away = own[:, at] * (own[:, at] - ahead) / (2 * np.sqrt(A * B))
+        wish = S0 + np.maximum(own[:, at] * gap_time[:, at] + away, 0.0)
+        found: np.ndarray = A * (1 - (own[:, at] / v0[:, at]) ** 4 - (wish / gap) ** 2)
+        return found
+
+    found = law(gap, ahead, slice(None))
+    if effect == "relative_speed":
+        found += size * (ahead - own)
+    if effect == "multi_anticipation":
+        second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
+        found[:, 1:] += size * (law(second, v[:, :-2], slice(1, None)) - found[:, 1:])
+    return found
+
+
+def _table(law: str, x: np.ndarray) -> pd.DataFrame:
+    samples, number, agents = x.shape
+    run = np.arange(number)[:, None]
+    clock = DT * np.arange(samples)[:, None, None] + 100.0 * run
+    columns = {"sequence": run, "time": clock.round(6), "x": x}
+    columns["agent"] = agents * run + np.arange(agents)
+    if law == "idm":
+        columns["length"] = np.array(CAR)
+    return pd.DataFrame({k: np.broadcast_to(v, x.shape).ravel() for k, v in columns.items()})
+
+
+def cases(seed: int, number: int, spread: float) -> list[dict[str, Any]]:
+    """Half of them with nothing hidden; laws and effects take turns."""
+    found = []
+    for k in range(number):
+        law = ("lin", "idm")[k // 2 % 2]
+        names = list(HIDDEN[law])
+        effect = "none" if k % 2 == 0 else names[k // 4 % len(names)]
+        found.append({"law": law, "effect": effect, "spread": spread, "seed": seed + k})
+    return found
+
+
+def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
+    """The case with what was said of it."""
+    begun, table = time.monotonic(), platoons(**case)
+    found = nnode.diagnose(
+        table, "traffic", model=case["law"], options=DiscoverOptions(page=False, replay=False)
+    ).plain()
+    names = [one["name"] for one in found["effects"]]
+    others = {other["name"] for one in found["effects"] for other in one["alternatives"]}
+    hidden = {case["effect"]} - {"none"}
+    values = [one["coefficients"] for one in found["effects"] if one["name"] in hidden]
+    drivers = {one["name"]: one for one in found["drivers"]}
+    return {
+        **case,
+        "verdict": found["verdict"], "names": " ".join(names), "others": " ".join(sorted(others)),
+        "exact": set(names) == hidden and not others
+        and found["verdict"] == ("named" if hidden else "none"),
+        "among": hidden <= set(names) | others, "false": bool(set(names) - hidden),
+        "size": HIDDEN[case["law"]].get(case["effect"], np.nan),
+        "estimate": next(iter(values[0].values()))["value"] if values else np.nan,
+        **{
+            f"{name} (%)": round(drivers[name]["estimate"], 1) if name in drivers else 0.0
+            for name in ("v0", "T")
+        },
+        "seconds": round(time.monotonic() - begun, 1),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, required=True, help="of the first case")
+    parser.add_argument("--cases", type=int, default=24)
+    parser.add_argument("--spread", type=float, default=15.0, help="between drivers, percent")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
+    given = parser.parse_args()
+    given.table.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
+        for row in pool.imap(diagnosed, cases(given.seed, given.cases, given.spread / 100)):
+            rows.append(row)
+            pd.DataFrame(rows).to_csv(given.table, index=False)
+            print(" ".join(f"{k}={v}" for k, v in row.items()), flush=True)
+    table = pd.DataFrame(rows)
+    counts = table.groupby(["law", table.effect != "none"])[["exact", "among", "false"]]
+    print(counts.agg(["sum", "count"]).to_string())
+    print(f"table: {given.table}")
+
+
+if __name__ == "__main__":
+    main()
