@@ -1,6 +1,6 @@
 """Measured positions with holes and noise: interpolated, smoothed, and how noisy they are.
 
-Local cubics (Savitzky & Golay 1964) do both. Holes of up to ``data.max_hole`` seconds are filled.
+Local cubics (Savitzky & Golay 1964) do both. Holes of up to ``data.fill`` seconds are filled.
 Smoothing is off by default: a model is calibrated to what was measured. Positions from video carry
 errors that differences amplify; ``data.smooth`` asks for the positions and speeds of local cubics
 instead, and ``data.start_speeds=smoothed`` for first speeds by parabolas, positions as they are.
@@ -208,39 +208,6 @@ def fill(x: np.ndarray, step: float, longest: float) -> tuple[np.ndarray, np.nda
             x[hole, n] = across(time, own, int(i), hole * step)
             filled[hole, n] = True
     return x, filled
-
-
-def bridge(
-    time: np.ndarray, x: np.ndarray, longest: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A record with the samples of its short holes added, see :func:`across`.
-
-    Args:
-        time: ``(K,)`` s, ascending, of the known samples.
-        x: ``(K, D)`` m.
-        longest: s; holes in which more time is missing stay, and so do those that are no multiple
-            of the usual step, to a tenth of it.
-
-    Returns:
-        All times, all positions, and the times that were added.
-    """
-    steps = np.diff(time)
-    if not steps.size:
-        return time, x, time[:0]
-    usual = float(np.median(steps))
-    number = np.round(steps / usual)
-    hole = (number > 1) & ((number - 1) * usual <= longest + 1e-6)
-    hole &= np.abs(steps - number * usual) <= 0.1 * usual
-    if not hole.any():
-        return time, x, time[:0]
-    places, times, values = [], [], []
-    for i in map(int, np.flatnonzero(hole)):
-        at = np.linspace(time[i], time[i + 1], int(number[i]) + 1)[1:-1]
-        places += [i + 1] * len(at)
-        times.append(at)
-        values.append(across(time, x, i, at))
-    added = np.concatenate(times)
-    return np.insert(time, places, added), np.insert(x, places, np.concatenate(values), 0), added
 
 
 def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from nnode.data.options import NgsimOptions, VehicleTableOptions
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import BEARABLE, bridge, fill, measured_noise, smooth
+from nnode.data.smooth import BEARABLE, fill, measured_noise, smooth
 from nnode.errors import ConfigError
 
 DOCS = Path(__file__).parents[2] / "docs" / "data.md"
@@ -176,9 +176,3 @@ def test_a_hole_does_not_bias_speeds() -> None:
     longer = x.copy()
     longer[20:26] = np.nan
     assert not fill(longer[:, None, None], 0.1, 0.5)[1].any()
-    whole, places, added = bridge(
-        np.delete(time, range(20, 25)), np.delete(x, range(20, 25))[:, None], 0.5
-    )
-    np.testing.assert_allclose(whole, time, atol=1e-9)
-    np.testing.assert_allclose(places[:, 0], x, atol=1e-9)
-    assert len(added) == 5

@@ -14,13 +14,14 @@ from nnode.data.check.rows import in_memory, scaled
 from nnode.data.check.scale import Medians, Scale, medians
 from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
 from nnode.data.check.tracks import Tracks, tracks_from
+from nnode.data.cut import Reading
 from nnode.data.options import DataOptions, TableOptions, WalkwayOptions
 from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.columns import Table
 from nnode.data.readers.jupedsim import PEOPLE
-from nnode.data.readers.recordings import Reading, reading
+from nnode.data.readers.recordings import reading
 from nnode.data.readers.table import TABLE
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
@@ -199,6 +200,10 @@ def _tried(
             made = FORMATS[type(options)].sequences({key: table}, options)
         left_out = made.left_out if isinstance(made, Reading) else []
         findings += [Finding("left_out", "warning", text) for text in without(made, [], left_out)]
+        findings += [
+            Finding("resampled", "warning", text)
+            for text in (made.notes if isinstance(made, Reading) else [])
+        ]
         return made
     except NNodeError as error:
         findings.append(Finding("reader", "error", f"data={source.group} refuses it: {error}"))

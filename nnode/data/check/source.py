@@ -28,7 +28,6 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.data.readers.highd import TRACKS
-from nnode.data.readers.table import UNEVEN
 
 _NGSIM = {"Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID"}
 #: Column that is made of two, where a table has recordings and sequences in them.
@@ -132,7 +131,7 @@ def _people(
     raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
 ) -> Source:
     columns = {meaning: one.column for meaning, one in found.items()}
-    if "sequence" in columns and _even(tracks):
+    if "sequence" in columns:
         return _tidy(raw, found, scale, path)
     rate = people_rate(tracks)
     steps = max(2, round(rate))
@@ -178,17 +177,6 @@ def people_of(raw: Raw, found: Mapping[str, Meaning], scale: Scale, rate: float)
     for axis in ("x", "y"):
         made[axis] = scale.metres * numbers(frame, columns[axis])
     return made.dropna().astype({"frame": np.int64})
-
-
-def _even(tracks: Tracks) -> bool:
-    """Whether times of every part of a table are equally spaced, apart from holes of single agents,
-    as those of a tidy table must be."""
-    part = np.zeros(len(tracks)) if tracks.part is None else tracks.part
-    for number in np.unique(part):
-        step = np.diff(np.unique(np.round(tracks.time[part == number], 9)))
-        if step.size and (np.abs(step - np.median(step)) > UNEVEN * np.median(step)).any():
-            return False
-    return True
 
 
 def _together(tracks: Tracks) -> bool:
@@ -305,7 +293,7 @@ def _vehicles(
     back = bool(np.median(tracks.x[end, 0] - tracks.x[start, 0]) < 0)
     exact = all(columns.get(name) == name for name in _TABLE)
     cut = "sequence" in columns and "lane" not in columns
-    if cut and not back and _even(tracks) and (exact or _together(tracks)):
+    if cut and not back and (exact or _together(tracks)):
         return _tidy(raw, found, scale, path)
     clock = "time" if "time" in columns else "frame"
     meant = {"vehicle": "agent", "time": clock} | {

@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 
 from nnode.data.exits import Exit, destinations, exits_of, read_exits
-from nnode.data.options import JuelichOptions, Velocity
-from nnode.data.readers.recordings import one_of, positive, raw_files
+from nnode.data.options import JuelichOptions, Velocity, one_of, positive
+from nnode.data.readers.recordings import raw_files
 from nnode.data.sequence import Sequence
 from nnode.data.smooth import fill, smooth_records
 from nnode.errors import ConfigError, DataError
@@ -111,7 +111,7 @@ def cut_people(
     _check_once(path, table)
     _check_dense(path, table)
     frames, ids, x = _positions(table)
-    x, filled = fill(x, 1 / rate, options.max_hole)
+    x, filled = fill(x, 1 / rate, options.fill)
     if options.smooth is not None:
         x = smooth_records(x, 1 / rate, positive("smooth", options.smooth))
     v = _velocity(x, rate, options.velocity)

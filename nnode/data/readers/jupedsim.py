@@ -17,10 +17,10 @@ import pandas as pd
 import shapely
 from shapely.geometry.polygon import orient
 
-from nnode.data.options import WalkwayOptions
+from nnode.data.options import WalkwayOptions, positive
 from nnode.data.readers.columns import Table
 from nnode.data.readers.juelich import cut_people, load_people
-from nnode.data.readers.recordings import positive, table_path
+from nnode.data.readers.recordings import table_path
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 

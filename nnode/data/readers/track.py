@@ -137,7 +137,7 @@ def _sound(run: Run, v: np.ndarray, most: float | None) -> np.ndarray:
 
 def cut_run(run: Run, options: OpenAccOptions) -> Iterator[Sequence]:
     """Cut a run into platoons, see :func:`nnode.data.readers.openacc.read_openacc`."""
-    most = int(options.max_hole / run.dt + 1e-6) - 1  # samples within a hole of that duration
+    most = int(options.fill / run.dt + 1e-6)  # samples that may be missing
     v = _filled(run.v, most)
     gap = _filled(_sound(run, v, options.max_error), most)
     driven = np.stack([_driven(column, run.dt) for column in v.T], 1)

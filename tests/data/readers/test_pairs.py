@@ -119,7 +119,7 @@ def test_a_coarser_grid(tmp_path: Path) -> None:
     [
         ({"spacing": np.linspace(20, 30, 51)}, "one length of the leader"),
         ({"leader": np.arange(51)}, "line 3: column 'leader' holds 1, before it 0"),
-        ({"time": 0.0}, "a second row of one pair at 0 s"),
+        ({"time": 0.0}, "line 3: agent 1 of p stands there a second time at 0 s"),
         ({"x_leader": "?"}, "line 2: column 'x_leader' holds '\\?'"),
     ],
 )
@@ -265,7 +265,7 @@ def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptur
     holed = spaced(3).drop(index=range(5, 51, 5))
     parts = [spaced(1), spaced(2, k=4), holed, spaced(4, spacing=0.2, leader_length=0.5)]
     path = save(tmp_path / "p.csv", *parts)
-    store = prepare(PairOptions(path=str(path), min_samples=10, max_hole=0.0), tmp_path / "store")
+    store = prepare(PairOptions(path=str(path), min_samples=10, fill=0.0), tmp_path / "store")
     left = {entry["name"]: entry["why"] for entry in store.manifest["left_out"]}
     assert left == {
         "pairs/2": "fewer than data.min_samples=10 times",
@@ -277,7 +277,7 @@ def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptur
     assert "records that are left out, as there is no sequence of them: 2 (" in said
     assert "1 of 2 sequences are left out for their faults: overlap in 1" in said
 
-    store = prepare(PairOptions(path=str(path), window=4.0, max_hole=0.0), tmp_path / "store")
+    store = prepare(PairOptions(path=str(path), window=4.0, fill=0.0), tmp_path / "store")
     assert store.manifest["left_out"] == [
         {"name": "pairs/2", "why": "no data.window=4 s without a gap"},
         {"name": "pairs/3", "why": "no data.window=4 s without a gap"},

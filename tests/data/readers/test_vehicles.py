@@ -169,8 +169,8 @@ def test_long_holes_are_not_interpolated(tmp_path: Path) -> None:
     parts = [drive(n, 0, 4, x0) for n, x0 in (("a", 0), ("b", 30), ("c", 60))]
     parts[1] = parts[1][(parts[1].time < 1.05) | (parts[1].time > 2.95)]
     path = save(tmp_path / "t.csv", *parts)
-    assert [s.n_samples for s in read(path, max_hole=1.0)] == [6, 6]
-    assert [s.n_samples for s in read(path, max_hole=2.0)] == [21]
+    assert [s.n_samples for s in read(path, fill=1.0)] == [6, 6]
+    assert [s.n_samples for s in read(path, fill=2.0)] == [21]
 
 
 def test_windows_share_their_boundary_sample(platoon: Path) -> None:
@@ -252,7 +252,10 @@ def test_bad_options(platoon: Path, options: dict, message: str) -> None:
         ("vehicle,time,x\n1,0,0\n1,,2\n", r"line 3: column 'time' holds nothing"),
         ("vehicle,time,x\n1,0,inf\n", r"line 2: column 'x' holds 'inf'"),
         ("vehicle,time,x\n1,0,0\n,0.1,2\n", r"line 3: column 'vehicle' is empty"),
-        ("vehicle,time,x\n1,0,0\n2,0,9\n1,0,1\n", r"line 4: vehicle 1 at time 0 s .* in line 2"),
+        (
+            "vehicle,time,x\n1,0,0\n2,0,9\n1,0,1\n",
+            r"line 4: agent 1 stands .* at 0 s .*in line 2",
+        ),
         ("vehicle,time,x\n1,0,0\n1,0.1,1\n1,0.2,2\n", r"no sequence; at no time are 3 vehicles"),
         ("vehicle,time,x\n1,0,0,5,6\n1,0\n1,2,3,4,5,6,7\n", "cannot be read as a comma-separated"),
     ],
