@@ -46,6 +46,10 @@ class Reading(list[Sequence]):
             self.notes += other.notes
 
 
+#: Agents' records, and the first and the last time of their sequence.
+_Platoon = tuple[list[Record], int, int]
+
+
 @dataclass
 class Member:
     """An agent of a sequence: its name, a row of the table that tells what it is, its records."""
@@ -197,6 +201,46 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
     return Reading(found, notes=notes)
 
 
+def by_presence(
+    every: list[Record],
+    steps: int,
+    least: int = 1,
+    axis: int = 0,
+    view: tuple[float, float] | None = None,
+) -> Iterator[_Platoon]:
+    """Consecutive windows, each with those who are there throughout.
+
+    Windows begin with the first record and share their boundary sample.
+
+    Args:
+        steps: of a window.
+        least: fewest agents.
+        axis, view: m, whoever is there is within these ends of a coordinate at all times.
+    """
+    if not every:
+        return
+    begin = np.array([record.first for record in every])
+    end = np.array([record.last for record in every])
+    low, number = int(begin.min()), end - begin
+    # windows that lie within a record: two records may lie years apart
+    starts = {
+        low + k * steps
+        for a, b in zip(begin[number >= steps], end[number >= steps], strict=True)
+        for k in range(-((low - int(a)) // steps), (int(b) - low) // steps)
+    }
+    for first in sorted(starts):
+        last = first + steps
+        there = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
+        if view is not None:
+            paths = [record.x[first - record.first : last - record.first + 1] for record in there]
+            inside = [
+                (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
+            ]
+            there = [record for record, good in zip(there, inside, strict=True) if good]
+        if len(there) >= least:
+            yield there, first, last
+
+
 def check_cutting(options: LaneOptions) -> None:
     """Refuse options of the cutting that are out of their range.
 
@@ -245,9 +289,6 @@ def chosen_lanes(lane: Any, present: set[str], who: str) -> list[str]:
         if name not in present:
             raise ConfigError(f"data.lane={name}: {who} the lanes {', '.join(known[:20])}")
     return names
-
-
-_Platoon = tuple[list[Record], int, int]
 
 
 def _platoons(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:

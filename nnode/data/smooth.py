@@ -164,52 +164,6 @@ def smoothed(sequence: Sequence, window: float) -> Sequence:
     return replace(sequence, x=x, v=np.maximum(v, 0.0) if x.shape[2] == 1 else v)
 
 
-def smooth_records(x: np.ndarray, step: float, window: float) -> np.ndarray:
-    """``(K, N, D)`` positions of local cubics, every record without a hole by itself.
-
-    Args:
-        x: ``(K, N, D)`` m at equally spaced times, NaN where a sample is missing.
-        step: s, between two times.
-        window: s.
-    """
-    x = x.copy()
-    for n in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[:, n]).all(axis=1))
-        for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-            for d in range(x.shape[2]):
-                x[part, n, d] = smooth(part * step, x[part, n, d], window)[0]
-    return x
-
-
-def fill(x: np.ndarray, step: float, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions with short holes filled, see :func:`across`.
-
-    Holes before the first and behind the last known sample stay, as there is only one side.
-
-    Args:
-        x: ``(K, N, D)`` m at equally spaced times, NaN where a sample is missing.
-        step: s, between two times.
-        longest: s; holes in which more time is missing stay.
-
-    Returns:
-        ``(K, N, D)`` m, and ``(K, N)`` True where a sample was filled.
-    """
-    known = np.isfinite(x).all(axis=2)
-    filled = np.zeros(known.shape, dtype=bool)
-    most = int(longest / step + 1e-6) if step > 0 else 0
-    if known.all() or not most:
-        return x, filled
-    x = x.copy()
-    for n in range(x.shape[1]):
-        rows = np.flatnonzero(known[:, n])
-        time, own = rows * step, x[rows, n]
-        for i in np.flatnonzero((np.diff(rows) > 1) & (np.diff(rows) <= most + 1)):
-            hole = np.arange(rows[i] + 1, rows[i + 1])
-            x[hole, n] = across(time, own, int(i), hole * step)
-            filled[hole, n] = True
-    return x, filled
-
-
 def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarray:
     """Positions in the hole between samples ``i`` and ``i + 1``.
 

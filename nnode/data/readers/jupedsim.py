@@ -17,11 +17,11 @@ import pandas as pd
 import shapely
 from shapely.geometry.polygon import orient
 
+from nnode.data.cut import Reading
 from nnode.data.options import WalkwayOptions, positive
 from nnode.data.readers.columns import Table
-from nnode.data.readers.juelich import cut_people, load_people
+from nnode.data.readers.juelich import cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
-from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 
 #: First bytes of every SQLite database.
@@ -49,7 +49,7 @@ def walkway_files(options: WalkwayOptions) -> dict[str, Path]:
 
 def read_walkway(
     path: Path | Table, options: WalkwayOptions, geometry: Path | None = None
-) -> list[Sequence]:
+) -> Reading:
     """Read one file and cut it, see :func:`nnode.data.readers.juelich.read_juelich`.
 
     Args:
@@ -70,23 +70,23 @@ def read_walkway(
     """
     area = None
     if isinstance(path, Table):
-        people, rate = path.frame, positive("frame_rate", options.frame_rate)
-        path = path.path
+        people = people_of(path.path, path.frame, positive("frame_rate", options.frame_rate))
     elif path.is_file() and _is_database(path):
-        people, rate, area = _read_database(path)
+        table, rate, area = _read_database(path)
         if options.frame_rate not in (None, rate) or options.unit not in (None, "m"):
             raise ConfigError(
                 f"{path} is in m at {rate:g} frames/s, but data.frame_rate={options.frame_rate}, "
                 f"data.unit={options.unit}; leave both out for a database"
             )
+        people = people_of(path, table, rate)
     else:
-        people, rate = load_people(path, options)
+        people = load_people(path, options)
     walls = None
     if geometry is not None:
         walls = walls_of(_text(geometry), str(geometry))
     elif area is not None and not options.walls:
         walls = walls_of(area, f"{path}, table geometry")
-    return cut_people(path, people, rate, options, walls)
+    return cut_people(people, options, walls)
 
 
 def walls_of(wkt: str, where: str) -> np.ndarray:

@@ -164,7 +164,7 @@ def test_several_polygons() -> None:
         ({"rows": [*ROWS, (21.5, 1, 0, 0, 0, 0)]}, ["21.5", "whole numbers"]),
         ({"rows": [*ROWS, (10**12, 1, 0, 0, 0, 0)]}, ["1000000000000", "consecutive"]),
         ({"rows": [*ROWS, (1e300, 1, 0, 0, 0, 0)]}, ["1e+300", "whole numbers"]),
-        ({"rows": [*ROWS, ROWS[0]]}, ["person 1 stands twice in frame 0"]),
+        ({"rows": [*ROWS, ROWS[0]]}, ["frame 0: agent 1 stands there a second time"]),
         ({"areas": (ROOM, ROOM.replace("10", "12"))}, ["2 of them", "data.geometry"]),
         ({"areas": ("POINT (1 1)",)}, ["table geometry", "Point"]),
         ({"extra": "DROP TABLE metadata;"}, ["no table metadata", "trajectory_data"]),
