@@ -156,14 +156,14 @@ class VehicleTableOptions(LaneOptions):
     """A table with one row per vehicle and time (CSV or Parquet).
 
     ``columns`` names the table's columns by what they mean: ``vehicle``, ``time``, ``x``, and
-    where they exist ``lane``, ``speed``, ``length``, ``kind``, ``recording``. Vehicles of two
-    recordings never meet. A column that bears the name of its meaning need not be listed; null
-    leaves an optional one out.
+    where they exist ``lane``, ``speed``, ``length``, ``kind``, ``recording``, ``sequence``.
+    Vehicles of two recordings or sequences never meet. A column that bears the name of its meaning
+    need not be listed; null leaves an optional one out.
     """
 
     name: str = "vehicles"
-    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind, recording where they
-    # exist
+    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind, recording, sequence
+    # where they exist
     columns: dict[str, str | None] = field(default_factory=dict)
     position_unit: str = "m"  # m | ft | cm | km
     length_unit: str | None = None  # null: the unit of the positions
@@ -280,11 +280,16 @@ class JuelichOptions(DataOptions):
 
 @dataclass
 class WalkwayOptions(JuelichOptions):
-    """One file of walking people: PedPy's text, or JuPedSim's SQLite database."""
+    """One file of walking people: PedPy's text, JuPedSim's SQLite database, or a table."""
 
     name: str = "pedpy"
     fill: float = 0.5  # s of missing frames of a person that are interpolated; 0: none
     path: str = MISSING  # the file; relative to data.source where that is given
+    # of a table: {agent: its column, time: ..., x: ..., y: ...} and recording, sequence where they
+    # exist; a column that bears the name of its meaning need not be listed
+    columns: dict[str, str | None] = field(default_factory=dict)
+    position_unit: str = "m"  # of a table: m | ft | cm | km
+    time_unit: str = "s"  # of a table: s | ms | us | ns | frame; dates and durations need none
     geometry: str | None = None  # text file with the walkable area as WKT, m
 
 

@@ -141,7 +141,11 @@ def usual_step(table: Trajectories) -> float:
     names = [n for n in ("recording", "sequence", "agent") if getattr(table, n) is not None]
     code = pd.DataFrame({n: getattr(table, n) for n in names}).groupby(names, sort=False).ngroup()
     order = np.lexsort((table.time, code))
-    step = np.diff(table.time[order])[np.diff(code.to_numpy()[order]) == 0]
+    return usual_interval(np.diff(table.time[order])[np.diff(code.to_numpy()[order]) == 0])
+
+
+def usual_interval(step: np.ndarray) -> float:
+    """The sampling interval (s) that steps are multiples of, see :func:`usual_step`."""
     step = step[step > 0]
     if not step.size:
         return float("nan")

@@ -91,7 +91,7 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
         raise ConfigError(f"data.history={options.history}: expected a number of seconds, or 0")
     number = positive("t_seq", options.t_seq) / dt
     steps = round(number)
-    if steps < 1 or abs(number - steps) > 1e-6:
+    if steps < 1 or abs(number - steps) > 1e-3:
         raise ConfigError(
             f"data.t_seq={options.t_seq:g} s is {number:g} frames at the {1 / dt:g} frames/s of "
             f"{path.name}; expected a whole number, such as t_seq={max(steps, 1) * dt:g}"
@@ -102,7 +102,7 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
     notes: list[str] = []
     for (name,), own in rows.parts("recording"):
         recording = name or rows.name
-        grid = Grid(dt, 0.0 if not name else float(own.time.min()))
+        grid = Grid(dt, float(own.time.min()))
         every = records(own, grid, fill=options.fill, smoothing=options.smooth)
         every = [_with_velocity(record, dt, options) for record in every]
         notes += told_uneven(every, dt)

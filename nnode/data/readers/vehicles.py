@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from nnode.data.options import (
     PairOptions,
     TableOptions,
     VehicleTableOptions,
+    WalkwayOptions,
     one_of,
     positive,
 )
@@ -27,7 +29,7 @@ LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 
 _REQUIRED = ("vehicle", "time", "x")
-_OPTIONAL = ("lane", "speed", "length", "kind", "recording")
+_OPTIONAL = ("lane", "speed", "length", "kind", "recording", "sequence")
 
 
 def vehicle_files(options: LaneOptions) -> dict[str, Path]:
@@ -57,7 +59,17 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> Reading
     return by_lane(rows, options)
 
 
-def seconds_per_unit(options: VehicleTableOptions | TableOptions | PairOptions) -> float:
+def recordings(table: Table, names: Mapping[str, str]) -> np.ndarray | None:
+    """``(rows,)`` names of what never meets: recordings, sequences, or both; None: all is one."""
+    known = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
+    if len(known) < 2:
+        return known[0] if known else None
+    return np.array([" ".join(cells) for cells in zip(*known, strict=True)], dtype=object)
+
+
+def seconds_per_unit(
+    options: VehicleTableOptions | TableOptions | PairOptions | WalkwayOptions,
+) -> float:
     """Seconds in a unit of a table's times.
 
     Raises:
@@ -95,7 +107,7 @@ def _rows(table: Table, options: VehicleTableOptions) -> Trajectories:
         time=_seconds(table, names["time"], options),
         x=table.numbers(names["x"])[:, None] * metres * options.direction,
         v=v,
-        recording=table.names(names["recording"]) if "recording" in names else None,
+        recording=recordings(table, names),
         lane=table.names(names["lane"]) if "lane" in names else None,
         length=length,
         kind=table.names(names["kind"], empty=True) if "kind" in names else None,

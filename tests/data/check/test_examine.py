@@ -218,8 +218,6 @@ def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
     assert "15 frames/s fit" in text_
     # and the file that would be read says so
     assert found.source.group == "pedpy"
-    lines = "\n".join(found.source.convert)
-    exec(compile(lines, "convert", "exec"), {})
     options = found.source.options
     kind = FORMATS[type(options)]
     sequences = kind.read(kind.files(options), options)
@@ -247,7 +245,6 @@ def test_pairs_and_tidy_tables_and_semicolons(tmp_path: Path) -> None:
     cars().to_csv(path, index=False, sep=";", decimal=",")
     found = examine(path)
     assert found.source.group == "vehicles"
-    exec(compile("\n".join(found.source.convert), "convert", "exec"), {})
     options = found.source.options
     kind = FORMATS[type(options)]
     (platoon,) = kind.read(kind.files(options), options)
@@ -328,12 +325,11 @@ def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) 
     assert found.sequences
 
 
-def test_lines_that_make_a_table_make_seconds_of_dates(tmp_path: Path) -> None:
+def test_dates_are_read_from_any_text(tmp_path: Path) -> None:
     path = tmp_path / "german.csv"
     table = cars().assign(t=DATES["dates"](cars()["t"]))
     table.to_csv(path, index=False, sep=";", decimal=",")
     found = examine(path)
-    exec(compile("\n".join(found.source.convert), "convert", "exec"), {})
     options = vehicles(found)
     kind = FORMATS[type(options)]
     (platoon,) = kind.read(kind.files(options), options)
@@ -441,3 +437,57 @@ def test_random_damage_ends_in_words_or_in_findings(tmp_path: Path) -> None:
             refused.append(str(error))
     assert examined > 10
     assert all(str(path) in words for words in refused)
+
+
+def test_people_on_an_oval_keep_the_rate_that_is_told(tmp_path: Path) -> None:
+    """In curves the sway across the way from start to end is none."""
+    k = np.arange(1200)
+    parts = []
+    for i in range(4):
+        angle = 2 * np.pi * (1.0 * k / 25 / 15 + i / 4)
+        x, y = 2.4 * np.cos(angle), 2.4 * np.sin(angle) + 0.02 * np.sin(2 * np.pi * 1.7 * k / 25)
+        parts.append(pd.DataFrame({"id": i, "frame": k, "x": x, "y": y}))
+    head = "# framerate: 25 fps\n# id frame x/m y/m z/m\n"
+    found = examine(text(pd.concat(parts), tmp_path, head))
+    assert "time_scale" not in said(found)
+    assert found.scale.rate == 25.0
+
+
+def test_times_that_are_numbers_of_frames(tmp_path: Path) -> None:
+    table = people(rate=2.5).rename(columns={"id": "ped"}).drop(columns=["vx", "vy"])
+    found = examine(saved(table.assign(timestamp=table.frame), tmp_path))
+    options = cast(WalkwayOptions, found.source.options)
+    assert (options.time_unit, options.frame_rate) == ("frame", 2.5)
+    assert options.columns == {"agent": "ped", "time": "frame"}
+    assert found.sequences[0].dt == pytest.approx(0.4)
+
+
+def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) -> None:
+    path = tmp_path / "people.txt"
+    table = people(12)[["id", "frame", "x", "y"]]
+    path.write_text(
+        "#framerate: 16\n#ID\tFR\tX\tY\n" + table.to_csv(sep="\t", header=False, index=False)
+    )
+    found = examine(path)
+    assert {m: one.column for m, one in found.meanings.items()} == {
+        "agent": "ID", "frame": "FR", "x": "X", "y": "Y",
+    }  # fmt: skip
+    options = cast(WalkwayOptions, found.source.options)
+    assert (options.time_unit, options.frame_rate) == ("frame", 16.0)
+    assert {name for s in found.sequences for name in s.agents} <= set(map(str, range(1, 13)))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("file", "agent"), [("single_file/oval/UX_24_1.txt", "ID"), ("eth_ucy/eth_hotel.parquet", "id")]
+)
+def test_public_tables_of_people_are_read_as_they_are(
+    real_data: Path, file: str, agent: str
+) -> None:
+    if not (real_data / file).is_file():
+        pytest.skip(f"{file} is not there")
+    found = examine(real_data / file)
+    options = cast(WalkwayOptions, found.source.options)
+    assert options.columns["agent"] == agent
+    assert options.time_unit == "frame"
+    assert found.sequences

@@ -247,7 +247,6 @@ def test_bad_options(platoon: Path, options: dict, message: str) -> None:
         ("", "is empty; expected a line of column names"),
         ("vehicle,time,x\n", "has no rows below its columns vehicle, time, x"),
         ("vehicle,t,x\n1,0,0\n", r"no column 'time'; it has: vehicle, t, x.*data.columns.time="),
-        ("vehicle;time;x\n1;0;0\n", "must be separated by commas"),
         ("vehicle,time,x\n1,0,0\n\n1,0.1,abc\n", r"line 4: column 'x' holds 'abc'"),
         ("vehicle,time,x\n1,0,0\n1,,2\n", r"line 3: column 'time' holds nothing"),
         ("vehicle,time,x\n1,0,inf\n", r"line 2: column 'x' holds 'inf'"),
