@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.clusters import clusters, index_of
+from nnode.data.cut import Reading
 from nnode.data.options import Gaps, PairOptions, SplitMode, SplitOptions
 from nnode.data.prepare import prepare
 from nnode.data.quality import find_faults
@@ -103,6 +104,28 @@ def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
     assert (first.time[-1], second.time[0]) == pytest.approx((2.0, 3.0))
     with pytest.raises(DataError, match=r"pair one steps from 2 s to 3 s \(line 23\)"):
         read(path, gaps=Gaps.error)
+
+
+def test_uneven_times_of_pairs_are_interpolated_and_told(tmp_path: Path) -> None:
+    table = drive(0, 50)
+    table["time"] += np.random.default_rng(2).uniform(-0.02, 0.02, 51)
+    table["x_follower"], table["x_leader"] = 10 * table.time, 24 + 11 * table.time
+    path = save(tmp_path / "one.csv", table.drop(columns="spacing"))
+    found = read(path, dt=0.1)
+    assert isinstance(found, Reading)
+    (s,) = found
+    assert "are interpolated to steps of 0.1 s" in found.notes[0]
+    np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time, atol=1e-9)
+    np.testing.assert_allclose(s.x[:, 1, 0], 24 + 11 * s.time, atol=1e-9)
+
+
+def test_pairs_in_frames(tmp_path: Path) -> None:
+    table = drive().assign(time=lambda t: (10 * t.time).round().astype(int))
+    path = save(tmp_path / "one.csv", table)
+    (s,) = read(path, time_unit="frame", frame_rate=10.0)
+    np.testing.assert_allclose(s.time, 0.1 * np.arange(51), atol=1e-12)
+    with pytest.raises(ConfigError, match="frame_rate=None: expected a positive number"):
+        read(path, time_unit="frame")
 
 
 def test_a_coarser_grid(tmp_path: Path) -> None:

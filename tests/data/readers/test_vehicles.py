@@ -118,6 +118,23 @@ def test_interpolates_and_never_extrapolates(tmp_path: Path) -> None:
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
 
 
+def test_uneven_times_are_told_and_a_coarser_grid_is_not(tmp_path: Path) -> None:
+    cars = pd.concat([drive(name, 0, 4, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))])
+    assert read(save(tmp_path / "even.csv", cars)).notes == []  # type: ignore[attr-defined]
+    late = np.random.default_rng(1).uniform(-0.02, 0.02, len(cars))
+    path = save(tmp_path / "road.csv", cars.assign(time=cars.time + late))
+    (note,) = read(path).notes  # type: ignore[attr-defined]
+    assert note.startswith("road: times are uneven: ")
+    assert note.endswith("are interpolated to steps of 0.2 s")
+
+
+def test_recordings_and_sequences_together_tell_rows_apart(tmp_path: Path) -> None:
+    cars = pd.concat([drive(name, 0, 4, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))])
+    parts = [cars.assign(recording=r, sequence=s) for r in "xy" for s in (1, 2)]
+    found = read(save(tmp_path / "road.csv", *parts))
+    assert [s.recording for s in found] == ["x 1", "x 2", "y 1", "y 2"]
+
+
 def test_maximal_intervals(tmp_path: Path) -> None:
     path = save(
         tmp_path / "t.csv",
