@@ -368,3 +368,12 @@ def check_known(asked: Iterable[str], known: Iterable[str]) -> None:
                 f"data.recording={name}: unknown recording; nearest first, the valid ones are: "
                 f"{', '.join(near) or 'none'}"
             )
+
+
+#: Options by their names in prepared folders and checkpoints of earlier versions.
+_BEFORE = {"max_hole": "fill"}
+
+
+def with_present_names(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of data as an earlier version wrote them, under the names that they have now."""
+    return {_BEFORE.get(key, key): value for key, value in told.items()}

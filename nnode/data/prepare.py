@@ -35,6 +35,7 @@ from nnode.data.options import (
     VehicleTableOptions,
     WalkwayOptions,
     positive,
+    with_present_names,
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
 from nnode.data.quality import Fault, find_faults
@@ -360,6 +361,7 @@ def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
 
 def _told(options: Mapping[str, Any]) -> dict[str, Any]:
     """The options that decide what is prepared; of a table's path only the name."""
+    options = with_present_names(options)
     chosen = {k: v for k, v in options.items() if k.partition(".")[0] not in NOT_PREPARATION}
     for key in ("path", "walls", "geometry"):
         if isinstance(chosen.get(key), str):

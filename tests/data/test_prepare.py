@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -271,6 +272,21 @@ def test_vehicles_that_never_meet_are_refused_with_what_to_do(tmp_path: Path) ->
     with pytest.raises(DataError, match=r"data\.fill=SECONDS") as error:
         prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
     assert "faults=keep" not in str(error.value)
+
+
+def test_a_folder_of_an_earlier_version_opens_under_its_names_of_options(tmp_path: Path) -> None:
+    rows = [f"s,{0.1 * k},{a},{30 * a + k}" for a in range(3) for k in range(30)]
+    path = tmp_path / "t.csv"
+    path.write_text("sequence,time,agent,x\n" + "\n".join(rows))
+    options = TableOptions(domain="traffic", path=str(path), fill=0.3)
+    store = prepare(options, tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"fill": 0.3', '"max_hole": 0.3'))
+    assert "max_hole" in manifest.read_text()
+    asked = replace(options, prepared=str(store.folder))
+    assert len(open_data(asked, tmp_path / "new")) == 1
+    with pytest.raises(ConfigError, match=r"data\.fill=0\.3 then, 0\.1 now"):
+        open_data(replace(asked, fill=0.1), tmp_path / "new")
 
 
 def test_noise_stands_in_the_manifest_and_is_no_fault(tmp_path: Path) -> None:

@@ -26,7 +26,10 @@ SUBTITLE = (
 LAWS = ("idm", "fvdm", "ovm", "gipps", "helly", "newell")
 PEOPLE = {"alone": "no interaction", "exponential": "social force", "esf": "elliptical force"}
 #: Predictions that need no calibration.
-SIMPLE = {"constant_velocity": "constant velocity", "preferred": "mean velocity of what is seen"}
+SIMPLE = {
+    "constant_velocity": "constant velocity",
+    "preferred": "mean speed with the stream",
+}
 #: Resamples of an interval.
 DRAWS = 2000
 

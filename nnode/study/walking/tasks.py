@@ -70,7 +70,8 @@ def along_stream(batch: Batch) -> Tensor:
     """``(B, N, 2)`` m/s: preferred speeds in the directions of streams."""
     scene = wanted(Scene.of(batch), batch, "direction")
     way = scene.destination - batch.x[0]
-    return scene.pace[..., None] * way / torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+    length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+    return scene.pace[..., None] * way / length.clamp(min=1e-9)  # who stood wants to stay
 
 
 def straight(batch: Batch, velocity: Tensor) -> Tensor:
