@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from nnode.data.check.scale import AGREE, INTERVAL, RATES, USUAL, Medians, Scale
+from nnode.data.check.scale import AGREE, INTERVAL, RATES, SWAYS, USUAL, Medians, Scale
 from nnode.data.check.tracks import Tracks
 from nnode.data.policy import told_filled
 from nnode.data.quality import KINDS, LIMITS, Fault
@@ -149,7 +149,8 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
         )  # fmt: skip
     clock = known.sway / scale.seconds
     walk = USUAL["crowd"]["sway"]
-    if scale.domain == "crowd" and np.isfinite(clock):
+    fine = known.dt * scale.seconds <= SWAYS
+    if scale.domain == "crowd" and fine and np.isfinite(clock):
         text = f"people sway {clock:.3g} times in a second; expected {walk.low:g} to {walk.high:g}"
         if told is None and scale.rate is not None:
             yield Finding("gait", "note", f"{text}: the frame rate is taken from this")

@@ -460,6 +460,19 @@ def test_times_that_are_numbers_of_frames(tmp_path: Path) -> None:
     assert found.sequences[0].dt == pytest.approx(0.4)
 
 
+def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
+    """At 2.5 positions a second what is left of the sway is the slow turns of the way."""
+    k = np.arange(60)
+    parts = [
+        pd.DataFrame({"id": i, "frame": k + 10 * i, "x": 0.4 * 1.3 * k,
+                      "y": i + 0.5 * np.sin(2 * np.pi * 0.06 * 0.4 * k)})
+        for i in range(12)
+    ]  # fmt: skip
+    found = examine(saved(pd.concat(parts), tmp_path), domain="crowd", rate=2.5)
+    assert "time_scale" not in said(found)
+    assert found.scale.rate == 2.5
+
+
 def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) -> None:
     path = tmp_path / "people.txt"
     table = people(12)[["id", "frame", "x", "y"]]
