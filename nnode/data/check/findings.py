@@ -17,6 +17,7 @@ from nnode.data.quality import KINDS, LIMITS, Fault
 from nnode.data.readers.columns import Table, floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import BEARABLE, Noise, suggested_window
+from nnode.data.trajectories import HOLE, UNEVEN
 
 #: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
 #: over a second: that of gravity, m/s².
@@ -25,8 +26,6 @@ FRICTION = 9.81
 EDGE = 0.1
 #: Share of agents from which on something is told of all.
 FEW = 0.02
-#: A step longer than so many usual ones is a hole.
-HOLE = 1.5
 
 
 @dataclass(frozen=True)
@@ -95,13 +94,13 @@ def sampling(tracks: Tracks) -> Iterator[Finding]:
             "rate", "error", "no agent has two rows at different times; nothing moves here"
         )
         return
-    uneven = np.abs(steps - dt) > 0.01 * dt
+    uneven = np.abs(steps - dt) > UNEVEN * dt
     holes = steps > HOLE * dt
     text = f"sampled every {dt:.4g} s ({1 / dt:.4g} in a second)"
     level = "note"
     if (uneven & ~holes).mean() > FEW:
         level = "warning"
-        text += f"; {(uneven & ~holes).mean():.0%} of the steps differ by more than 1 %"
+        text += f"; {(uneven & ~holes).mean():.0%} of the steps differ by more than {UNEVEN:.0%}"
     if INTERVAL.score(dt) < -2:
         level = "warning"
         text += f"; unusual: {INTERVAL.source}"

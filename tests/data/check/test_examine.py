@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import nnode
 from nnode.data.check.examine import Examination, examine, sure
 from nnode.data.options import PairOptions, VehicleTableOptions, WalkwayOptions
 from nnode.data.prepare import FORMATS
@@ -502,3 +503,23 @@ def test_public_tables_of_people_are_read_as_they_are(
     assert options.columns["agent"] == agent
     assert options.time_unit == "frame"
     assert found.sequences
+
+
+def test_the_window_that_noise_asks_for_reads_and_smooths(tmp_path: Path) -> None:
+    table = cars(4)
+    noisy = table.assign(x=table.x + 0.3 * np.random.default_rng(2).standard_normal(len(table)))
+    path = saved(noisy.drop(columns="v"), tmp_path)
+    text_ = said(examine(path), "warning")["noise"]
+    window = re.search(r"data\.smooth=([\d.]+) \(s\)", text_)
+    assert window is not None
+    raw, smooth = (
+        nnode.sequences(path, data="vehicles", columns={"vehicle": "veh", "time": "t"}, **more)[0]
+        for more in ({}, {"smooth": float(window[1])})
+    )
+    true = table[table.veh == 0].set_index("t").v  # the leader, last in its platoon
+    for s, most in ((raw, None), (smooth, 0.25)):
+        error = s.velocity()[5:-5, -1, 0] - true.loc[s.time[5:-5].round(6)].to_numpy()
+        if most is None:
+            assert np.std(error) > 1.0
+        else:
+            assert np.std(error) < most
