@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nnode.app.python.inputs import data_options
 from nnode.data.prepare import prepare
 from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from nnode.model.build import build_model
 from nnode.study.prediction import printed, tasks
-from nnode.study.prediction.data import AHEAD, SCENES, SEEN, scene
+from nnode.study.prediction.data import AHEAD, SCENES, SEEN, events, scene
 from nnode.study.walking import tasks as walking
 from nnode.study.walking.data import chosen
 
@@ -65,3 +66,12 @@ def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_
         # everybody who is judged was there for all samples that are seen
         (first, *_) = store
         assert first.dt * (SEEN - 1) == pytest.approx(2.8)
+
+
+@pytest.mark.real
+def test_the_configurations_are_those_of_the_study(real_data: Path) -> None:
+    for name, own in (("waymo_pairs", events(str(real_data))), ("eth_ucy", scene("x", ""))):
+        shipped = data_options(name, {"path": own.path, "source": own.source})
+        chosen = ("columns", "time_unit", "frame_rate", "velocity", "history", "t_seq")
+        for key in (key for key in chosen if hasattr(own, key)):
+            assert getattr(shipped, key) == pytest.approx(getattr(own, key)), key
