@@ -115,8 +115,8 @@ def told_uneven(found: Iterable[Record], dt: float) -> list[str]:
     if not number:
         return []
     return [
-        f"times are uneven: {number} of {total} samples ({number / total:.0%}) are interpolated to "
-        f"steps of {dt:g} s"
+        f"times are uneven, or no multiples of {dt:g} s: {number} of {total} samples "
+        f"({number / total:.0%}) are interpolated to steps of {dt:g} s"
     ]
 
 

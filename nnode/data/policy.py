@@ -92,7 +92,7 @@ def without(
     Args:
         read: all sequences.
         dropped: see :func:`apply_policy`.
-        left_out: see :class:`nnode.data.readers.recordings.Reading`.
+        left_out: see :class:`nnode.data.cut.Reading`.
     """
     told = []
     if left_out:

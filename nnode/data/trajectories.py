@@ -90,7 +90,7 @@ class Trajectories:
             yield tuple("" for _ in names), self
             return
         groups = pd.DataFrame(dict(enumerate(known))).groupby(list(range(len(known))), sort=False)
-        for rows in groups.indices.values():
+        for rows in sorted(groups.indices.values(), key=min):
             own = self.at(np.sort(rows))
             columns = (getattr(own, name) for name in names)
             yield tuple("" if column is None else str(column[0]) for column in columns), own

@@ -124,8 +124,14 @@ def test_uneven_times_are_told_and_a_coarser_grid_is_not(tmp_path: Path) -> None
     late = np.random.default_rng(1).uniform(-0.02, 0.02, len(cars))
     path = save(tmp_path / "road.csv", cars.assign(time=cars.time + late))
     (note,) = read(path).notes  # type: ignore[attr-defined]
-    assert note.startswith("road: times are uneven: ")
+    assert note.startswith("road: times are uneven")
     assert note.endswith("are interpolated to steps of 0.2 s")
+
+
+def test_a_grid_that_is_finer_than_the_file_is_told(tmp_path: Path) -> None:
+    cars = pd.concat([drive(name, 0, 9, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))])
+    found = read(save(tmp_path / "road.csv", cars), dt=0.05)
+    assert "no multiples of 0.05 s" in found.notes[0]  # type: ignore[attr-defined]
 
 
 def test_recordings_and_sequences_together_tell_rows_apart(tmp_path: Path) -> None:
