@@ -278,7 +278,7 @@ def _how(scale: Scale) -> str:
 
 def _line(raw: Raw, found: Mapping[str, Meaning], seen: Scaled, group: str) -> str:
     named = ", ".join(f"{meaning} = {one.column}" for meaning, one in found.items())
-    return (
-        f"{raw.path}: recognised {named}; {_words(seen.scale)} ({sure(_share(seen))}); read as "
-        f"data={group}"
-    )
+    words, scale = f"{_words(seen.scale)} ({sure(_share(seen))})", seen.scale
+    if scale.rate is not None and raw.rate not in (None, scale.rate):
+        words = f"{_words(replace(scale, rate=raw.rate))} as it tells; {scale.rate:g} frames/s fit"
+    return f"{raw.path}: recognised {named}; {words}; read as data={group}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,9 @@ def _people(
     if "sequence" in columns and "frame" not in columns:
         return _tidy(raw, found, scale, path)
     dt = usual_interval(tracks.steps)
+    if scale.rate is not None and raw.rate is not None:  # what the file tells is taken
+        dt *= scale.rate / raw.rate
+        scale = replace(scale, rate=raw.rate)
     steps = max(2, round(1 / dt))
     whole = abs(1 / dt - steps) < 1e-3
     own: dict[str, Any] = {} if whole else {"t_seq": float(f"{steps * dt:.9g}")}

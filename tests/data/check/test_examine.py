@@ -12,6 +12,7 @@ import pytest
 
 import nnode
 from nnode.data.check.examine import Examination, examine, sure
+from nnode.data.check.recognise import recognised
 from nnode.data.options import PairOptions, VehicleTableOptions, WalkwayOptions
 from nnode.data.prepare import FORMATS
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
@@ -487,6 +488,21 @@ def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) 
     options = cast(WalkwayOptions, found.source.options)
     assert (options.time_unit, options.frame_rate) == ("frame", 16.0)
     assert {name for s in found.sequences for name in s.agents} <= set(map(str, range(1, 13)))
+
+
+def test_a_rate_that_the_file_tells_is_read_and_doubted(tmp_path: Path) -> None:
+    """Filmed at 16 frames/s, said to be 30: the check says so, the reader takes what is said."""
+    path = tmp_path / "people.txt"
+    table = people()[["id", "frame", "x", "y"]]
+    rows = table.to_csv(sep="\t", header=False, index=False)
+    path.write_text(f"#framerate: 30\n#id\tframe\tx\ty\n{rows}")
+    found = examine(path)
+    assert "time_scale" in said(found)
+    assert cast(WalkwayOptions, found.source.options).frame_rate == 30.0
+    assert found.sequences[0].dt == pytest.approx(1 / 30)
+    line = recognised(path).line
+    assert "times in frames of 1/30 s" in line
+    assert re.search(r"as it tells; 1[56] frames/s fit", line)
 
 
 @pytest.mark.real
