@@ -50,6 +50,7 @@ from nnode.program import configuration
 from nnode.study.options import (
     CrowdStudyOptions,
     FollowingStudyOptions,
+    PredictionStudyOptions,
     TrafficStudyOptions,
     WalkingStudyOptions,
 )
@@ -207,6 +208,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
     ("study", "walking_study_schema"): WalkingStudyOptions,
+    ("study", "prediction_study_schema"): PredictionStudyOptions,
     ("study", "following_study_schema"): FollowingStudyOptions,
 }
 

@@ -134,8 +134,6 @@ def summary(found: Examination, lines: list[str]) -> str:
     else:
         text.append(f"format: {found.raw.native}, whose reader knows its units")
     text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
-    if found.source.convert:
-        text += ["", "no reader takes the file as it is; in Python:", *found.source.convert]
     words = " ".join(lines)
     text += ["", "to read it:", f"  python scripts/prepare_data.py {words}"]
     text += ["to calibrate a model, and to diagnose it:"]
@@ -241,17 +239,11 @@ def _findings(findings: list[Finding]) -> list[Block]:
 
 
 def _usage(found: Examination, lines: list[str]) -> str:
-    text = ""
-    if found.source.convert:
-        made = "\n".join(found.source.convert)
-        text = (
-            f"No reader takes the file as it is. In Python:\n\n```python\n{made}\n```\n\nThen:\n\n"
-        )
     words = " \\\n    ".join(lines)
     commands = [f"python scripts/prepare_data.py {words}"]
     commands += _next(found, words)
     shell, python = "\n".join(commands), "\n".join(python_lines(found))
-    return typed(f"{text}```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```")
+    return typed(f"```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```")
 
 
 def _columns(found: Examination) -> list[Block]:

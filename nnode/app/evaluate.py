@@ -90,6 +90,8 @@ def _cut_alike(*manifests: dict[str, Any]) -> bool:
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     """Write ``metrics.json`` and ``replay.html``, and print the model beside its baselines.
 
+    Of lanes the errors of every follower are printed and written as well.
+
     Raises:
         NNodeError: no such checkpoint, no such data, or data of another domain.
     """
@@ -143,6 +145,13 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
         },
     )
     _print({name: found, **others}, f"{data.name}, {part}: {found.sequences} sequences", convention)
+    if data.domain == "traffic":
+        from nnode.app.followers import follower_errors, write_followers  # loads Matplotlib
+
+        batches = stream(straight_loader(source, indices, data.loader.batch_size), dtype, device)
+        rows = follower_errors(lambda batch: solver(model, batch), batches, store.index)
+        if len(rows):
+            write_followers(rows, folder)
     print(f"metrics: {folder / 'metrics.json'}")
     if config.replay:
         from nnode.app.replay import write_replay  # loads Matplotlib, which takes a second

@@ -23,7 +23,8 @@ log = logging.getLogger(__name__)
 
 #: The module of each study; imported when it is asked for.
 STUDIES = {
-    name: f"nnode.study.{name}.study" for name in ("traffic", "crowd", "following", "walking")
+    name: f"nnode.study.{name}.study"
+    for name in ("traffic", "crowd", "following", "walking", "prediction")
 }
 
 #: Folder of quick studies inside the study's own: they must not replace full results.

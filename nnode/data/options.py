@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, ClassVar
 
 from omegaconf import MISSING
+
+from nnode.errors import ConfigError
 
 
 class Faults(str, Enum):
@@ -98,8 +102,9 @@ class DataOptions:
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop
-    # s; missing samples are interpolated where no more time than this is missing; 0: nowhere
-    max_hole: float = 0.5
+    # s; missing samples are interpolated where no more time than this is missing, longer holes cut
+    # a record in two; 0: nothing is interpolated
+    fill: float = 0.5
     # s, window of the local cubics that smooth positions and give speeds; null: as measured
     smooth: float | None = None
     # whether one identifier in two sequences of a recording is one agent
@@ -119,7 +124,7 @@ class EsimasOptions(DataOptions):
 
     name: str = "esimas"
     domain: str = "traffic"
-    max_hole: float = 0.0  # the published sequences as they are
+    fill: float = 0.0  # the published sequences as they are
     min_vehicles: int = 3  # 2 or 3: which of the two published families
 
 
@@ -132,7 +137,6 @@ class LaneOptions(DataOptions):
     kinds: Any = field(default_factory=dict)  # {class code: name}; codes may be numbers
     lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
     dt: float = 0.2  # reference time grid, s
-    max_hole: float = 1.0  # s between two rows of a vehicle; a longer hole is not interpolated
     min_vehicles: int = 3  # fewest vehicles of a platoon
     min_samples: int = 3  # fewest points of the time grid
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
@@ -152,14 +156,14 @@ class VehicleTableOptions(LaneOptions):
     """A table with one row per vehicle and time (CSV or Parquet).
 
     ``columns`` names the table's columns by what they mean: ``vehicle``, ``time``, ``x``, and
-    where they exist ``lane``, ``speed``, ``length``, ``kind``, ``recording``. Vehicles of two
-    recordings never meet. A column that bears the name of its meaning need not be listed; null
-    leaves an optional one out.
+    where they exist ``lane``, ``speed``, ``length``, ``kind``, ``recording``, ``sequence``.
+    Vehicles of two recordings or sequences never meet. A column that bears the name of its meaning
+    need not be listed; null leaves an optional one out.
     """
 
     name: str = "vehicles"
-    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind, recording where they
-    # exist
+    # {vehicle: its column, time: ..., x: ...} and lane, speed, length, kind, recording, sequence
+    # where they exist
     columns: dict[str, str | None] = field(default_factory=dict)
     position_unit: str = "m"  # m | ft | cm | km
     length_unit: str | None = None  # null: the unit of the positions
@@ -196,7 +200,8 @@ class PairOptions(DataOptions):
     constant: dict[str, str] = field(default_factory=dict)  # {meaning: its value in every row}
     position_unit: Any = "m"  # m | ft | cm | km, or by pattern of the file's name {"*.csv": ft}
     speed_unit: Any = "m/s"  # m/s | km/h | ft/s | mph, or by pattern of the file's name
-    time_unit: str = "s"  # s | ms | us | ns; dates and durations need none
+    time_unit: str = "s"  # s | ms | us | ns | frame; dates and durations need none
+    frame_rate: float | None = None  # 1/s, with time_unit=frame
     # m, of leaders where the table has neither positions nor lengths; the gap does not depend on it
     length: float | None = 5.0
     kinds: Any = field(default_factory=dict)  # {class code: name}
@@ -230,7 +235,7 @@ class OpenAccOptions(DataOptions):
     # m by which a gap may change between two samples otherwise than the speeds tell, without being
     # taken for unknown: the error that one position may have; null: whatever
     max_error: float | None = 0.5
-    max_hole: float = 1.0  # s between two rows of a vehicle; a longer hole is not interpolated
+    fill: float = 0.9  # s that may be missing of a vehicle; a longer hole is not interpolated
     window: float | None = None  # s; null: maximal intervals with the same vehicles in view
     min_vehicles: int = 2  # fewest vehicles of a platoon
     min_duration: float = 5.0  # s, shortest sequence where window is null
@@ -256,7 +261,7 @@ class JuelichOptions(DataOptions):
 
     name: str = "juelich"
     domain: str = "crowd"
-    max_hole: float = 0.0  # the published recordings as they are
+    fill: float = 0.0  # the published recordings as they are
     t_seq: float = 1.0  # s, length of a sequence
     frame_rate: float | None = None  # 1/s; null reads it from the file's header
     unit: str | None = None  # cm | m; null reads it from the file's header
@@ -275,11 +280,16 @@ class JuelichOptions(DataOptions):
 
 @dataclass
 class WalkwayOptions(JuelichOptions):
-    """One file of walking people: PedPy's text, or JuPedSim's SQLite database."""
+    """One file of walking people: PedPy's text, JuPedSim's SQLite database, or a table."""
 
     name: str = "pedpy"
-    max_hole: float = 0.5  # s of missing frames of a person that are interpolated; 0: none
+    fill: float = 0.5  # s of missing frames of a person that are interpolated; 0: none
     path: str = MISSING  # the file; relative to data.source where that is given
+    # of a table: {agent: its column, time: ..., x: ..., y: ...} and recording, sequence where they
+    # exist; a column that bears the name of its meaning need not be listed
+    columns: dict[str, str | None] = field(default_factory=dict)
+    position_unit: str = "m"  # of a table: m | ft | cm | km
+    time_unit: str = "s"  # of a table: s | ms | us | ns | frame; dates and durations need none
     geometry: str | None = None  # text file with the walkable area as WKT, m
 
 
@@ -303,3 +313,67 @@ class TableOptions(DataOptions):
     position_unit: str = "m"  # m | ft | cm | km, of positions, lengths and destinations
     time_unit: str = "s"  # s | ms | us | ns | frame; dates and durations need none
     frame_rate: float | None = None  # 1/s, with time_unit=frame
+
+
+def positive(option: str, value: float | None) -> float:
+    """``value``, if it is a positive finite number.
+
+    Raises:
+        ConfigError: it is not; names the option.
+    """
+    if value is None or not 0 < value < float("inf"):
+        raise ConfigError(f"data.{option}={value}: expected a positive number")
+    return float(value)
+
+
+def one_of(option: str, value: str | None, valid: Mapping[str, float]) -> float:
+    """What ``valid`` holds for the configured word.
+
+    Raises:
+        ConfigError: the word is not among the valid ones; lists them.
+    """
+    if value is None or value not in valid:
+        raise ConfigError(f"data.{option}={value}: expected one of {', '.join(valid)}")
+    return valid[value]
+
+
+def wanted(option: object) -> list[str] | None:
+    """Names that ``data.recording`` asks for; None for all.
+
+    Raises:
+        ConfigError: neither a name nor a list of names, or an empty list.
+    """
+    if option is None or option == "all":
+        return None
+    items = [option] if isinstance(option, str | int) else option
+    if not isinstance(items, Iterable) or isinstance(items, Mapping):
+        raise ConfigError(f"data.recording={option}: expected 'all', a name or a list of names")
+    names = list(dict.fromkeys(str(item) for item in items))
+    if not names:
+        raise ConfigError("data.recording=[]: expected 'all', a name or a list of names")
+    return names
+
+
+def check_known(asked: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse names that are not known, naming the nearest first.
+
+    Raises:
+        ConfigError: an unknown recording.
+    """
+    valid = list(dict.fromkeys(known))
+    for name in asked:
+        if name not in valid:
+            near = difflib.get_close_matches(name, valid, n=len(valid) or 1, cutoff=0.0)
+            raise ConfigError(
+                f"data.recording={name}: unknown recording; nearest first, the valid ones are: "
+                f"{', '.join(near) or 'none'}"
+            )
+
+
+#: Options by their names in prepared folders and checkpoints of earlier versions.
+_BEFORE = {"max_hole": "fill"}
+
+
+def with_present_names(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of data as an earlier version wrote them, under the names that they have now."""
+    return {_BEFORE.get(key, key): value for key, value in told.items()}

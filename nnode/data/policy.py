@@ -92,7 +92,7 @@ def without(
     Args:
         read: all sequences.
         dropped: see :func:`apply_policy`.
-        left_out: see :class:`nnode.data.readers.recordings.Reading`.
+        left_out: see :class:`nnode.data.cut.Reading`.
     """
     told = []
     if left_out:
@@ -117,7 +117,7 @@ def _advice(sequences: list[Sequence], faults: dict[str, list[Fault]], keep: boo
         return "data.faults=keep keeps faulty ones"
     if any(fault.kind == "gap_in_time" for s in sequences for fault in faults[s.name]):
         return (
-            "what is missing cannot be simulated; data.max_hole=SECONDS interpolates longer "
+            "what is missing cannot be simulated; data.fill=SECONDS interpolates longer "
             "holes, or cut the sequences where vehicles come and go"
         )
     return "these cannot be simulated; correct the rows that the faults name"
@@ -129,7 +129,7 @@ def told_filled(filled: list[dict[str, Any]]) -> str:
     more = f" and {len(filled) - LISTED} more" if len(filled) > LISTED else ""
     return (
         f"{sum(one['samples'] for one in filled)} missing samples in {len(filled)} sequences "
-        f"({names}{more}) are interpolated; data.max_hole sets up to how many seconds"
+        f"({names}{more}) are interpolated; data.fill sets up to how many seconds"
     )
 
 

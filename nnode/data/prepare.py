@@ -18,6 +18,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
+from nnode.data.cut import Reading
 from nnode.data.download import sha256
 from nnode.data.identity import identify
 from nnode.data.options import (
@@ -33,6 +34,8 @@ from nnode.data.options import (
     TableOptions,
     VehicleTableOptions,
     WalkwayOptions,
+    positive,
+    with_present_names,
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
 from nnode.data.quality import Fault, find_faults
@@ -44,7 +47,7 @@ from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.openacc import openacc_files, read_openacc
 from nnode.data.readers.pairs import pair_files, read_pairs
-from nnode.data.readers.recordings import Reading, positive, reading
+from nnode.data.readers.recordings import reading
 from nnode.data.readers.sumo import read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
@@ -81,7 +84,7 @@ class Format:
 
     files: Callable[[Any], _Files]
     read: Callable[[_Files, Any], list[Sequence]]
-    smooths: bool = False  # whether the reader applies ``data.smooth`` itself, before it cuts
+    smooths: bool = True  # whether the reader applies ``data.smooth`` itself, before it cuts
 
     def sequences(self, files: _Files, options: Any) -> list[Sequence]:
         """Read the files.
@@ -89,33 +92,44 @@ class Format:
         Raises:
             NNodeError: what cannot be read, see :func:`nnode.data.readers.recordings.reading`.
         """
+        if not 0 <= options.fill < float("inf"):
+            raise ConfigError(
+                f"data.fill={options.fill}: expected a number of seconds, or 0 to interpolate "
+                "nothing"
+            )
         with reading(", ".join(str(getattr(file, "path", file)) for file in files.values())):
             return self.read(files, options)
 
 
 def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
     """Read files that do not depend on each other."""
-    return lambda files, options: [s for path in files.values() for s in read(path, options)]
+
+    def every(files: _Files, options: Any) -> Reading:
+        found = Reading()
+        for path in files.values():
+            found.add(read(path, options))
+        return found
+
+    return every
 
 
 #: The format that each kind of options stands for; a new format is one more entry.
 FORMATS: dict[type[DataOptions], Format] = {
-    EsimasOptions: Format(esimas_files, _each(read_esimas)),
-    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles), smooths=True),
-    NgsimOptions: Format(vehicle_files, _each(read_ngsim), smooths=True),
-    JuelichOptions: Format(juelich_files, _each(read_juelich), smooths=True),
+    EsimasOptions: Format(esimas_files, _each(read_esimas), smooths=False),
+    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
+    NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
+    JuelichOptions: Format(juelich_files, _each(read_juelich)),
     TableOptions: Format(
         table_files, lambda files, options: read_table(files[TIDY], options, files.get(WALLS))
     ),
     WalkwayOptions: Format(
         walkway_files,
         lambda files, options: read_walkway(files[PEOPLE], options, files.get(GEOMETRY)),
-        smooths=True,
     ),
     PairOptions: Format(pair_files, read_pairs),
-    OpenAccOptions: Format(openacc_files, read_openacc),
-    SumoOptions: Format(sumo_files, _each(read_sumo), smooths=True),
-    HighDOptions: Format(highd_files, read_highd, smooths=True),
+    OpenAccOptions: Format(openacc_files, read_openacc, smooths=False),
+    SumoOptions: Format(sumo_files, _each(read_sumo)),
+    HighDOptions: Format(highd_files, read_highd),
 }
 
 
@@ -133,9 +147,9 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
         The store. Its manifest tells the source files and their SHA-256, all options, the
         package's version, the sampling interval (s), how many sequences were read, kept and
         dropped (in all and by recording), every fault that was found, every sequence and agent
-        that was dropped and why, every record of which there is no sequence, in which sequences
-        how many samples were filled, and the noise of the measurement (see
-        :class:`nnode.data.smooth.Noise`).
+        that was dropped and why, every record of which there is no sequence, what was interpolated
+        to equal times or cut, in which sequences how many samples were filled, and the noise of
+        the measurement (see :class:`nnode.data.smooth.Noise`).
 
     Raises:
         ConfigError: options that contradict each other or the data.
@@ -190,11 +204,11 @@ def judge(
         NNodeError: see :func:`prepare`.
     """
     domain = _domain(options, read)
-    left_out = read.left_out if isinstance(read, Reading) else []
+    read = read if isinstance(read, Reading) else Reading(read)
     _plausible(options, read)
     if options.smooth is not None and not FORMATS[type(options)].smooths:
         positive("smooth", options.smooth)
-        read = [smoothed(s, options.smooth) for s in read]
+        read[:] = [smoothed(s, options.smooth) for s in read]
     noise = measured_noise(read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
     faults = {}
@@ -203,7 +217,7 @@ def judge(
         if stages is not None:
             stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
-    for text in without(read, dropped, left_out):
+    for text in [*read.notes, *without(read, dropped, read.left_out)]:
         log.warning("%s", text)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on
@@ -230,7 +244,8 @@ def judge(
         "recordings": by_recording(read, kept, faults),
         "dropped": dropped,
         "dropped_agents": absent,
-        "left_out": left_out,
+        "left_out": read.left_out,
+        "notes": read.notes,
         "filled": filled,
         "noise": noise.plain(),
         "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
@@ -346,6 +361,7 @@ def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
 
 def _told(options: Mapping[str, Any]) -> dict[str, Any]:
     """The options that decide what is prepared; of a table's path only the name."""
+    options = with_present_names(options)
     chosen = {k: v for k, v in options.items() if k.partition(".")[0] not in NOT_PREPARATION}
     for key in ("path", "walls", "geometry"):
         if isinstance(chosen.get(key), str):

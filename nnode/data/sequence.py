@@ -82,7 +82,7 @@ class Sequence:
         split: the side of the published division that it is on, ``train`` or ``test``; empty: the
             source publishes none.
         filled: number of samples that are missing in the source and were interpolated when it was
-            read (``data.max_hole``).
+            read (``data.fill``).
     """
 
     name: str

@@ -271,7 +271,7 @@ def _files(options: DataOptions, frame: pd.DataFrame | Table | None) -> dict[str
         )
     if type(options) is VehicleTableOptions or isinstance(options, PairOptions):
         return {table.path.stem: table}
-    if isinstance(options, WalkwayOptions) and isinstance(frame, Table):
+    if isinstance(options, WalkwayOptions):
         geometry = options.geometry
         return {PEOPLE: table} | (
             {} if geometry is None else {GEOMETRY: table_path(options, "geometry", geometry)}

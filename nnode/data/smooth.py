@@ -1,6 +1,6 @@
 """Measured positions with holes and noise: interpolated, smoothed, and how noisy they are.
 
-Local cubics (Savitzky & Golay 1964) do both. Holes of up to ``data.max_hole`` seconds are filled.
+Local cubics (Savitzky & Golay 1964) do both. Holes of up to ``data.fill`` seconds are filled.
 Smoothing is off by default: a model is calibrated to what was measured. Positions from video carry
 errors that differences amplify; ``data.smooth`` asks for the positions and speeds of local cubics
 instead, and ``data.start_speeds=smoothed`` for first speeds by parabolas, positions as they are.
@@ -162,85 +162,6 @@ def smoothed(sequence: Sequence, window: float) -> Sequence:
             x[:, n, d], v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], window)
     # a vehicle that stands shall not roll back
     return replace(sequence, x=x, v=np.maximum(v, 0.0) if x.shape[2] == 1 else v)
-
-
-def smooth_records(x: np.ndarray, step: float, window: float) -> np.ndarray:
-    """``(K, N, D)`` positions of local cubics, every record without a hole by itself.
-
-    Args:
-        x: ``(K, N, D)`` m at equally spaced times, NaN where a sample is missing.
-        step: s, between two times.
-        window: s.
-    """
-    x = x.copy()
-    for n in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[:, n]).all(axis=1))
-        for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-            for d in range(x.shape[2]):
-                x[part, n, d] = smooth(part * step, x[part, n, d], window)[0]
-    return x
-
-
-def fill(x: np.ndarray, step: float, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions with short holes filled, see :func:`across`.
-
-    Holes before the first and behind the last known sample stay, as there is only one side.
-
-    Args:
-        x: ``(K, N, D)`` m at equally spaced times, NaN where a sample is missing.
-        step: s, between two times.
-        longest: s; holes in which more time is missing stay.
-
-    Returns:
-        ``(K, N, D)`` m, and ``(K, N)`` True where a sample was filled.
-    """
-    known = np.isfinite(x).all(axis=2)
-    filled = np.zeros(known.shape, dtype=bool)
-    most = int(longest / step + 1e-6) if step > 0 else 0
-    if known.all() or not most:
-        return x, filled
-    x = x.copy()
-    for n in range(x.shape[1]):
-        rows = np.flatnonzero(known[:, n])
-        time, own = rows * step, x[rows, n]
-        for i in np.flatnonzero((np.diff(rows) > 1) & (np.diff(rows) <= most + 1)):
-            hole = np.arange(rows[i] + 1, rows[i + 1])
-            x[hole, n] = across(time, own, int(i), hole * step)
-            filled[hole, n] = True
-    return x, filled
-
-
-def bridge(
-    time: np.ndarray, x: np.ndarray, longest: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A record with the samples of its short holes added, see :func:`across`.
-
-    Args:
-        time: ``(K,)`` s, ascending, of the known samples.
-        x: ``(K, D)`` m.
-        longest: s; holes in which more time is missing stay, and so do those that are no multiple
-            of the usual step, to a tenth of it.
-
-    Returns:
-        All times, all positions, and the times that were added.
-    """
-    steps = np.diff(time)
-    if not steps.size:
-        return time, x, time[:0]
-    usual = float(np.median(steps))
-    number = np.round(steps / usual)
-    hole = (number > 1) & ((number - 1) * usual <= longest + 1e-6)
-    hole &= np.abs(steps - number * usual) <= 0.1 * usual
-    if not hole.any():
-        return time, x, time[:0]
-    places, times, values = [], [], []
-    for i in map(int, np.flatnonzero(hole)):
-        at = np.linspace(time[i], time[i + 1], int(number[i]) + 1)[1:-1]
-        places += [i + 1] * len(at)
-        times.append(at)
-        values.append(across(time, x, i, at))
-    added = np.concatenate(times)
-    return np.insert(time, places, added), np.insert(x, places, np.concatenate(values), 0), added
 
 
 def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarray:

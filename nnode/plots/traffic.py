@@ -293,3 +293,23 @@ def _histogram(ax: Axes, gaps: np.ndarray, span: tuple[float, float]) -> tuple[f
     dress(ax, x="gap (m)", y="measured\nsamples")
     ax.set_title(note, fontsize=SMALL_FONT, color=GREY, loc="left")
     return low, high
+
+
+def follower_errors(rows: pd.DataFrame) -> Figure:
+    """Spacing and speed errors of followers, the largest first, with their biases.
+
+    Args:
+        rows: see :func:`nnode.app.followers.follower_errors`.
+    """
+    figure = new_figure(7.2, 3.4)
+    axes = figure.subplots(1, 2)
+    for ax, what, unit in zip(axes, ("spacing", "speed"), ("m", "m/s"), strict=True):
+        order = np.argsort(-rows[f"{what}_rmse"].to_numpy(), kind="stable")
+        place = np.arange(1, len(rows) + 1)
+        for i, (kind, label) in enumerate((("rmse", "RMSE"), ("bias", "bias"))):
+            style = curve_style(i) | {"linestyle": "none", "label": label}
+            ax.plot(place, rows[f"{what}_{kind}"].to_numpy()[order], markersize=3, **style)
+        ax.axhline(0, color=GREY, linewidth=0.8)
+        dress(ax, x="followers, in order of RMSE", y=f"{what} error ({unit})")
+    axes[0].legend(fontsize=SMALL_FONT, frameon=False)
+    return figure

@@ -69,3 +69,11 @@ class FollowingStudyOptions(StudyOptions):
     name: str = "following"
     restarts: int = 4  # starts of every calibration; networks get as many
     folds: int = 5  # of cross-validation, by cluster
+
+
+@dataclass
+class PredictionStudyOptions(StudyOptions):
+    """Laws beside published predictions of followers and of people in the open."""
+
+    name: str = "prediction"
+    restarts: int = 6  # starts of every law of car following beside its own

@@ -73,7 +73,7 @@ def test_another_cutting_cannot_be_told_apart(tmp_path: Path, checkpoint: Checkp
 def test_options_that_a_checkpoint_does_not_know_are_not_compared(
     tmp_path: Path, checkpoint: Checkpoint
 ) -> None:
-    now = store(tmp_path / "now", "ab", t_seq=1.0, max_hole=0.5)
+    now = store(tmp_path / "now", "ab", t_seq=1.0, fill=0.5)
     assert choose(now, checkpoint, "auto") == ("heldout", [1, 5], 0)
 
 

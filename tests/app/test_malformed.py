@@ -55,10 +55,6 @@ CASES = {
     "empty file": (_csv(""), ["cars.csv", "empty"]),
     "truncated mat": (_truncated, ["sequence_datademo.mat"]),
     "one vehicle": (_csv(HEAD + "".join(f"1,{0.2 * k:.1f},{k}\n" for k in range(9))), ["vehicle"]),
-    "non-uniform time": (
-        _tidy(TABLE + "".join(f"a,{t},{n},{20 * n + 5 * t}\n" for t in (0, 1, 3) for n in (1, 2))),
-        ["own.csv", "line 4", "equal steps"],
-    ),
     "NaN": (_tidy(TABLE + "a,0,1,0\na,0,2,9\na,1,1,nan\na,1,2,19\na,2,1,9\na,2,2,29\n"), []),
     "unknown recording": (_unknown, ["demo2"]),
     "dt that does not divide": (_step, ["solver.dt", "0.2 s"]),

@@ -102,17 +102,11 @@ def commands(printed: str) -> list[list[str]]:
     return [[Path(words[1]).stem, *words[2:]] for words in found]
 
 
-def blocks(printed: str) -> list[str]:
-    """The Python that a check printed: what converts the file, where it must be, and what reads."""
+def python(printed: str) -> str:
+    """The Python that a check printed."""
     lines = printed.splitlines()
-    found = []
-    for start in ("no reader takes the file as it is; in Python:", "in Python:"):
-        if start in lines:
-            rest = lines[lines.index(start) + 1 :]
-            end = rest.index("to read it:") if start != "in Python:" else len(rest)
-            body = [one.removeprefix("  ") if start == "in Python:" else one for one in rest[:end]]
-            found.append("\n".join(one for one in body if not one.startswith("page: ")))
-    return found
+    rest = lines[lines.index("in Python:") + 1 :]
+    return "\n".join(one.removeprefix("  ") for one in rest if not one.startswith("page: "))
 
 
 @pytest.mark.parametrize(("form", "number"), CASES)
@@ -123,29 +117,25 @@ def test_commands_and_python_that_are_printed_run(
     done = script("check", str(path), f"hydra.run.dir={tmp_path / 'check'}")
     assert done.returncode == 0, done.stderr
     assert "refuses it" not in done.stdout
-    *convert, python = blocks(done.stdout)
-    for lines in convert:
-        exec(compile(lines, "convert", "exec"), {})
+    lines = python(done.stdout)
     (prepare, train, *_) = commands(done.stdout)
     assert (prepare[0], train[0]) == ("prepare_data", "train")
     for name, *words in (prepare, train):
         ran = script(name, *words, f"hydra.run.dir={tmp_path / name}")
         assert ran.returncode == 0, ran.stderr
-    read = python.splitlines()[-2]
+    read = lines.splitlines()[-2]
     held: dict[str, nnode.Sequences] = {}
     exec(compile(f"import nnode\n{read}", "read", "exec"), held)
     store = Store(tmp_path / "prepare_data")
     assert [s.name for s in held["data"]] == [entry["name"] for entry in store.index]
     assert number in (None, len(store))
-    exec(compile(python.replace("nnode.fit(", "nnode.fit(epochs=2, data="), "fit", "exec"), {})
+    exec(compile(lines.replace("nnode.fit(", "nnode.fit(epochs=2, data="), "fit", "exec"), {})
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("form", [of_platoons, with_semicolons, pedpy])
 def test_the_diagnosis_that_is_printed_runs(script: Script, tmp_path: Path, form: Form) -> None:
     done = script("check", str(form(tmp_path)), f"hydra.run.dir={tmp_path / 'check'}")
-    for lines in blocks(done.stdout)[:-1]:
-        exec(compile(lines, "convert", "exec"), {})
     (words,) = [line for name, *line in commands(done.stdout) if name == "discover"]
     ran = script("discover", *words, f"hydra.run.dir={tmp_path / 'discover'}")
     assert ran.returncode == 0, ran.stderr
@@ -168,11 +158,10 @@ def test_what_is_told_in_python_reads_what_is_recognised(tmp_path: Path) -> None
         for a, b in zip(frame, file, strict=True):
             assert a.x == pytest.approx(b.x, abs=1e-9)
         found = nnode.check(path, frame_rate=rate.get("frame_rate")).examination
-        if not found.source.convert:
-            told: dict[str, nnode.Sequences] = {}
-            exec(compile("\n".join(python_lines(found)[:2]), "told", "exec"), told)
-            for a, b in zip(told["data"], file, strict=True):
-                assert a.x == pytest.approx(b.x, abs=1e-9)
+        told: dict[str, nnode.Sequences] = {}
+        exec(compile("\n".join(python_lines(found)[:2]), "told", "exec"), told)
+        for a, b in zip(told["data"], file, strict=True):
+            assert a.x == pytest.approx(b.x, abs=1e-9)
 
 
 def test_a_command_recognises_columns_and_units(script: Script, tmp_path: Path) -> None:

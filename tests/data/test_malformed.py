@@ -125,7 +125,7 @@ def cars(path: Path, *times: float, vehicle: str = "1") -> Path:
 def test_times_that_no_step_counts_are_refused(tmp_path: Path, time: str) -> None:
     path = cars(tmp_path / "c.csv", 0.0, 0.2, 0.4)
     path.write_text(path.read_text() + f"1,{time},0\n")
-    with pytest.raises(DataError, match=r"line 11: column 'time' is the time .* cannot count"):
+    with pytest.raises(DataError, match=r"line 11: the time is .* cannot count"):
         read_vehicles(path, VehicleTableOptions())
 
 

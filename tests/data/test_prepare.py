@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -224,11 +225,11 @@ def test_absent_vehicle_makes_the_sequence_faulty(tmp_path: Path) -> None:
         for s in "ab"
         for k in range(5)
         for a in range(3)
-        if not (s == "b" and a == 1 and k > 2)
+        if not (s == "b" and a == 1 and k > 1)
     ]
     (tmp_path / "t.csv").write_text("sequence,time,agent,x\n" + "\n".join(rows))
     options = TableOptions(
-        domain="traffic", path=str(tmp_path / "t.csv"), faults=Faults.keep, max_hole=0.1
+        domain="traffic", path=str(tmp_path / "t.csv"), faults=Faults.keep, fill=0.1
     )
     store = prepare(options, tmp_path / "out")
     assert [s.name for s in store] == ["t/a"]
@@ -254,12 +255,38 @@ def test_two_percent_of_missing_samples_cost_no_platoon(tmp_path: Path) -> None:
     told = store.manifest["filled"]
     assert sum(one["samples"] for one in told) == pytest.approx(0.02 * len(rows), rel=0.3)
     assert {one["sequence"] for one in told} <= {s.name for s in store}
-    # what is longer is not filled, and no hint leads to a refusal
+    # what is longer is not filled: it cuts a platoon in two, and that is said
     gone = rows[~(rows.time.between(3, 5) & (rows.agent == 1))]
     gone.to_csv(path, index=False)
-    with pytest.raises(DataError, match=r"data\.max_hole=SECONDS") as error:
+    store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
+    assert len(store) == 16
+    assert store.manifest["filled"] == []
+    assert "cut into 2 sequences" in store.manifest["notes"][0]
+    assert store.manifest["notes"][3] == "and 5 more such sequences"
+
+
+def test_vehicles_that_never_meet_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    rows = [f"s,{0.1 * k},{a},{30 * a + k}" for a in range(3) for k in range(30 * a, 30 * a + 30)]
+    path = tmp_path / "t.csv"
+    path.write_text("sequence,time,agent,x\n" + "\n".join(rows))
+    with pytest.raises(DataError, match=r"data\.fill=SECONDS") as error:
         prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
     assert "faults=keep" not in str(error.value)
+
+
+def test_a_folder_of_an_earlier_version_opens_under_its_names_of_options(tmp_path: Path) -> None:
+    rows = [f"s,{0.1 * k},{a},{30 * a + k}" for a in range(3) for k in range(30)]
+    path = tmp_path / "t.csv"
+    path.write_text("sequence,time,agent,x\n" + "\n".join(rows))
+    options = TableOptions(domain="traffic", path=str(path), fill=0.3)
+    store = prepare(options, tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"fill": 0.3', '"max_hole": 0.3'))
+    assert "max_hole" in manifest.read_text()
+    asked = replace(options, prepared=str(store.folder))
+    assert len(open_data(asked, tmp_path / "new")) == 1
+    with pytest.raises(ConfigError, match=r"data\.fill=0\.3 then, 0\.1 now"):
+        open_data(replace(asked, fill=0.1), tmp_path / "new")
 
 
 def test_noise_stands_in_the_manifest_and_is_no_fault(tmp_path: Path) -> None:

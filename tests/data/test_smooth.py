@@ -13,7 +13,8 @@ from nnode.data.options import NgsimOptions, VehicleTableOptions
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import BEARABLE, bridge, fill, measured_noise, smooth
+from nnode.data.smooth import BEARABLE, measured_noise, smooth
+from nnode.data.trajectories import Grid, Record, Trajectories, records
 from nnode.errors import ConfigError
 
 DOCS = Path(__file__).parents[2] / "docs" / "data.md"
@@ -163,22 +164,26 @@ def test_the_noise_of_positions_is_found(rate: float, sigma: float) -> None:
     assert found.beyond == (found.start_speed > BEARABLE)
 
 
+def record(time: np.ndarray, x: np.ndarray) -> list[Record]:
+    """Records of one car at 10 Hz."""
+    rows = Trajectories(
+        path=Path("t"), name="t", where=str, agent=np.full(len(time), "a", dtype=object),
+        time=time, x=x[:, None],
+    )  # fmt: skip
+    return records(rows, Grid(0.1), fill=0.5)
+
+
 def test_a_hole_does_not_bias_speeds() -> None:
     time = 0.1 * np.arange(60)
     x = 10 * time + 0.5 * 1.5 * time**2
-    lacking = x.copy()
-    lacking[20:25] = np.nan
-    found, filled = fill(lacking[:, None, None], 0.1, 0.5)
-    np.testing.assert_allclose(found[:, 0, 0], x, atol=1e-9)
-    assert filled[:, 0].nonzero()[0].tolist() == [20, 21, 22, 23, 24]
-    line = np.interp(time, time[~filled[:, 0]], x[~filled[:, 0]])
+    (found,) = record(np.delete(time, range(20, 25)), np.delete(x, range(20, 25)))
+    np.testing.assert_allclose(found.x[:, 0], x, atol=1e-9)
+    assert found.filled.nonzero()[0].tolist() == [20, 21, 22, 23, 24]
+    line = np.interp(time, time[~found.filled], x[~found.filled])
     assert (np.diff(x) - np.diff(line))[19] / 0.1 < -0.3  # m/s, the bias of a straight line
-    longer = x.copy()
-    longer[20:26] = np.nan
-    assert not fill(longer[:, None, None], 0.1, 0.5)[1].any()
-    whole, places, added = bridge(
-        np.delete(time, range(20, 25)), np.delete(x, range(20, 25))[:, None], 0.5
-    )
-    np.testing.assert_allclose(whole, time, atol=1e-9)
-    np.testing.assert_allclose(places[:, 0], x, atol=1e-9)
-    assert len(added) == 5
+    # what is longer ends a record, and so does an empty cell
+    apart = record(np.delete(time, range(20, 26)), np.delete(x, range(20, 26)))
+    assert [(one.first, one.last) for one in apart] == [(0, 19), (26, 59)]
+    lacking = x.copy()
+    lacking[20:26] = np.nan
+    assert [len(one.x) for one in record(time, lacking)] == [20, 34]

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.config import choices
+from nnode.data.options import with_present_names
 from nnode.errors import CheckpointError, ConfigError
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.program import own_choices
@@ -127,7 +128,8 @@ def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, 
     choices, own = HydraConfig.get().runtime.choices, saved["groups"]
     for name in sections:
         if name not in own or choices[name] == own[name]:
-            OmegaConf.update(merged, name, saved[name], merge=True)
+            own_options = with_present_names(saved[name]) if name == "data" else saved[name]
+            OmegaConf.update(merged, name, own_options, merge=True)
             if isinstance(saved[name], dict) and "law" in saved[name]:
                 # a law is one piece: what its description did not say then, it does not say now
                 OmegaConf.update(merged, f"{name}.law", saved[name]["law"], merge=False)

@@ -20,7 +20,7 @@ from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.options import TrainerOptions
 from nnode.data.check.recognise import NEEDED, has_columns, recognised
 from nnode.data.dataset import Source
-from nnode.data.options import DataOptions, TableOptions
+from nnode.data.options import DataOptions, TableOptions, with_present_names
 from nnode.data.prepare import FORMATS
 from nnode.data.readers.columns import Table as DataTable
 from nnode.data.sequences import Sequences, say_recognised
@@ -252,6 +252,7 @@ def data_of(given: Sequences) -> DataOptions:
     schema = next((kind for kind in FORMATS if kind.__name__ == reader), None)
     if schema is None or told is None:
         return TableOptions(domain=given.domain, path="")
+    told = with_present_names(told)
     return cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
 
 
@@ -266,6 +267,7 @@ def data_used(checkpoint: Checkpoint) -> Source:
     schema = next((kind for kind in FORMATS if kind.__name__ == reader), None)
     if schema is None or told.get("path") == "":
         raise ConfigError("the run's data were a table in memory; give it again, as data=TABLE")
+    told = with_present_names(told)
     options = cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
     if options.prepared is not None:
         return Store(Path(options.prepared).expanduser())

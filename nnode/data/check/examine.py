@@ -10,18 +10,15 @@ from nnode.data.check import findings as find
 from nnode.data.check.columns import Meaning, in_seconds, meanings
 from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
-from nnode.data.check.rows import in_memory, scaled
+from nnode.data.check.rows import scaled
 from nnode.data.check.scale import Medians, Scale, medians
 from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
 from nnode.data.check.tracks import Tracks, tracks_from
-from nnode.data.options import DataOptions, TableOptions, WalkwayOptions
+from nnode.data.cut import Reading
 from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import Fault, find_faults
-from nnode.data.readers.columns import Table
-from nnode.data.readers.jupedsim import PEOPLE
-from nnode.data.readers.recordings import Reading, reading
-from nnode.data.readers.table import TABLE
+from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.errors import NNodeError
@@ -52,7 +49,7 @@ class Examination:
         known: medians in the file's own units.
         tracks: rows in SI units, by the most probable units.
         findings: errors first.
-        source: what reads it, with its options, where need be after a change of its form.
+        source: what reads it, with its options.
         sequences: that the reader makes, at most :data:`MOST`.
         faults: in them, by name.
     """
@@ -137,8 +134,7 @@ def _table(
     examined.findings += find.rows(table, seen.agent[: len(table)], seen.time[: len(table)])
     examined.findings += _unsure(every, rate)
     examined.findings += _rivals(found)
-    changed = in_memory(raw, found, seen, source) if source.convert else None
-    sequences = _tried(source, examined.findings, changed)
+    sequences = _tried(source, examined.findings)
     return _judged(examined, sequences, rate)
 
 
@@ -185,20 +181,16 @@ def _read(source: Source) -> list[Sequence]:
     return kind.sequences(kind.files(source.options), source.options)
 
 
-def _tried(
-    source: Source, findings: list[Finding], changed: tuple[DataOptions, Table] | None = None
-) -> list[Sequence]:
-    """The sequences that the reader makes of the file, or of a table in memory; what it refuses is
-    a finding."""
+def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:
+    """The sequences that the reader makes of the file; what it refuses is a finding."""
     try:
-        if changed is None:
-            made = _read(source)
-        else:
-            options, table = changed
-            key = {TableOptions: TABLE, WalkwayOptions: PEOPLE}.get(type(options), table.path.stem)
-            made = FORMATS[type(options)].sequences({key: table}, options)
+        made = _read(source)
         left_out = made.left_out if isinstance(made, Reading) else []
         findings += [Finding("left_out", "warning", text) for text in without(made, [], left_out)]
+        findings += [
+            Finding("resampled", "warning", text)
+            for text in (made.notes if isinstance(made, Reading) else [])
+        ]
         return made
     except NNodeError as error:
         findings.append(Finding("reader", "error", f"data={source.group} refuses it: {error}"))

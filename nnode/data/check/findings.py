@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from nnode.data.check.scale import AGREE, INTERVAL, RATES, USUAL, Medians, Scale
+from nnode.data.check.scale import AGREE, INTERVAL, RATES, SWAYS, USUAL, Medians, Scale
 from nnode.data.check.tracks import Tracks
 from nnode.data.policy import told_filled
 from nnode.data.quality import KINDS, LIMITS, Fault
 from nnode.data.readers.columns import Table, floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import BEARABLE, Noise, suggested_window
+from nnode.data.trajectories import HOLE, UNEVEN
 
 #: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
 #: over a second: that of gravity, m/s².
@@ -26,10 +26,6 @@ FRICTION = 9.81
 EDGE = 0.1
 #: Share of agents from which on something is told of all.
 FEW = 0.02
-#: Jumps at one time among which swaps are looked for.
-SOME = 30
-#: A step longer than so many usual ones is a hole.
-HOLE = 1.5
 
 
 @dataclass(frozen=True)
@@ -98,13 +94,13 @@ def sampling(tracks: Tracks) -> Iterator[Finding]:
             "rate", "error", "no agent has two rows at different times; nothing moves here"
         )
         return
-    uneven = np.abs(steps - dt) > 0.01 * dt
+    uneven = np.abs(steps - dt) > UNEVEN * dt
     holes = steps > HOLE * dt
     text = f"sampled every {dt:.4g} s ({1 / dt:.4g} in a second)"
     level = "note"
     if (uneven & ~holes).mean() > FEW:
         level = "warning"
-        text += f"; {(uneven & ~holes).mean():.0%} of the steps differ by more than 1 %"
+        text += f"; {(uneven & ~holes).mean():.0%} of the steps differ by more than {UNEVEN:.0%}"
     if INTERVAL.score(dt) < -2:
         level = "warning"
         text += f"; unusual: {INTERVAL.source}"
@@ -152,7 +148,8 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
         )  # fmt: skip
     clock = known.sway / scale.seconds
     walk = USUAL["crowd"]["sway"]
-    if scale.domain == "crowd" and np.isfinite(clock):
+    fine = known.dt * scale.seconds <= SWAYS
+    if scale.domain == "crowd" and fine and np.isfinite(clock):
         text = f"people sway {clock:.3g} times in a second; expected {walk.low:g} to {walk.high:g}"
         if told is None and scale.rate is not None:
             yield Finding("gait", "note", f"{text}: the frame rate is taken from this")
@@ -212,33 +209,16 @@ def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
 
 
 def _jumps(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
-    """Steps that are too long, and pairs of agents that take each other's place in one."""
+    """Steps that are too long; the faults of the sequences say where identifiers are swapped."""
     steps, limits = tracks.moves(1), LIMITS[domain]
     fast = steps.size > limits.max_speed * steps.took + limits.noise
-    if not fast.any():
-        return
-    first, last = steps.first[fast], steps.last[fast]
-    reach = limits.reach + float(np.median(steps.size))
-    swaps = [
-        (i, j)
-        for at in np.unique(tracks.time[last])
-        for i, j in combinations(np.flatnonzero(tracks.time[last] == at)[:SOME], 2)
-        if np.linalg.norm(tracks.x[last[i]] - tracks.x[first[j]]) < reach
-        and np.linalg.norm(tracks.x[last[j]] - tracks.x[first[i]]) < reach
-    ]
-    who = sorted({tracks.names[i] for i in tracks.agent[first]})
-    text = (
-        f"{fast.sum()} of {len(steps)} steps are faster than {limits.max_speed:g} m/s, of "
-        f"{_some(who)}"
-    )
-    if swaps:
-        names = [tracks.names[tracks.agent[first[i]]] for i in swaps[0]]
-        text += (
-            f"; in {len(swaps)} pairs of them two agents take each other's place, first "
-            f"{names[0]} and {names[1]} at {tracks.time[last[swaps[0][0]]]:g} s: their identifiers "
-            "are swapped"
-        )
-    yield Finding("swap" if swaps else "jump", "error", text)
+    if fast.any():
+        who = sorted({tracks.names[i] for i in tracks.agent[steps.first[fast]]})
+        yield Finding(
+            "fast", "error",
+            f"{fast.sum()} of {len(steps)} steps are faster than {limits.max_speed:g} m/s, of "
+            f"{_some(who)}",
+        )  # fmt: skip
 
 
 def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:

@@ -10,6 +10,9 @@ from nnode.data.check.tracks import Tracks
 LEAST, MOST = 48, 150
 #: Frequencies that are looked at, in cycles a sample.
 BAND = np.linspace(0.01, 0.45, 441)
+#: Of a straight way, the share of its length that is left between its ends. People who walk in
+#: curves sway across another direction at every moment.
+STRAIGHT = 0.95
 #: A peak must stand so many times above the median of the spectrum.
 CLEAR = 6.0
 
@@ -32,7 +35,7 @@ def sway(tracks: Tracks) -> float:
     for a, b in zip(start.tolist(), end.tolist(), strict=True):
         way = tracks.x[b - 1] - tracks.x[a]
         far = np.hypot(*way)
-        if b - a < LEAST or far == 0 or not even[a : b - 1].all():
+        if b - a < LEAST or not even[a : b - 1].all() or far <= STRAIGHT * _length(tracks.x[a:b]):
             continue
         across = tracks.x[a:b] @ np.array([-way[1], way[0]]) / far
         v = np.diff(across)
@@ -51,3 +54,9 @@ def sway(tracks: Tracks) -> float:
     if power[top] < CLEAR * np.median(power):
         return float("nan")
     return float(BAND[top] / tracks.dt)
+
+
+def _length(x: np.ndarray) -> float:
+    """m along a path, by every sixteenth sample: noise and sway shall not count."""
+    parts = np.concatenate([x[:-1:16], x[-1:]])
+    return float(np.hypot(*np.diff(parts, axis=0).T).sum())

@@ -15,7 +15,7 @@ import pandas as pd
 from nnode.data.check.columns import Meaning, in_seconds, meanings, plain
 from nnode.data.check.examine import FAIR, LIKELY, SURE, sure, unit_names
 from nnode.data.check.raw import Raw, read_raw
-from nnode.data.check.rows import Scaled, in_memory, scaled
+from nnode.data.check.rows import Scaled, scaled
 from nnode.data.check.scale import Scale
 from nnode.data.check.source import native_source, source_of
 from nnode.data.options import DataOptions, PairOptions, TableOptions, VehicleTableOptions
@@ -92,7 +92,7 @@ def _of_table(
     """How columns are read; ``memory`` says that the table comes from no file."""
     assert raw.table is not None
     exact = _exact(raw.table, given)
-    if exact == "table" and raw.separator in (",", ""):
+    if exact == "table":
         return _tidy(raw, domain, given)
     found = _with_given(raw, meanings(raw), given)
     if exact is None and not memory and (native := native_source(raw, found)) is not None:
@@ -109,15 +109,15 @@ def _of_table(
         return _by_name(raw, exact, given)
     if exact is None:
         _sure_enough(raw, seen, rate or raw.rate, told)
-    elif raw.separator in (",", "") and (told or _si(seen.scale) or _share(seen) < SURE):
+    elif told or _si(seen.scale) or _share(seen) < SURE:
         return _by_name(raw, exact, given)
     found = seen.meanings
     read = source_of(raw, found, seen.scale, seen.tracks)
     line = _line(raw, found, seen, read.group)
-    if not memory and not read.convert:
+    if not memory:
         return Recognised(read.group, read.options, None, line)
-    options, table = in_memory(raw, found, seen, read)
-    return Recognised(read.group, options, table, line)
+    options = replace(read.options, path="")  # type: ignore[call-arg]
+    return Recognised(read.group, options, raw.table, line)
 
 
 def _native(raw: Raw) -> Recognised:
@@ -278,7 +278,7 @@ def _how(scale: Scale) -> str:
 
 def _line(raw: Raw, found: Mapping[str, Meaning], seen: Scaled, group: str) -> str:
     named = ", ".join(f"{meaning} = {one.column}" for meaning, one in found.items())
-    return (
-        f"{raw.path}: recognised {named}; {_words(seen.scale)} ({sure(_share(seen))}); read as "
-        f"data={group}"
-    )
+    words, scale = f"{_words(seen.scale)} ({sure(_share(seen))})", seen.scale
+    if scale.rate is not None and raw.rate not in (None, scale.rate):
+        words = f"{_words(replace(scale, rate=raw.rate))} as it tells; {scale.rate:g} frames/s fit"
+    return f"{raw.path}: recognised {named}; {words}; read as data={group}"

@@ -1,9 +1,9 @@
-"""The rows of a table in SI units, and the table as a reader takes it."""
+"""The rows of a table in SI units."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -11,18 +11,8 @@ import pandas as pd
 from nnode.data.check.columns import Meaning, numbers
 from nnode.data.check.raw import Raw
 from nnode.data.check.scale import Medians, Scale, medians, scales
-from nnode.data.check.source import (
-    JOINT,
-    Source,
-    are_pairs,
-    is_spaced,
-    joint,
-    people_of,
-    people_rate,
-)
+from nnode.data.check.source import are_pairs, is_spaced
 from nnode.data.check.tracks import LAG, Tracks, tracks_of
-from nnode.data.options import DataOptions, PairOptions, VehicleTableOptions, WalkwayOptions
-from nnode.data.readers.columns import Table
 from nnode.data.sequence import Domain
 from nnode.errors import DataError
 
@@ -80,6 +70,7 @@ def scaled(
     assert table is not None
     found = _of_pairs(raw, dict(found))
     pairs = are_pairs(found)
+    found = _counted(raw, found)
     clock = next((m for m in ("time", "frame") if m in found), None)
     lacking = [] if clock else ["a time or a frame"]
     lacking += [] if pairs or "x" in found else ["a position x"]
@@ -127,25 +118,15 @@ def scaled(
     return Scaled(found, every, known[scale.domain], si, files, time, clock)
 
 
-def in_memory(
-    raw: Raw, found: Mapping[str, Meaning], seen: Scaled, source: Source
-) -> tuple[DataOptions, Table]:
-    """The options that read a table as it is in memory, and the table that they read.
-
-    The table is changed as the lines of ``source.convert`` change it.
-    """
+def _counted(raw: Raw, found: dict[str, Meaning]) -> dict[str, Meaning]:
+    """Meanings without a time that is nothing but the number of the frame."""
     assert raw.table is not None
-    options, table = replace(source.options, path=""), raw.table  # type: ignore[call-arg]
-    if isinstance(options, WalkwayOptions):
-        rate = people_rate(seen.tracks)
-        options = replace(options, frame_rate=rate, unit=None)
-        table = Table(people_of(raw, found, seen.scale, rate))
-    elif isinstance(options, PairOptions) and source.convert:
-        clock = numbers(table.frame, found[seen.clock].column)
-        table = Table(table.frame.assign(time=seen.scale.seconds * clock))
-    elif isinstance(options, VehicleTableOptions) and JOINT in options.columns.values():
-        table = Table(table.frame.assign(**{JOINT: joint(raw, found)}))
-    return options, table
+    if not {"time", "frame"} <= set(found):
+        return found
+    time, frame = (numbers(raw.table.frame, found[m].column) for m in ("time", "frame"))
+    if not np.array_equal(time, frame, equal_nan=True):
+        return found
+    return {m: one for m, one in found.items() if m != "time"}
 
 
 def _domains(found: Mapping[str, Meaning], tracks: Tracks, asked: Domain | None) -> list[Domain]:

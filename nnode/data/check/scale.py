@@ -75,6 +75,8 @@ USUAL: dict[Domain, dict[str, Range]] = {
         "length": Range(3.5, 7.0, 0.12, "cars are 3.5 to 5 m long; up to half trucks"),
     },
 }  # fmt: skip
+#: s; sampled more coarsely, people's sway does not show.
+SWAYS = 1 / 3
 INTERVAL = Range(0.02, 1.0, 0.4, "recordings take 1 to 50 samples in a second")
 #: How near speeds in a file are to those of its positions; beyond, one of them is wrong.
 AGREE = Range(0.995, 1.005, 0.025, "two measurements of one motion")
@@ -255,6 +257,6 @@ def _likely(scale: Scale, known: Medians) -> float:
     score += INTERVAL.score(known.dt * seconds)
     if "length" in usual:
         score += usual["length"].score(known.length * metres)
-    if "sway" in usual:
+    if "sway" in usual and known.dt * seconds <= SWAYS:
         score += usual["sway"].score(known.sway / seconds)
     return score + AGREE.score(known.ratio * metres / (scale.per_second * seconds))

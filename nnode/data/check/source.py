@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from nnode.data.check.columns import Meaning, numbers
+from nnode.data.check.columns import Meaning
 from nnode.data.check.raw import Raw
 from nnode.data.check.scale import Scale
 from nnode.data.check.tracks import Tracks
@@ -28,11 +27,9 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.data.readers.highd import TRACKS
-from nnode.data.readers.table import UNEVEN
+from nnode.data.trajectories import usual_interval
 
 _NGSIM = {"Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID"}
-#: Column that is made of two, where a table has recordings and sequences in them.
-JOINT = "recording and sequence"
 
 _TABLE = {"sequence", "time", "agent", "x"}
 _RUNS = {"run", "position", "t", "v", "gap"}
@@ -45,13 +42,10 @@ class Source:
     Attributes:
         group: its name in ``conf/data``.
         options: that read the file.
-        convert: lines of Python that make a table which a source reads; then there are no options
-            for the file as it is.
     """
 
     group: str
     options: DataOptions
-    convert: list[str] = field(default_factory=list)
 
 
 def native_source(raw: Raw, found: Mapping[str, Meaning]) -> str | None:
@@ -123,72 +117,36 @@ def _esimas(path: Path) -> Source:
     return Source("esimas", options)
 
 
-def _plain(raw: Raw) -> bool:
-    """Whether tables are read as this one is written."""
-    return raw.named and raw.separator in (",", "")
-
-
 def _people(
     raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
 ) -> Source:
     columns = {meaning: one.column for meaning, one in found.items()}
-    if "sequence" in columns and _even(tracks):
+    if "sequence" in columns and "frame" not in columns:
         return _tidy(raw, found, scale, path)
-    rate = people_rate(tracks)
-    steps = max(2, round(rate))
-    own: dict[str, Any] = {"t_seq": float(f"{steps / rate:.9g}")} if rate != round(rate) else {}
+    dt = usual_interval(tracks.steps)
+    if scale.rate is not None and raw.rate is not None:  # what the file tells is taken
+        dt *= scale.rate / raw.rate
+        scale = replace(scale, rate=raw.rate)
+    steps = max(2, round(1 / dt))
+    whole = abs(1 / dt - steps) < 1e-3
+    own: dict[str, Any] = {} if whole else {"t_seq": float(f"{steps * dt:.9g}")}
     if np.ptp(tracks.x[:, 1]) > np.ptp(tracks.x[:, 0]):
         own["walking_axis"] = "y"
     order = [raw.table.frame.columns.get_loc(columns[m]) for m in columns] if raw.table else []
     ordered = list(columns) == ["agent", "frame", "x", "y"] and order == [0, 1, 2, 3]
-    every = scale.rate is not None and abs(rate / scale.rate - 1) < 1e-6  # frame by frame
+    every = scale.rate is not None and abs(dt * scale.rate - 1) < 1e-6  # frame by frame
     text = not raw.named and raw.separator == " " and ordered and scale.position in ("cm", "m")
     if text and every:
         if raw.rate is None:
-            own["frame_rate"] = rate
+            own["frame_rate"] = scale.rate
         if raw.unit is None:
             own["unit"] = scale.position
         return Source("pedpy", WalkwayOptions(path=path, **own))
-    made = raw.path.with_name(f"{raw.path.stem}_people.txt").absolute()
-    own["path"] = str(made)
-    return Source("pedpy", WalkwayOptions(**own), _to_people(raw, columns, scale, rate, made))
-
-
-def people_rate(tracks: Tracks) -> float:
-    """Samples of people per second."""
-    return float(f"{1 / tracks.dt:.9g}")
-
-
-def people_of(raw: Raw, found: Mapping[str, Meaning], scale: Scale, rate: float) -> pd.DataFrame:
-    """Rows id, frame, x, y (m) of a table of people, as the lines of :func:`_to_people` make them.
-
-    Args:
-        rate: samples per second.
-    """
-    assert raw.table is not None
-    frame = raw.table.frame
-    columns = {meaning: one.column for meaning, one in found.items()}
-    clock = numbers(frame, columns["time" if "time" in columns else "frame"])
-    number = np.round(rate * scale.seconds * clock)
-    runs = [columns[m] for m in ("recording", "sequence") if m in columns]
-    if runs:
-        number += (np.nanmax(number) - np.nanmin(number) + 1) * frame.groupby(runs).ngroup()
-    who = frame[[*runs, columns["agent"]]].astype(str).agg(" ".join, axis=1)
-    made = pd.DataFrame({"id": pd.factorize(who)[0], "frame": number})
-    for axis in ("x", "y"):
-        made[axis] = scale.metres * numbers(frame, columns[axis])
-    return made.dropna().astype({"frame": np.int64})
-
-
-def _even(tracks: Tracks) -> bool:
-    """Whether times of every part of a table are equally spaced, apart from holes of single agents,
-    as those of a tidy table must be."""
-    part = np.zeros(len(tracks)) if tracks.part is None else tracks.part
-    for number in np.unique(part):
-        step = np.diff(np.unique(np.round(tracks.time[part == number], 9)))
-        if step.size and (np.abs(step - np.median(step)) > UNEVEN * np.median(step)).any():
-            return False
-    return True
+    meant = {name: name for name in ("agent", "x", "y", "recording", "sequence")}
+    meant["time"] = "time" if "time" in columns else "frame"
+    own |= {"columns": _named(raw, columns, meant), "frame_rate": scale.rate}
+    own |= {"position_unit": scale.position, "time_unit": scale.time}
+    return Source("pedpy", WalkwayOptions(path=path, **own))
 
 
 def _together(tracks: Tracks) -> bool:
@@ -216,8 +174,7 @@ def _tidy(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> So
         named["y"] = None
     own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
     own |= {"time_unit": scale.time, "frame_rate": scale.rate, "domain": scale.domain}
-    place, lines = _commas(raw, path)
-    return Source("table", TableOptions(path=place, **own), lines)
+    return Source("table", TableOptions(path=path, **own))
 
 
 def _named(raw: Raw, columns: Mapping[str, str], meant: Mapping[str, str]) -> dict[str, str | None]:
@@ -233,69 +190,6 @@ def _named(raw: Raw, columns: Mapping[str, str], meant: Mapping[str, str]) -> di
     }
 
 
-def _commas(raw: Raw, path: str, *change: str) -> tuple[str, list[str]]:
-    """Where the table is with commas between its cells, and the lines that write it there."""
-    if _plain(raw) and not change:
-        return path, []
-    made = str(raw.path.with_name(f"{raw.path.stem}_commas.csv").absolute())
-    read = ["import pandas as pd", "", *_read(raw)]
-    return made, [*read, *change, f"t.to_csv({made!r}, index=False)"]
-
-
-def _to_people(
-    raw: Raw, columns: Mapping[str, str], scale: Scale, rate: float, made: Path
-) -> list[str]:
-    clock = columns["time" if "time" in columns else "frame"]
-    samples = rate * scale.seconds  # by unit of the file's time
-    frames = f"({samples:.9g} * t[{clock!r}]).round().astype(int)"
-    metres = f"{scale.metres:g} * " if scale.metres != 1 else ""
-    whose = [columns[m] for m in ("recording", "sequence", "agent") if m in columns]
-    who = f"t[{whose[0]!r}]"
-    lines = [f"frame = {frames}"]
-    if len(whose) > 1:
-        who = f"t[{whose!r}].astype(str).agg(' '.join, axis=1)"
-        # people of two recordings never meet: one recording begins when the other one has ended
-        lines.append(
-            f"frame += (frame.max() - frame.min() + 1) * t.groupby({whose[:-1]!r}).ngroup()"
-        )
-    return [
-        "import pandas as pd",
-        "",
-        *_read(raw),
-        *lines,
-        "people = pd.DataFrame({",
-        f"    'id': pd.factorize({who})[0], 'frame': frame,",
-        f"    'x': {metres}t[{columns['x']!r}], 'y': {metres}t[{columns['y']!r}], 'z': 0}})",
-        f"with open({str(made)!r}, 'w') as file:",
-        f"    file.write('# framerate: {rate:.9g}\\n# id frame x/m y/m z/m\\n')",
-        "    people.to_csv(file, sep=' ', header=False, index=False)",
-    ]
-
-
-def _read(raw: Raw) -> list[str]:
-    if not raw.separator:
-        return [f"t = pd.read_parquet({str(raw.path.absolute())!r})", *_seconds(raw)]
-    how = [repr(str(raw.path.absolute()))]
-    if raw.separator != ",":
-        how.append("sep=r'\\s+'" if raw.separator == " " else f"sep={raw.separator!r}")
-    if raw.decimal != ".":
-        how.append(f"decimal={raw.decimal!r}")
-    if not raw.named and raw.table is not None:
-        names = [str(name) for name in raw.table.frame.columns]
-        how.append(f"comment='#', names={names!r}")
-    return [f"t = pd.read_csv({', '.join(how)})", *_seconds(raw)]
-
-
-def _seconds(raw: Raw) -> list[str]:
-    """Lines that make seconds of dates, clock times and durations."""
-    if not raw.dated:
-        return []
-    return [
-        "from nnode.data.readers.columns import Table",
-        *(f"t[{name!r}] = Table(t).times({name!r})[1]" for name in raw.dated),
-    ]  # fmt: skip
-
-
 def _vehicles(
     raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
 ) -> Source:
@@ -305,18 +199,12 @@ def _vehicles(
     back = bool(np.median(tracks.x[end, 0] - tracks.x[start, 0]) < 0)
     exact = all(columns.get(name) == name for name in _TABLE)
     cut = "sequence" in columns and "lane" not in columns
-    if cut and not back and _even(tracks) and (exact or _together(tracks)):
+    if cut and not back and (exact or _together(tracks)):
         return _tidy(raw, found, scale, path)
     clock = "time" if "time" in columns else "frame"
     meant = {"vehicle": "agent", "time": clock} | {
-        name: name for name in ("x", "lane", "speed", "length", "kind", "recording")
+        name: name for name in ("x", "lane", "speed", "length", "kind", "recording", "sequence")
     }
-    whole = [columns[m] for m in ("recording", "sequence") if m in columns]
-    columns = {**columns, **({"recording": whole[0]} if whole else {})}
-    change: list[str] = []
-    if len(whole) > 1:
-        columns["recording"] = JOINT
-        change = [f"t[{JOINT!r}] = t[{whole!r}].astype(str).agg(' '.join, axis=1)"]
     named = _named(raw, columns, meant)
     own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
     if "speed" in columns:
@@ -330,15 +218,7 @@ def _vehicles(
         own["direction"] = -1
     if _most(tracks) < VehicleTableOptions.min_vehicles:
         own["min_vehicles"] = max(_most(tracks), 1)
-    place, lines = _commas(raw, path, *change)
-    return Source("vehicles", VehicleTableOptions(path=place, **own), lines)
-
-
-def joint(raw: Raw, found: Mapping[str, Meaning]) -> pd.Series:
-    """Names of recording and sequence of every row."""
-    assert raw.table is not None
-    whole = [found[m].column for m in ("recording", "sequence")]
-    return raw.table.frame[whole].astype(str).agg(" ".join, axis=1)
+    return Source("vehicles", VehicleTableOptions(path=path, **own))
 
 
 def _most(tracks: Tracks) -> int:
@@ -362,13 +242,7 @@ def _pairs(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> S
     own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
     if "v_follower" in columns:
         own["speed_unit"] = scale.speed
-    if scale.rate is None and _plain(raw) and "time" in columns:
-        return Source("pairs", PairOptions(path=path, time_unit=scale.time, **own))
-    made = str(raw.path.with_name(f"{raw.path.stem}_pairs.csv").absolute())
-    clock = columns.get("time", columns.get("frame", ""))
-    named["time"] = "time"
-    lines = [
-        "import pandas as pd", "", *_read(raw), f"t['time'] = {scale.seconds:.9g} * t[{clock!r}]",
-        f"t.to_csv({made!r}, index=False)",
-    ]  # fmt: skip
-    return Source("pairs", PairOptions(path=made, **own), lines)
+    if "time" not in columns and columns.get("frame", "time") != "time":
+        named["time"] = columns["frame"]
+    own |= {"time_unit": scale.time, "frame_rate": scale.rate}
+    return Source("pairs", PairOptions(path=path, **own))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +25,99 @@ EPOCH = 1e8
 _WHOLE = 2.0**63
 
 
+#: So many bytes and lines are looked at to tell how a text is laid out.
+LOOKED_AT, _LINES = 1 << 16, 20
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|inf", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a text holds a table.
+
+    Attributes:
+        first: its first row.
+        cells: in that row.
+        separator: ``,``, ``;``, tab, or a space for any white space.
+        decimal: the sign between whole and broken part of numbers.
+        names: of the columns, where the first row holds none: those of the last comment, else
+            ``column 1``, ...; None: the first row holds them.
+        named: whether the names are the file's own.
+        above: lines above the first row.
+        comments: lines that begin with ``#``.
+    """
+
+    first: str
+    cells: int
+    separator: str
+    decimal: str
+    names: list[str] | None
+    named: bool
+    above: int
+    comments: str
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`pandas.read_csv`."""
+        how: dict[str, Any] = {"sep": r"\s+" if self.separator == " " else self.separator}
+        how["decimal"] = self.decimal
+        # the rows' own lines are counted from the comments above them on
+        return how | ({"comment": "#", "skiprows": self.above} if self.comments else {})
+
+
+def layout(text: str, whole: bool = True) -> Layout | None:
+    """How a text holds a table; None of one without rows.
+
+    Args:
+        text: its beginning.
+        whole: whether it is all of it.
+    """
+    lines = text.splitlines() if whole else text.splitlines()[:-1] or [text]
+    comments = [line for line in lines if line.startswith("#")]
+    rows = [line for line in lines if line.strip() and not line.startswith("#")][:_LINES]
+    if not rows:
+        return None
+    separator = _separator(rows)
+    cells = _cells(rows[0], separator)
+    named = not all(_NUMBER.fullmatch(cell) or not cell for cell in cells)
+    later = [cell for row in rows[1:] for cell in _cells(row, separator)]
+    comma = separator != "," and any("," in cell and _NUMBER.fullmatch(cell) for cell in later)
+    names = None if named else [f"column {i + 1}" for i in range(len(cells))]
+    if not named and comments and separator != " ":
+        said = _cells(comments[-1].lstrip("# "), separator)
+        if len(said) == len(cells) and not any(_NUMBER.fullmatch(cell) for cell in said):
+            names, named = said, True
+    above = next(i for i, line in enumerate(lines) if line.strip() and line[0] != "#")
+    return Layout(
+        rows[0], len(cells), separator, "," if comma else ".", names, named, above,
+        "\n".join(comments),
+    )  # fmt: skip
+
+
+def _separator(rows: list[str]) -> str:
+    """The sign of which every row has as many, at least two."""
+    for sign in (";", "\t", ","):
+        counts = {row.count(sign) for row in rows}
+        if min(counts) >= 2 and len(counts) == 1:
+            return sign
+    # rows of unequal lengths: what the first line has
+    most = max((",", ";", "\t"), key=rows[0].count)
+    return most if rows[0].count(most) else " "
+
+
+def _cells(row: str, separator: str) -> list[str]:
+    parts = row.split() if separator == " " else row.split(separator)
+    return [part.strip().strip('"') for part in parts]
+
+
 class Table:
     """A table whose cells are asked for by meaning.
 
     Args:
-        source: a file, ``.parquet`` or ``.pq`` read as Parquet, all else as CSV; or a data frame.
-        names: of the columns of a CSV without a line of names.
-        csv: further options of :func:`pandas.read_csv`.
+        source: a file, ``.parquet`` or ``.pq`` read as Parquet, all else as text, see
+            :class:`Layout`; or a data frame.
+        names: of the columns of a text without a line of names.
+        csv: further options of :func:`pandas.read_csv`; with ``sep`` or ``skiprows`` among them the
+            layout is not looked for.
 
     Attributes:
         path: of the file; a data frame, which has none, is called ``table``.
@@ -49,11 +137,13 @@ class Table:
             self._read(source, names, csv)
 
     def _read(self, path: Path, names: list[str] | None, csv: dict[str, Any]) -> None:
-        self._first = (2 if names is None else 1) + int(csv.get("skiprows", 0))
         parquet = path.suffix.lower() in (".parquet", ".pq")
         self.by_line = not parquet
         if not path.is_file():
             raise DataError(f"there is no table {path}; set data.path, or data.source, to it")
+        if not parquet and names is None and not {"sep", "skiprows"} & csv.keys():
+            names, csv = self._laid_out(path, csv)
+        self._first = (2 if names is None else 1) + int(csv.get("skiprows", 0))
         try:
             if parquet:
                 frame = pd.read_parquet(path).reset_index(drop=True)
@@ -75,6 +165,18 @@ class Table:
                 "every column a name"
             )
         self._take(frame)
+
+    @staticmethod
+    def _laid_out(path: Path, csv: dict[str, Any]) -> tuple[list[str] | None, dict[str, Any]]:
+        """Names and options that read a text as it is laid out."""
+        try:
+            with path.open("rb") as file:
+                start = file.read(LOOKED_AT)
+        except OSError as error:
+            raise DataError(f"{path} cannot be read: {error.strerror}") from error
+        text = start.decode("utf-8-sig", errors="replace")
+        found = layout(text, whole=len(start) < LOOKED_AT)
+        return (None, csv) if found is None else (found.names, {**found.options, **csv})
 
     def _take(self, frame: pd.DataFrame) -> None:
         self.frame = frame
@@ -310,9 +412,6 @@ class Table:
         text = f"{self.path} has no column {column!r}; it has: {self._listing()}"
         if near:
             text += f"; did you mean {near[0]!r}?"
-        only = str(self.frame.columns[0])
-        if len(self.frame.columns) == 1 and any(sign in only for sign in ";\t|"):
-            return text + "; the cells must be separated by commas"
         if mapped:
             return text + f"; set data.columns.{key}={example}"
         return text + f"; rename the column that holds it to {key!r}"

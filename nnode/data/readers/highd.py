@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from nnode.data.cut import Reading, by_lane, check_cutting
 from nnode.data.options import HighDOptions
 from nnode.data.readers.columns import Table
-from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.recordings import table_path
-from nnode.data.sequence import Sequence
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: How the names of a recording's three tables end.
@@ -42,7 +42,7 @@ def highd_files(options: HighDOptions) -> dict[str, Path]:
     return files
 
 
-def read_highd(files: dict[str, Path], options: HighDOptions) -> list[Sequence]:
+def read_highd(files: dict[str, Path], options: HighDOptions) -> Reading:
     """Read a recording and cut it as a vehicle table.
 
     Args:
@@ -66,18 +66,21 @@ def read_highd(files: dict[str, Path], options: HighDOptions) -> list[Sequence]:
     vehicle = tracks.names(names["id"])
     direction, kind = _tracks(files[TRACKS_META], tracks, vehicle)
     corner, length = tracks.numbers(names["x"]), tracks.numbers(names["width"])
-    rows = Vehicles(
+    x = np.where(direction == RIGHT, corner + length, -corner)
+    speed = np.abs(tracks.numbers(names["xVelocity"])) if "xVelocity" in names else None
+    rows = Trajectories(
         path=tracks.path,
-        row=tracks.row,
-        vehicle=vehicle,
+        name=files[TRACKS].name.removesuffix(TRACKS),
+        where=tracks.row,
+        agent=vehicle,
         time=tracks.numbers(names["frame"]) / _rate(files[RECORDING_META]),
-        x=np.where(direction == RIGHT, corner + length, -corner),
+        x=x[:, None],
+        v=None if speed is None else speed[:, None],
         lane=tracks.names(names["laneId"]),
-        speed=np.abs(tracks.numbers(names["xVelocity"])) if "xVelocity" in names else None,
         length=length,
         kind=kind,
     )
-    return cut_vehicles({files[TRACKS].name.removesuffix(TRACKS): rows}, options)
+    return by_lane(rows, options)
 
 
 def _rate(path: Path) -> float:

@@ -10,6 +10,7 @@ import logging
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
@@ -17,18 +18,17 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 
+from nnode.data.cut import Member, Reading, by_presence, sequence_of, told_uneven
 from nnode.data.exits import Exit, destinations, exits_of, read_exits
-from nnode.data.options import JuelichOptions, Velocity
-from nnode.data.readers.recordings import one_of, positive, raw_files
+from nnode.data.options import JuelichOptions, Velocity, one_of, positive
+from nnode.data.readers.recordings import natural, raw_files
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import fill, smooth_records
+from nnode.data.trajectories import Grid, Record, Trajectories, records
 from nnode.errors import ConfigError, DataError
 
 #: Units of the coordinates, with their size in m.
 UNITS = {"cm": 0.01, "m": 1.0}
 
-#: A table of frames and people may hold so many cells, or so many times its rows.
-_FRAMES, _SPARSE = 10**8, 1000
 #: From the first frame to the last there may be so many, or ten times those with somebody in them.
 _PAUSES = 10**5
 
@@ -38,13 +38,16 @@ FASTEST = 1e6
 _AXES = {"x": 0, "y": 1}
 _NAME = re.compile(r"(.+)\.txt")
 
+#: Rows of people, and their sampling interval (s).
+People = tuple[Trajectories, float]
+
 
 def juelich_files(options: JuelichOptions) -> dict[str, Path]:
     """Path of each wanted recording's file, see :func:`nnode.data.readers.recordings.raw_files`."""
     return raw_files(options, default="juelich", pattern=_NAME, file_name=lambda r: f"{r}.txt")
 
 
-def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
+def read_juelich(path: Path, options: JuelichOptions) -> Reading:
     """Read one file and cut it into consecutive sequences of ``t_seq`` seconds.
 
     Neighbouring sequences share their boundary sample: with 25 frames per second and
@@ -67,108 +70,102 @@ def read_juelich(path: Path, options: JuelichOptions) -> list[Sequence]:
 
     Source: Forschungszentrum Jülich, DOI 10.34735/ped.2013.5 (bi_corr) and the HERMES runs.
     """
-    path = Path(path)
-    table, rate = load_people(path, options)
-    return cut_people(path, table, rate, options)
+    return cut_people(load_people(Path(path), options), options, None)
 
 
-def cut_people(
-    path: Path,
-    table: pd.DataFrame,
-    rate: float,
-    options: JuelichOptions,
-    walls: np.ndarray | None = None,
-) -> list[Sequence]:
-    """Cut tracked people into consecutive sequences, see :func:`read_juelich`.
+def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None) -> Reading:
+    """Cut a recording of people, whatever file it comes from, see :func:`read_juelich`.
 
     Args:
-        path: the file they come from; its stem names the recording.
-        table: rows id, frame (whole numbers), x, y (m).
-        rate: frames per second.
-        options: duration, history, walking axis, walls, view and velocities.
-        walls: ``(W, 4)`` m, in place of ``options.walls``.
+        people: their rows.
+        walls: ``(W, 4)`` segments, or None for those of ``options.walls``.
 
     Raises:
         ConfigError: an option out of its range.
-        DataError: one person twice in a frame, or no sequence at all.
+        DataError: one person twice at one time, or no sequence at all.
     """
-    axis = int(one_of("walking_axis", options.walking_axis, _AXES))
+    rows, dt = people
+    path, axis = rows.path, int(one_of("walking_axis", options.walking_axis, _AXES))
     view = _interval("view", options.view)
-    if not 0 < rate <= FASTEST:
-        raise DataError(
-            f"{path}: a frame rate of {rate:g} frames/s; expected a positive number of at most "
-            f"{FASTEST:g}: correct it in the file"
-        )
     if not 0 <= options.history < math.inf:
         raise ConfigError(f"data.history={options.history}: expected a number of seconds, or 0")
-    steps = positive("t_seq", options.t_seq) * rate
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
-        nearest = max(round(steps), 1) / rate
+    number = positive("t_seq", options.t_seq) / dt
+    steps = round(number)
+    if steps < 1 or abs(number - steps) > 1e-3:
         raise ConfigError(
-            f"data.t_seq={options.t_seq:g} s is {steps:g} frames at the {rate:g} frames/s of "
-            f"{path.name}; expected a whole number, such as t_seq={nearest:g}"
+            f"data.t_seq={options.t_seq:g} s is {number:g} frames at the {1 / dt:g} frames/s of "
+            f"{path.name}; expected a whole number, such as t_seq={max(steps, 1) * dt:g}"
         )
-    _check_once(path, table)
-    _check_dense(path, table)
-    frames, ids, x = _positions(table)
-    x, filled = fill(x, 1 / rate, options.max_hole)
-    if options.smooth is not None:
-        x = smooth_records(x, 1 / rate, positive("smooth", options.smooth))
-    v = _velocity(x, rate, options.velocity)
     if walls is None:
-        walls = _walls(path.stem, options.walls, axis, x, view)
-    exits = _exits(path, read_exits(options.exits), x, ids)
-    inside = np.isfinite(x[:, :, axis])
-    if view is not None:
-        with np.errstate(invalid="ignore"):
-            inside &= (x[:, :, axis] >= view[0]) & (x[:, :, axis] <= view[1])
+        walls = _walls(path.stem, options.walls, axis, rows.x, view)
     found: list[Sequence] = []
-    for first in range(0, len(frames) - round(steps), round(steps)):
-        rows = slice(first, first + round(steps) + 1)
-        people = np.flatnonzero(inside[rows].all(axis=0))
-        if len(people) < max(options.min_agents, 1):
-            continue
-        positions = x[rows][:, people]
-        before = first - round(options.history * rate)
-        found.append(
-            Sequence(
-                name=f"{path.stem}/{len(found):03d}",
-                recording=path.stem,
-                time=frames[rows] / rate,
-                x=positions,
-                v=None if v is None else v[rows][:, people],
-                agents=tuple(str(ids[i]) for i in people),
-                destination=destinations([exits[i] for i in people], positions[0])
-                if exits
-                else positions[-1],
-                preferred=_before(x[[before, first]][:, people], rate / (first - before))
-                if 0 <= before < first
-                else None,
-                walls=walls,
-                filled=int(filled[rows][:, people].sum()),
-            )
-        )
+    notes: list[str] = []
+    for (name,), own in rows.parts("recording"):
+        recording = name or rows.name
+        grid = Grid(dt, float(own.time.min()))
+        every = records(own, grid, fill=options.fill, smoothing=options.smooth)
+        every = [_with_velocity(record, dt, options) for record in every]
+        notes += told_uneven(every, dt)
+        goals = _goals(own, read_exits(options.exits))
+        before = round(options.history / dt)
+        for number, (there, first, last) in enumerate(
+            by_presence(every, steps, max(options.min_agents, 1), axis, view)
+        ):
+            there.sort(key=lambda record: natural(record.agent))
+            of = [Member(record.agent, record.row, [record]) for record in there]
+            found.append(
+                sequence_of(
+                    f"{recording}/{number:03d}", own, of, first, last, grid,
+                    recording=recording,
+                    destination=_destinations(goals, there, first, last),
+                    preferred=_before(every, there, first, before, dt),
+                    walls=walls,
+                )
+            )  # fmt: skip
     if not found:
+        span = float(rows.time.max() - rows.time.min()) + dt
         raise DataError(
             f"{path}: no sequence; nowhere are {max(options.min_agents, 1)} people present for "
-            f"{options.t_seq:g} s ({len(ids)} people, {len(frames) / rate:g} s in all); lower "
+            f"{options.t_seq:g} s ({len(set(rows.agent))} people, {span:g} s in all); lower "
             "data.t_seq or data.min_agents, widen data.view, or leave it out of data.recording"
         )
-    return found
+    return Reading(found, notes=notes)
 
 
-def _exits(path: Path, exits: list[Exit], x: np.ndarray, ids: np.ndarray) -> list[Exit]:
-    """Everybody's exit by where he is first and last seen in the file, or an empty list."""
+def _with_velocity(record: Record, dt: float, options: JuelichOptions) -> Record:
+    """A record with velocities as the options ask for them; smoothed ones stay."""
+    scheme, x = options.velocity, record.x
+    if options.smooth is not None or scheme is Velocity.forward or len(x) < 2:
+        return record
+    step = np.diff(x, axis=0) / dt
+    ahead, behind = np.concatenate([step, step[-1:]]), np.concatenate([step[:1], step])
+    return replace(record, v=behind if scheme is Velocity.backward else (ahead + behind) / 2)
+
+
+_Goals = dict[str, Exit]
+
+
+def _goals(rows: Trajectories, exits: list[Exit]) -> _Goals:
+    """Everybody's exit by where he is first and last seen in the file, or nothing."""
     if not exits:
-        return []
-    known = np.isfinite(x).all(axis=2)
-    column = np.arange(x.shape[1])
-    first = x[known.argmax(axis=0), column]
-    last = x[len(x) - 1 - known[::-1].argmax(axis=0), column]
+        return {}
+    order = np.argsort(rows.time, kind="stable")
+    agent = rows.agent[order].astype(str)
+    names, first = np.unique(agent, return_index=True)
+    last = len(agent) - 1 - np.unique(agent[::-1], return_index=True)[1]
     try:
-        return exits_of(exits, first, last, [str(i) for i in ids])
+        own = exits_of(exits, rows.x[order[first]], rows.x[order[last]], names.tolist())
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{rows.path}: {error}") from error
+    return dict(zip(names.tolist(), own, strict=True))
+
+
+def _destinations(goals: _Goals, there: list[Record], first: int, last: int) -> np.ndarray:
+    """``(N, 2)`` m: nearest points of exits, or the last positions of the sequence."""
+    if not goals:
+        return np.stack([record.x[last - record.first] for record in there])
+    x = np.stack([record.x[first - record.first] for record in there])
+    return destinations([goals[record.agent] for record in there], x)
 
 
 def _interval(option: str, value: list[float] | None) -> tuple[float, float] | None:
@@ -180,8 +177,8 @@ def _interval(option: str, value: list[float] | None) -> tuple[float, float] | N
     return numbers[0], numbers[1]
 
 
-def load_people(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, float]:
-    """Rows id, frame, x, y (m) of a text file, and its frame rate (1/s).
+def load_people(path: Path, options: JuelichOptions) -> People:
+    """The rows of a text file, and its sampling interval.
 
     Raises:
         ConfigError: a frame rate or unit that is unknown or contradicts the file.
@@ -212,29 +209,37 @@ def load_people(path: Path, options: JuelichOptions) -> tuple[pd.DataFrame, floa
     table = trajectory.data[["id", "frame", "x", "y"]].reset_index(drop=True)
     if not np.isfinite(table[["x", "y"]].to_numpy()).all():
         _check_lines(path)
-    return table, float(trajectory.frame_rate)
+    return people_of(path, table, float(trajectory.frame_rate))
 
 
-def _check_once(path: Path, table: pd.DataFrame) -> None:
-    twice = table.duplicated(["id", "frame"])
-    if twice.any():
-        row = table[twice].iloc[0]
+def people_of(path: Path, table: pd.DataFrame, rate: float) -> People:
+    """Rows id, frame, x, y (m) of a recording with so many frames per second.
+
+    Raises:
+        DataError: a rate that no recording has, or frames far away from the others.
+    """
+    if not 0 < rate <= FASTEST:
         raise DataError(
-            f"{path}: person {row.id:g} stands twice in frame {row.frame:g} "
-            f"({int(twice.sum())} such rows); expected one row per person and frame"
+            f"{path}: a frame rate of {rate:g} frames/s; expected a positive number of at most "
+            f"{FASTEST:g}: correct it in the file"
         )
-
-
-def _check_dense(path: Path, table: pd.DataFrame) -> None:
-    """Refuse a stray frame number before a table of all frames is made for it."""
-    frame = table["frame"]
-    span = int(frame.max()) - int(frame.min()) + 1
-    stray = span > max(_PAUSES, 10 * frame.nunique())
-    if stray or span * table["id"].nunique() > max(_FRAMES, _SPARSE * len(table)):
+    frame = table["frame"].to_numpy()
+    if int(frame.max()) - int(frame.min()) >= max(_PAUSES, 10 * table["frame"].nunique()):
         raise DataError(
             f"{path}: {len(table)} rows stand in frames {frame.min()} to {frame.max()}; expected "
             "consecutive frame numbers: look for one that is wrong, or cut the file"
         )
+    return (
+        Trajectories(
+            path=path,
+            name=path.stem,
+            where=lambda i: f"frame {frame[i]}",
+            agent=table["id"].astype(str).to_numpy(dtype=object),
+            time=frame / rate,
+            x=table[["x", "y"]].to_numpy(dtype=np.float64),
+        ),
+        1 / rate,
+    )
 
 
 def _pedpy() -> ModuleType:
@@ -275,33 +280,18 @@ def _check_lines(path: Path) -> None:
         raise DataError(f"{path} is empty; expected lines of 'id frame x y z'")
 
 
-def _positions(table: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All frames from first to last, ids, and positions (frames, people, 2), NaN where absent."""
-    ids, column = np.unique(table["id"].to_numpy(), return_inverse=True)
-    frame = table["frame"].to_numpy()
-    frames = np.arange(frame.min(), frame.max() + 1)
-    x = np.full((len(frames), len(ids), 2), np.nan)
-    x[frame - frames[0], column] = table[["x", "y"]].to_numpy()
-    return frames, ids, x
-
-
-def _velocity(x: np.ndarray, rate: float, scheme: Velocity) -> np.ndarray | None:
-    """Velocities (m/s) over the whole trajectory; one-sided where a neighbour is absent."""
-    if scheme is Velocity.forward:
+def _before(
+    every: list[Record], there: list[Record], first: int, steps: int, dt: float
+) -> np.ndarray | None:
+    """Mean velocities (m/s) of people so many steps before a time, NaN of who was not tracked."""
+    at = first - steps
+    if not steps or at < min(record.first for record in every):
         return None
-    step = np.diff(x, axis=0) * rate
-    edge = np.full_like(x[:1], np.nan)
-    ahead, behind = np.concatenate([step, edge]), np.concatenate([edge, step])
-    one_sided = np.where(np.isnan(behind), ahead, behind)
-    if scheme is Velocity.backward:
-        return one_sided
-    central = (ahead + behind) / 2
-    return np.where(np.isnan(central), one_sided, central)
-
-
-def _before(x: np.ndarray, rate: float) -> np.ndarray | None:
-    """Mean velocities (m/s) between two moments, ``rate`` (1/s) apart, of those who were there."""
-    found: np.ndarray = (x[1] - x[0]) * rate
+    then = {r.agent: r.x[at - r.first] for r in every if r.first <= at <= r.last}
+    nowhere = np.full(2, np.nan)
+    found: np.ndarray = np.stack(
+        [(r.x[first - r.first] - then.get(r.agent, nowhere)) / (steps * dt) for r in there]
+    )
     return found if np.isfinite(found).any() else None
 
 
@@ -319,7 +309,7 @@ def _walls(
         return None
     sides = _interval(f"walls.{patterns[0]}", walls[patterns[0]])
     assert sides is not None
-    start, end = view or (np.nanmin(x[:, :, axis]), np.nanmax(x[:, :, axis]))
+    start, end = view or (np.nanmin(x[:, axis]), np.nanmax(x[:, axis]))
     # Walking along y instead of x mirrors the plane, and with it left and right.
     low, high = ((start, end), (end, start)) if axis == 0 else ((end, start), (start, end))
     segments = np.empty((2, 4))

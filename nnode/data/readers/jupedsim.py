@@ -17,11 +17,14 @@ import pandas as pd
 import shapely
 from shapely.geometry.polygon import orient
 
-from nnode.data.options import WalkwayOptions
-from nnode.data.readers.columns import Table
-from nnode.data.readers.juelich import cut_people, load_people
-from nnode.data.readers.recordings import positive, table_path
-from nnode.data.sequence import Sequence
+from nnode.data.cut import Reading
+from nnode.data.options import WalkwayOptions, one_of
+from nnode.data.readers.columns import Table, opened
+from nnode.data.readers.juelich import People, cut_people, load_people, people_of
+from nnode.data.readers.recordings import table_path
+from nnode.data.readers.vehicles import LENGTH_UNITS, recordings, seconds_per_unit
+from nnode.data.sequence import check_interval
+from nnode.data.trajectories import Trajectories, usual_step
 from nnode.errors import ConfigError, DataError
 
 #: First bytes of every SQLite database.
@@ -36,6 +39,9 @@ _AT_ONCE = 100_000
 #: Whole numbers below this are exact as floating-point numbers.
 _WHOLE = 2**53
 
+#: Endings of files that are tables.
+TABLES = (".csv", ".parquet", ".pq")
+
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
@@ -49,14 +55,14 @@ def walkway_files(options: WalkwayOptions) -> dict[str, Path]:
 
 def read_walkway(
     path: Path | Table, options: WalkwayOptions, geometry: Path | None = None
-) -> list[Sequence]:
+) -> Reading:
     """Read one file and cut it, see :func:`nnode.data.readers.juelich.read_juelich`.
 
     Args:
         path: SQLite database as JuPedSim's writer makes it; text ``id frame x y z``; or a table
-            in memory with id, frame, x, y (m), and ``frame_rate`` among the options.
+            (CSV, Parquet, in memory, or any text whose ``columns`` are given).
         options: those of the Jülich reader. ``frame_rate`` and ``unit`` are for texts without a
-            header; a database tells its own.
+            header; a database tells its own, and a table has units.
         geometry: text file with the walkable area as WKT (m); it takes the place of the area
             that a database holds.
 
@@ -69,24 +75,44 @@ def read_walkway(
         DataError: a file that is not of its format, or no sequence at all.
     """
     area = None
-    if isinstance(path, Table):
-        people, rate = path.frame, positive("frame_rate", options.frame_rate)
-        path = path.path
-    elif path.is_file() and _is_database(path):
-        people, rate, area = _read_database(path)
+    if isinstance(path, Path) and path.is_file() and _is_database(path):
+        table, rate, area = _read_database(path)
         if options.frame_rate not in (None, rate) or options.unit not in (None, "m"):
             raise ConfigError(
                 f"{path} is in m at {rate:g} frames/s, but data.frame_rate={options.frame_rate}, "
                 f"data.unit={options.unit}; leave both out for a database"
             )
+        people = people_of(path, table, rate)
+    elif isinstance(path, Table) or options.columns or path.suffix.lower() in TABLES:
+        people = _of_table(opened(path), options)
     else:
-        people, rate = load_people(path, options)
+        people = load_people(path, options)
     walls = None
     if geometry is not None:
         walls = walls_of(_text(geometry), str(geometry))
     elif area is not None and not options.walls:
         walls = walls_of(area, f"{path}, table geometry")
-    return cut_people(path, people, rate, options, walls)
+    return cut_people(people, options, walls)
+
+
+def _of_table(table: Table, options: WalkwayOptions) -> People:
+    """Rows agent, time, x, y of any table, and their sampling interval."""
+    names = table.choose(("agent", "time", "x", "y"), ("recording", "sequence"), options.columns)
+    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
+    rows = Trajectories(
+        path=table.path,
+        name=table.path.stem,
+        where=table.row,
+        recording=recordings(table, names),
+        agent=table.names(names["agent"]),
+        time=table.times(names["time"], seconds_per_unit(options))[1],
+        x=np.stack([table.measured(names[axis]) for axis in ("x", "y")], -1) * metres,
+    )
+    dt = usual_step(rows)
+    if not np.isfinite(dt):
+        raise DataError(f"{table.path}: nobody has rows at two times; nothing moves here")
+    check_interval(dt, f"{table.path}: rows of a person")
+    return rows, dt
 
 
 def walls_of(wkt: str, where: str) -> np.ndarray:

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from nnode.data.cut import Reading, by_lane, check_cutting
 from nnode.data.options import NgsimOptions, VehicleTableOptions
 from nnode.data.readers.columns import Table
-from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.vehicles import read_vehicles
-from nnode.data.sequence import Sequence
+from nnode.data.trajectories import Trajectories
 from nnode.errors import DataError
 
 log = logging.getLogger(__name__)
@@ -74,8 +74,8 @@ _LATEST = 2.0**53
 BEHIND_UTC = 7
 
 
-def read_ngsim(path: Path, options: NgsimOptions) -> list[Sequence]:
-    """Read a file and cut it, see :func:`nnode.data.readers.platoons.cut_vehicles`.
+def read_ngsim(path: Path, options: NgsimOptions) -> Reading:
+    """Read a file and cut it, see :func:`nnode.data.cut.by_lane`.
 
     Args:
         path: CSV, Parquet, or text with blanks between the cells.
@@ -100,7 +100,7 @@ def read_ngsim(path: Path, options: NgsimOptions) -> list[Sequence]:
         return read_vehicles(
             path, VehicleTableOptions(**{**vars(options), "columns": dict(RECONSTRUCTED)})
         )
-    return cut_vehicles(_periods(table), options)
+    return by_lane(_periods(table), options)
 
 
 def _table(path: Path) -> Table:
@@ -137,8 +137,8 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _periods(table: Table) -> dict[str, Vehicles]:
-    """The rows of every period of every location, by name."""
+def _periods(table: Table) -> Trajectories:
+    """The rows, every period of every location a recording."""
     held = set(table.frame.columns)
     lacking = [name for name in _NEEDED if name not in held]
     if lacking:
@@ -166,7 +166,7 @@ def _periods(table: Table) -> dict[str, Vehicles]:
             f"{table.path}, {table.row(int(odd[0]))}: Global_Time and Frame_ID put frame 0 at "
             f"{start[odd[0]]:g} ms since 1970; correct them"
         )
-    found: dict[str, Vehicles] = {}
+    found: dict[str, np.ndarray] = {}
     for location in dict.fromkeys(place[roads]):
         own = roads[place[roads] == location]
         own = own[np.argsort(start[own], kind="stable")]
@@ -175,8 +175,11 @@ def _periods(table: Table) -> dict[str, Vehicles]:
             name = called = f"{location}_{_clock(start[rows[0]])}"
             while name in found:  # of another day
                 name = f"{called}-{1 + sum(known.startswith(called) for known in found)}"
-            found[name] = _vehicles(table, number, np.sort(rows), start[rows[0]])
-    return found
+            rows = np.sort(rows)
+            same = np.stack([number[needed][rows] for needed in _NEEDED], axis=1)
+            # rows that stand there twice are taken once
+            found[name] = rows[np.sort(np.unique(same, axis=0, return_index=True)[1])]
+    return _vehicles(table, number, found, start)
 
 
 def _roads(table: Table, place: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
@@ -204,21 +207,28 @@ def _clock(start: float) -> str:
 
 
 def _vehicles(
-    table: Table, number: dict[str, np.ndarray], rows: np.ndarray, start: float
-) -> Vehicles:
-    """One period in SI units, rows that stand there twice taken once."""
-    same = np.stack([number[name][rows] for name in _NEEDED], axis=1)
-    rows = rows[np.sort(np.unique(same, axis=0, return_index=True)[1])]
+    table: Table, number: dict[str, np.ndarray], found: dict[str, np.ndarray], start: np.ndarray
+) -> Trajectories:
+    """Periods in SI units, times since frame 0 of each.
+
+    Args:
+        found: rows by the period's name.
+        start: ms, of frame 0 by the row.
+    """
+    rows = np.concatenate(list(found.values()))
+    origin = np.concatenate([np.full(len(own), start[own].min()) for own in found.values()])
     own = {name: values[rows] for name, values in number.items()}
     speed, length, kind = (own.get(name) for name in ("v_Vel", "v_Length", "v_Class"))
-    return Vehicles(
+    return Trajectories(
         path=table.path,
-        row=lambda i: table.row(int(rows[i])),
-        vehicle=_text(own["Vehicle_ID"]),
-        time=(own["Global_Time"] - start) * 1e-3,
-        x=own["Local_Y"] * FOOT,
+        name=table.path.stem,
+        where=lambda i: table.row(int(rows[i])),
+        recording=np.repeat(np.array(list(found), dtype=object), [len(o) for o in found.values()]),
+        agent=_text(own["Vehicle_ID"]),
+        time=(own["Global_Time"] - origin) * 1e-3,
+        x=own["Local_Y"][:, None] * FOOT,
         lane=_text(own["Lane_ID"]),
-        speed=None if speed is None else np.abs(speed) * FOOT,
+        v=None if speed is None else np.abs(speed)[:, None] * FOOT,
         length=None if length is None else length * FOOT,
         kind=None if kind is None else _text(kind),
     )

@@ -16,16 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nnode.data.options import OpenAccOptions
+from nnode.data.options import OpenAccOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import Table
-from nnode.data.readers.recordings import (
-    check_known,
-    one_of,
-    positive,
-    raw_files,
-    tables_below,
-    wanted,
-)
+from nnode.data.readers.recordings import raw_files, tables_below
 from nnode.data.readers.track import KNOWN, Run, check_laps, cut_run
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
@@ -65,7 +58,7 @@ def openacc_files(options: OpenAccOptions) -> dict[str, Path]:
 def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Sequence]:
     """Read runs and cut them into sequences.
 
-    Where a vehicle's record has a hole longer than ``max_hole``, or a vehicle has no columns, the
+    Where a vehicle's record has a hole longer than ``fill``, or a vehicle has no columns, the
     platoon is cut in two at its place, so that nobody follows a vehicle that is not its leader.
     Gaps that are not above 0, and those that jump, count as holes (``max_error``).
 
@@ -106,7 +99,7 @@ def _check(options: OpenAccOptions) -> None:
     for name in ("dt", "window", "length", "max_error"):
         if getattr(options, name) is not None:
             positive(name, getattr(options, name))
-    positive("max_hole", options.max_hole)
+    positive("fill", options.fill)
     positive("min_duration", options.min_duration)
     for name in ("kind", "group"):
         if getattr(options, name) is not None:

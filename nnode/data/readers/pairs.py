@@ -18,21 +18,29 @@ from typing import Any
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from nnode.data.options import Gaps, PairOptions
-from nnode.data.readers.columns import Table, opened
-from nnode.data.readers.recordings import (
+from nnode.data.cut import (
+    Member,
     Reading,
-    check_known,
-    natural,
-    one_of,
-    place_below,
-    positive,
-    tables_below,
-    wanted,
+    chosen_lanes,
+    sequence_of,
+    spans,
+    told_uneven,
+    windows,
 )
-from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
-from nnode.data.sequence import TIME_UNITS, Sequence
-from nnode.data.smooth import bridge
+from nnode.data.options import Gaps, PairOptions, check_known, one_of, positive, wanted
+from nnode.data.readers.columns import Table, opened
+from nnode.data.readers.recordings import natural, place_below, tables_below
+from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS, seconds_per_unit
+from nnode.data.sequence import Sequence
+from nnode.data.trajectories import (
+    UNEVEN,
+    Grid,
+    Record,
+    Trajectories,
+    measured_times,
+    records,
+    usual_step,
+)
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -42,8 +50,7 @@ _REQUIRED = ("time", "x_follower", "x_leader")
 _INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
 _METRES = ("leader_length", "follower_length", "spacing")
 _SPEEDS = ("v_follower", "v_leader")
-#: Share of the sampling interval by which a step may deviate.
-UNEVEN = 0.01
+_WHO = ("follower", "leader")
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
 
@@ -57,23 +64,14 @@ UNSTEADY = 0.5
 
 @dataclass(frozen=True)
 class _Pair:
-    """A pair's rows in one file, in order of time, and what belongs to it as a whole.
+    """A pair's rows in one file, follower and leader, and what belongs to it as a whole.
 
-    ``time`` (s) counts from ``origin`` (ns).
+    Its times count from ``origin`` (ns).
     """
 
-    table: Table
-    rows: np.ndarray
     words: dict[str, str]
     origin: int
-    time: np.ndarray
-    x: np.ndarray
-    v: np.ndarray | None
-    length: np.ndarray
-
-    @property
-    def called(self) -> str:
-        return f"{self.table.path}: pair {self.words['pair']}"
+    rows: Trajectories
 
 
 def pair_files(options: PairOptions) -> dict[str, Path]:
@@ -112,8 +110,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
     Returns:
         Sequences of two vehicles, follower and leader, named ``run/pair``, with a number behind
         where a pair is cut, in the order of these names. A pair is cut where more than
-        ``max_hole`` s are missing. Shorter holes are filled (:func:`nnode.data.smooth.bridge`;
-        speeds by straight lines); a row without a position or a speed is one that is missing.
+        ``fill`` s are missing, see :func:`nnode.data.trajectories.records`; a
+        row without a position or a speed is one that is missing.
         Speeds are the measured ones where the source has those of both. A pair without a column
         of it is a file; without a run, all are of one recording, which is called like the data. A
         vehicle without an identifier is called after the pair and is in no other one.
@@ -138,10 +136,11 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         check_known(asked, [pair.words["run"] for pair in pairs])
     lanes = _lanes(options, pairs)
     start = min((pair.origin for pair in pairs), default=0)
+    dt = options.dt or _usual([pair.rows for pair in pairs])
     found: list[Sequence] = []
-    taken: dict[str, str] = {}
+    taken: dict[str, Path] = {}
     short: list[dict[str, str]] = []
-    anonymous = 0
+    every: list[Record] = []
     for pair in sorted(pairs, key=lambda p: (natural(p.words["run"]), natural(p.words["pair"]))):
         run, lane = pair.words["run"], pair.words.get("lane", "")
         if (asked is not None and run not in asked) or (lanes and lane not in lanes):
@@ -149,18 +148,17 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         name = f"{run}/{pair.words['pair']}"
         if name in taken:
             raise DataError(
-                f"{pair.called} of run {run} stands in {taken[name]} as well; give pairs names of "
-                "their own (data.columns.pair, data.pattern)"
+                f"{pair.rows.path}: pair {pair.words['pair']} of run {run} stands in {taken[name]} "
+                "as well; give pairs names of their own (data.columns.pair, data.pattern)"
             )
-        taken[name] = str(pair.table.path)
-        anonymous += not (pair.words.get("follower") or pair.words.get("leader"))
-        pair = replace(pair, time=pair.time + (pair.origin - start) / 1e9)
-        pieces = list(_pieces(pair, options))
-        if not pieces:
-            short.append({"name": name, "why": _too_short(pair, options)})
-        for number, (time, x, v, filled) in enumerate(pieces):
-            made = _sequence(name, number, len(pieces), pair, time, x, v, options)
-            found.append(replace(made, filled=filled))
+        taken[name] = pair.rows.path
+        late = (pair.origin - start) / 1e9
+        rows = replace(pair.rows, time=pair.rows.time + late)
+        made, own = _sequences(name, rows, pair.words, dt, options)
+        every += own
+        if not made:
+            short.append({"name": name, "why": _too_short(rows, options)})
+        found += made
     if not found:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
@@ -168,13 +166,20 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             + (f" or lasts for {options.window:g} s" if options.window else "")
             + "; lower data.min_samples or data.window"
         )
+    anonymous = sum(not (p.words.get("follower") or p.words.get("leader")) for p in pairs)
     if anonymous:
         log.info(
             "%d of %d pairs name neither follower nor leader and are taken as independent of each "
             "other; data.columns.follower and data.columns.leader tell which share a vehicle",
-            anonymous, len(taken),
+            anonymous, len(pairs),
         )  # fmt: skip
-    return Reading(found, short)
+    return Reading(found, short, told_uneven(every, dt))
+
+
+def _usual(tables: list[Trajectories]) -> float:
+    """The sampling interval (s) of most pairs."""
+    steps = [step for table in tables if np.isfinite(step := usual_step(table))]
+    return float(np.median(steps)) if steps else 1.0
 
 
 def _check(options: PairOptions) -> None:
@@ -228,8 +233,7 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
     names, integrated = _columns(table, options)
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
-    unit = one_of("time_unit", options.time_unit, TIME_UNITS)
-    origin, time = table.times(names["time"], unit)
+    origin, time = table.times(names["time"], seconds_per_unit(options))
     x = v = None
     if not integrated:
         x = np.stack([table.measured(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
@@ -247,14 +251,6 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
     for code in np.argsort(first):
         rows = np.flatnonzero(codes == code)
         rows = rows[np.argsort(time[rows], kind="stable")]
-        again = np.flatnonzero(np.diff(time[rows]) <= 0)
-        if again.size:
-            i, j = sorted(rows[again[0] : again[0] + 2])
-            raise DataError(
-                f"{table.path}, {table.row(j)}: a second row of one pair at {time[j]:g} s (first "
-                f"in {table.row(i)}); expected one row per pair and time; name the column that "
-                "tells pairs apart (data.columns.pair)"
-            )
         said = dict(everywhere)
         for name, cells in words.items():
             _steady(table, names[name], cells, rows)
@@ -266,10 +262,40 @@ def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str])
             place = _integrated(time[rows], v[rows, 1], own["spacing"][rows], leader)
         else:
             place, leader = x[rows], _leader(table, own, x, rows)
-        yield _Pair(
-            table, rows, said, origin, time[rows], place, None if v is None else v[rows],
-            np.array([_follower(own, rows), leader]),
-        )  # fmt: skip
+        lengths = np.array([_follower(own, rows), leader])
+        yield _Pair(said, origin, _rows(table, rows, said, options, time, place, v, lengths))
+
+
+def _rows(
+    table: Table,
+    rows: np.ndarray,
+    words: dict[str, str],
+    options: PairOptions,
+    time: np.ndarray,
+    x: np.ndarray,
+    v: np.ndarray | None,
+    length: np.ndarray,
+) -> Trajectories:
+    """The rows of a pair's follower, and then those of its leader."""
+    n = len(rows)
+    kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
+    codes = [words.get(f"{who}_kind", "") for who in _WHO]
+    # one without an identifier is in no other pair
+    agents = [words.get(who) or f"{words['pair']} {who}" for who in _WHO]
+    return Trajectories(
+        path=table.path,
+        name=words["run"],
+        where=lambda i: table.row(int(rows[i % n])),
+        agent=np.repeat(np.array(agents, dtype=object), n),
+        sequence=np.full(2 * n, words["pair"], dtype=object),
+        time=np.tile(time[rows], 2),
+        x=x.T.reshape(-1, 1),
+        v=None if v is None else v[rows].T.reshape(-1, 1),
+        length=np.repeat(length, n),
+        kind=np.repeat(np.array([kinds.get(c, c) for c in codes], dtype=object), n)
+        if any(codes)
+        else None,
+    )
 
 
 def _columns(table: Table, options: PairOptions) -> tuple[dict[str, str], bool]:
@@ -368,114 +394,58 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
 def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
     if options.lane is None:
         return []
-    chosen = [options.lane] if isinstance(options.lane, str | int | float) else options.lane
-    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
-    present = sorted({pair.words.get("lane", "") for pair in pairs}, key=lambda n: (len(n), n))
-    for name in names:
-        if name not in present:
-            raise ConfigError(f"data.lane={name}: the pairs have the lanes {', '.join(present)}")
-    return names
+    present = {pair.words.get("lane", "") for pair in pairs}
+    return chosen_lanes(options.lane, present, "the pairs have")
 
 
-def _too_short(pair: _Pair, options: PairOptions) -> str:
+def _too_short(rows: Trajectories, options: PairOptions) -> str:
     """Why there is no sequence of a pair."""
-    if len(pair.time) < options.min_samples:
+    if len(rows) // 2 < options.min_samples:
         return f"fewer than data.min_samples={options.min_samples} times"
     if options.window is not None:
         return f"no data.window={options.window:g} s without a gap"
     return f"no data.min_samples={options.min_samples} times without a gap"
 
 
-_Piece = tuple[np.ndarray, np.ndarray, np.ndarray | None, int]
-
-
-def _pieces(pair: _Pair, options: PairOptions) -> Iterator[_Piece]:
-    """Times, positions and speeds of every part without a gap."""
-    if len(pair.time) < options.min_samples:
-        return
-    step = np.diff(pair.time)
-    usual = float(np.median(step))
-    known = np.isfinite(pair.x if pair.v is None else np.hstack([pair.x, pair.v])).all(axis=1)
-    measured = pair.time[known]
-    all_time, all_x, added = bridge(measured, pair.x[known], options.max_hole)
-    all_v = None if pair.v is None else _at(all_time, measured, pair.v[known])
-    gaps = np.flatnonzero(np.abs(np.diff(all_time) - usual) > UNEVEN * usual)
-    if gaps.size and options.gaps is Gaps.error:
-        i = int(gaps[0])
-        raise DataError(
-            f"{pair.called} steps from {all_time[i]:g} s to {all_time[i + 1]:g} s "
-            f"({pair.table.row(int(pair.rows[pair.time == all_time[i + 1]][0]))}), expected "
-            f"steps of {usual:g} s "
-            f"({len(gaps)} such gaps); data.gaps=cut cuts the pair there"
+def _sequences(
+    name: str, rows: Trajectories, words: dict[str, str], dt: float, options: PairOptions
+) -> tuple[list[Sequence], list[Record]]:
+    """A pair's sequences, one for every part without a gap or every window, and its records."""
+    usual = usual_step(rows)
+    if options.dt is not None and dt < usual * (1 - UNEVEN):
+        raise ConfigError(
+            f"data.dt={dt:g} s is finer than the {usual:g} s of {rows.path}: pair "
+            f"{words['pair']}; expected no more times than were measured"
         )
-    for rows in np.split(np.arange(len(all_time)), gaps + 1):
-        if len(rows) < 2:
-            continue
-        time, x, v = all_time[rows], all_x[rows], None if all_v is None else all_v[rows]
-        dt = usual
-        if options.dt is not None:
-            dt = options.dt
-            if dt < usual * (1 - UNEVEN):
-                raise ConfigError(
-                    f"data.dt={dt:g} s is finer than the {usual:g} s of {pair.called}; expected no "
-                    "more times than were measured"
-                )
-            first, last = np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6)
-            grid = np.arange(first, last + 1) * dt
-            x = _at(grid, time, x)
-            v = None if v is None else _at(grid, time, v)
-            time = grid
-        for piece in _windows(time, x, v, dt, options):
-            within = (added >= piece[0][0]) & (added <= piece[0][-1])
-            yield *piece, 2 * int(within.sum())
-
-
-def _at(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(grid, time, column) for column in values.T], -1)
-
-
-def _windows(
-    time: np.ndarray, x: np.ndarray, v: np.ndarray | None, dt: float, options: PairOptions
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
-    """Consecutive windows that share their boundary sample; what is left at the end is not used."""
-    starts, steps = [0], len(time) - 1
+    grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
+    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+    both = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
+    for record in found:
+        both[record.row >= len(rows) // 2].records.append(record)
+    parts = spans(both)
+    if len(parts) > 1 and options.gaps is Gaps.error:
+        end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
+        row = int(np.flatnonzero(rows.time >= start - dt / 2)[0])
+        raise DataError(
+            f"{rows.path}: pair {words['pair']} steps from {end:g} s to {start:g} s "
+            f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
+            "data.gaps=cut cuts the pair there"
+        )
     if options.window is not None:
         steps = round(options.window / dt)
         if steps < 1 or abs(options.window / dt - steps) > 1e-6 * steps:
             raise ConfigError(
                 f"data.window={options.window:g} s is no whole number of steps of {dt:g} s"
             )
-        starts = list(range(0, len(time) - steps, steps))
-    for first in starts:
-        rows = slice(first, first + steps + 1)
-        if len(time[rows]) >= options.min_samples:
-            yield time[rows], x[rows], None if v is None else v[rows]
-
-
-def _sequence(
-    name: str,
-    number: int,
-    pieces: int,
-    pair: _Pair,
-    time: np.ndarray,
-    x: np.ndarray,
-    v: np.ndarray | None,
-    options: PairOptions,
-) -> Sequence:
-    words = pair.words
-    # one without an identifier is in no other pair
-    agents = tuple(words.get(who) or f"{words['pair']} {who}" for who in ("follower", "leader"))
-    kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
-    codes = (words.get("follower_kind", ""), words.get("leader_kind", ""))
-    kind = tuple(kinds.get(code, code) for code in codes)
-    return Sequence(
-        name=name if pieces == 1 else f"{name}_{number:03d}",
-        recording=words["run"],
-        time=time,
-        x=x[:, :, None],
-        v=None if v is None else v[:, :, None],
-        agents=agents,
-        length=None if np.isnan(pair.length).all() else pair.length,
-        kind=kind if any(kind) else None,
-        split=words.get("split", "").lower(),
-    )
+        parts = [piece for part in parts for piece in windows(*part, steps)]
+    parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
+    split = words.get("split", "").lower()
+    made = [
+        sequence_of(
+            name if len(parts) == 1 else f"{name}_{number:03d}",
+            rows, both, first, last, grid,
+            time=measured_times(rows, grid, first, last), split=split,
+        )
+        for number, (first, last) in enumerate(parts)
+    ]  # fmt: skip
+    return made, found

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from nnode.data import download
-from nnode.data.options import DataOptions
-from nnode.data.sequence import Sequence
+from nnode.data.options import DataOptions, check_known, wanted
 from nnode.errors import ConfigError, DataError, NNodeError
 
 #: What Python and its libraries raise for contents that no reader expects.
@@ -44,81 +42,12 @@ def reading(what: object) -> Iterator[None]:
         ) from error
 
 
-class Reading(list[Sequence]):
-    """Sequences of a reader that tells what it left out.
-
-    Attributes:
-        left_out: ``name`` and ``why`` of each record of which there is no sequence.
-    """
-
-    def __init__(
-        self, sequences: Iterable[Sequence] = (), left_out: Iterable[dict[str, str]] = ()
-    ) -> None:
-        super().__init__(sequences)
-        self.left_out = list(left_out)
-
-
 def natural(name: str) -> tuple[list[tuple[int, str]], str]:
     """A key that sorts names as they are counted: ``s2`` before ``s10``."""
     parts = re.split(r"(\d+)", name)
     parts[1::2] = [digits.lstrip("0") for digits in parts[1::2]]
     # a number of more digits is larger
     return [(len(p) if i % 2 else 0, p) for i, p in enumerate(parts)], name
-
-
-def positive(option: str, value: float | None) -> float:
-    """``value``, if it is a positive finite number.
-
-    Raises:
-        ConfigError: it is not; names the option.
-    """
-    if value is None or not 0 < value < float("inf"):
-        raise ConfigError(f"data.{option}={value}: expected a positive number")
-    return float(value)
-
-
-def one_of(option: str, value: str | None, valid: Mapping[str, float]) -> float:
-    """What ``valid`` holds for the configured word.
-
-    Raises:
-        ConfigError: the word is not among the valid ones; lists them.
-    """
-    if value is None or value not in valid:
-        raise ConfigError(f"data.{option}={value}: expected one of {', '.join(valid)}")
-    return valid[value]
-
-
-def wanted(option: object) -> list[str] | None:
-    """Names that ``data.recording`` asks for; None for all.
-
-    Raises:
-        ConfigError: neither a name nor a list of names, or an empty list.
-    """
-    if option is None or option == "all":
-        return None
-    items = [option] if isinstance(option, str | int) else option
-    if not isinstance(items, Iterable) or isinstance(items, Mapping):
-        raise ConfigError(f"data.recording={option}: expected 'all', a name or a list of names")
-    names = list(dict.fromkeys(str(item) for item in items))
-    if not names:
-        raise ConfigError("data.recording=[]: expected 'all', a name or a list of names")
-    return names
-
-
-def check_known(asked: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse names that are not known, naming the nearest first.
-
-    Raises:
-        ConfigError: an unknown recording.
-    """
-    valid = list(dict.fromkeys(known))
-    for name in asked:
-        if name not in valid:
-            near = difflib.get_close_matches(name, valid, n=len(valid) or 1, cutoff=0.0)
-            raise ConfigError(
-                f"data.recording={name}: unknown recording; nearest first, the valid ones are: "
-                f"{', '.join(near) or 'none'}"
-            )
 
 
 def raw_files(

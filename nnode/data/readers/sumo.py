@@ -16,10 +16,10 @@ from xml.parsers import expat
 
 import numpy as np
 
+from nnode.data.cut import Reading, by_lane, check_cutting
 from nnode.data.options import SumoOptions
-from nnode.data.readers.platoons import Vehicles, check_cutting, cut_vehicles
 from nnode.data.readers.recordings import table_path
-from nnode.data.sequence import Sequence
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: Lanes within a junction have names that begin with this sign.
@@ -32,7 +32,7 @@ def sumo_files(options: SumoOptions) -> dict[str, Path]:
     return {_stem(path): path}
 
 
-def read_sumo(path: Path, options: SumoOptions) -> list[Sequence]:
+def read_sumo(path: Path, options: SumoOptions) -> Reading:
     """Read a file of ``sumo --fcd-output`` and cut it as a vehicle table.
 
     A vehicle's position is ``pos``, along its ``lane``; positions begin anew on every edge, so
@@ -63,7 +63,7 @@ def read_sumo(path: Path, options: SumoOptions) -> list[Sequence]:
             f"data.dt={options.dt:g} s is finer than the steps of {path}, {step:g} s; set "
             f"data.dt={step:g}, or let SUMO write with --step-length {options.dt:g}"
         )
-    return cut_vehicles({_stem(path): rows}, options, lane_word="")
+    return by_lane(rows, options, lane_word="")
 
 
 def _stem(path: Path) -> str:
@@ -128,7 +128,7 @@ class _Content:
                 "sumo --fcd-output writes them"
             )
 
-    def rows(self, within: bool) -> Vehicles:
+    def rows(self, within: bool) -> Trajectories:
         """The vehicles; those on lanes of junctions only where they are asked for.
 
         Raises:
@@ -144,14 +144,15 @@ class _Content:
         line = np.asarray(self.line)[keep]
         speed, length = np.asarray(self.speed)[keep], np.asarray(self.length)[keep]
         kind = self.kind.cells()[keep]
-        return Vehicles(
+        return Trajectories(
             path=self.path,
-            row=lambda i: f"line {line[i]}",
-            vehicle=self.vehicle.cells()[keep],
+            name=_stem(self.path),
+            where=lambda i: f"line {line[i]}",
+            agent=self.vehicle.cells()[keep],
             time=np.asarray(self.time)[keep],
-            x=np.asarray(self.x)[keep],
+            x=np.asarray(self.x)[keep, None],
             lane=lane[keep],
-            speed=None if np.isnan(speed).any() else np.abs(speed),
+            v=None if np.isnan(speed).any() else np.abs(speed)[:, None],
             length=None if np.isnan(length).all() else length,
             kind=kind if (kind != "").any() else None,
         )

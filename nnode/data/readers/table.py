@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.exits import Exit, destinations, exits_of, read_exits
-from nnode.data.options import TableOptions
+from nnode.data.cut import Member, Reading, members, sequence_of, spans, told_uneven
+from nnode.data.exits import destinations, exits_of, read_exits
+from nnode.data.options import TableOptions, check_known, one_of, wanted
 from nnode.data.readers.columns import Table, opened
-from nnode.data.readers.recordings import check_known, natural, one_of, table_path, wanted
+from nnode.data.readers.recordings import natural, table_path
 from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import fill
+from nnode.data.trajectories import Grid, Record, Trajectories, measured_times, records, usual_step
 from nnode.errors import ConfigError, DataError
-
-#: Share of the sampling interval by which sampling times may deviate from equal spacing.
-UNEVEN = 0.01
 
 #: A sequence's times times its agents, present or not.
 MOST_CELLS = 10**8
+#: Fewest times of a part of a sequence.
+LEAST = 3
 
 _REQUIRED = ("sequence", "time", "agent", "x")
 _OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
@@ -38,9 +39,7 @@ def table_files(options: TableOptions) -> dict[str, Path]:
     return files
 
 
-def read_table(
-    source: Path | Table, options: TableOptions, walls: Path | None = None
-) -> list[Sequence]:
+def read_table(source: Path | Table, options: TableOptions, walls: Path | None = None) -> Reading:
     """Read a table.
 
     Args:
@@ -51,190 +50,164 @@ def read_table(
 
     Returns:
         Sequences named ``recording/sequence``, in the order of their names, whatever that of the
-        rows. An agent that is absent at some times of a sequence is NaN there (see
-        :func:`nnode.data.quality.find_faults`), where no row or an empty cell tells its position
-        for longer than ``max_hole``. Shorter holes are filled, see :func:`nnode.data.smooth.fill`;
-        a platoon begins and ends when all vehicles are there, if that costs no more than
-        ``max_hole`` at either end. Vehicles are ordered by their first position, people by name.
+        rows. Samples that no row or an empty cell tells are filled where no more than ``fill`` s
+        are missing, and uneven times are interpolated, see
+        :func:`nnode.data.trajectories.records`. A platoon is cut into the parts in which all its
+        vehicles are there, with a number behind the name where there are several; where these are
+        never there together, a vehicle without a position is NaN. A crowd is cut where nobody is
+        there; a person who is absent at other times is NaN there (see
+        :func:`nnode.data.quality.find_faults`). Vehicles are ordered by position, people by name.
 
     Raises:
         ConfigError: no domain, or an unknown recording.
         DataError: columns or cells that are missing or hold no number (names the row), one
-            agent twice at one time, time steps that are no multiples of the usual one, or values
-            that change within a sequence although they belong to an agent.
+            agent twice at one time, or values that change within a sequence although they belong
+            to an agent.
     """
-    table = opened(source)
-    columns = _columns(table, options)
+    rows = _rows(opened(source), options)
     asked = wanted(options.recording)
     if asked is not None:
-        check_known(asked, columns.recording)
+        check_known(asked, () if rows.recording is None else rows.recording)
     segments = None if walls is None else _segments(walls)
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i, key in enumerate(zip(columns.recording, columns.sequence, strict=True)):
-        groups.setdefault(key, []).append(i)
-    return [
-        _sequence(table, columns, key, np.array(rows), options.max_hole, segments)
-        for key, rows in sorted(groups.items(), key=lambda item: [*map(natural, item[0])])
-        if asked is None or key[0] in asked
-    ]
+    dt = usual_step(rows)
+    found: list[Sequence] = []
+    notes: list[str] = []
+    every: list[Record] = []
+    parts = sorted(rows.parts("recording", "sequence"), key=lambda p: [*map(natural, p[0])])
+    for (run, number), own in parts:
+        if asked is None or run in asked:
+            name = number if number.startswith(f"{run}/") else f"{run}/{number}"
+            made, its, note = _sequences(name, own, dt, options)
+            found += [replace(s, recording=run, walls=segments) for s in made]
+            every += its
+            notes += note
+    return Reading(found, notes=[*told_uneven(every, dt), *told_parts(notes)])
 
 
-@dataclass(frozen=True)
-class _Columns:
-    """What the rows of a table say, in SI units.
-
-    Attributes:
-        crowd: whether positions have two coordinates.
-        recording, sequence, agent: ``(R,)`` names.
-        time: ``(R,)`` s.
-        values: positions, destinations and lengths, m.
-        words: classes and groups.
-        exits: destinations of people, where the options give them.
-    """
-
-    crowd: bool
-    recording: np.ndarray
-    sequence: np.ndarray
-    agent: np.ndarray
-    time: np.ndarray
-    values: dict[str, np.ndarray]
-    words: dict[str, np.ndarray]
-    exits: list[Exit]
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        return _axes(self.crowd)
+def told_parts(notes: list[str], most: int = 3) -> list[str]:
+    """The first of some sentences, and how many more there are."""
+    more = [f"and {len(notes) - most} more such sequences"] if len(notes) > most else []
+    return notes[:most] + more
 
 
-def _axes(crowd: bool) -> tuple[str, ...]:
-    return ("x", "y") if crowd else ("x",)
-
-
-def _columns(table: Table, options: TableOptions) -> _Columns:
+def _rows(table: Table, options: TableOptions) -> Trajectories:
+    """The table's columns, by what they mean."""
     crowd, path = _is_crowd(options), table.path
+    axes = ("x", "y") if crowd else ("x",)
     names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
         raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
-    goals = tuple(f"dest_{axis}" for axis in _axes(crowd))
+    goals = tuple(f"dest_{axis}" for axis in axes)
     if any(goal in names for goal in goals) and not all(goal in names for goal in goals):
         raise DataError(f"{path}: a destination needs the columns {' and '.join(goals)}")
-    exits = read_exits(options.exits)
-    if exits and (not crowd or goals[0] in names):
-        raise ConfigError(
-            "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
-        )
     sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
     time = table.times(names["time"], seconds_per_unit(options))[1]
-    values = {axis: table.measured(names[axis]) * metres for axis in _axes(crowd)}
-    values |= {name: table.numbers(names[name]) * metres for name in goals if name in names}
-    if "length" in names:
-        values["length"] = table.positive(names["length"]) * metres
-    words: dict[str, np.ndarray] = {
-        k: table.names(names[k], empty=True) for k in ("kind", "group") if k in names
-    }
-    if "recording" in names:
-        recording = table.names(names["recording"])
-    else:
-        recording = np.full(len(table), path.stem, dtype=object)
-    return _Columns(crowd, recording, sequence, agent, time, values, words, exits)
+    x = np.stack([table.measured(names[axis]) for axis in axes], -1) * metres
+    destination = None
+    if goals[0] in names:
+        destination = np.stack([table.numbers(names[goal]) for goal in goals], -1) * metres
+    rows = Trajectories(
+        path=path,
+        name=path.stem,
+        where=table.row,
+        recording=table.names(names["recording"])
+        if "recording" in names
+        else np.full(len(table), path.stem, dtype=object),
+        sequence=sequence,
+        agent=agent,
+        time=time,
+        x=x,
+        length=table.positive(names["length"]) * metres if "length" in names else None,
+        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
+        group=table.names(names["group"], empty=True) if "group" in names else None,
+        destination=destination,
+    )
+    for key in ("length", "kind", "group", *goals):
+        if key in names:
+            _constant(rows, key, names[key])
+    if options.exits:
+        if not crowd or destination is not None:
+            raise ConfigError(
+                "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
+            )
+        rows = replace(rows, destination=_goals(rows, options))
+    return rows
 
 
-def _sequence(
-    table: Table,
-    columns: _Columns,
-    key: tuple[str, str],
-    index: np.ndarray,
-    max_hole: float,
-    segments: np.ndarray | None,
-) -> Sequence:
-    """One sequence of the rows ``index``; ``key`` names its recording and the sequence."""
-    run, number = key
-    name = number if number.startswith(f"{run}/") else f"{run}/{number}"
-    grid, k = _grid(table, name, columns.time, index, max_hole)
-    people, n = _people(columns.agent[index])
-    if len(grid) * len(people) > MOST_CELLS:
+def _sequences(
+    name: str, rows: Trajectories, dt: float, options: TableOptions
+) -> tuple[list[Sequence], list[Record], list[str]]:
+    """One sequence of the table, or its parts; its records; and what was cut, in words."""
+    if not np.isfinite(dt):  # of single samples
+        dt = 1.0
+    grid = Grid(dt, float(rows.time.min()))
+    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+    of = sorted(members(rows, found), key=lambda member: natural(member.agent))
+    first, last = 0, round((float(rows.time.max()) - grid.origin) / dt)
+    if (last + 1) * len(of) > MOST_CELLS:
         raise DataError(
-            f"{table.path}: sequence {name} has {len(grid)} times and {len(people)} agents in "
-            f"{len(index)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
+            f"{rows.path}: sequence {name} has {last + 1} times and {len(of)} agents in "
+            f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
             "shorter sequences"
         )
-    at = np.full((len(grid), len(people)), -1)
-    for row, i, j in zip(index, k, n, strict=True):
-        if at[i, j] >= 0:
-            raise DataError(
-                f"{table.path}, {table.row(row)}: agent {columns.agent[row]} of sequence {name} "
-                f"stands there a second time at {columns.time[row]:g} s (first in "
-                f"{table.row(at[i, j])})"
-            )
-        at[i, j] = row
-    values, words, axes = columns.values, columns.words, columns.axes
-    known = _known(at, [values[axis] for axis in axes])
-    if not columns.crowd:
-        order = np.argsort(values["x"][_ends(known)[0]], kind="stable")
-        at, known, people = at[:, order], known[:, order], [people[j] for j in order]
-    owner = np.array([column[column >= 0][0] for column in at.T])
-    for meaning, column in (*values.items(), *words.items()):
-        if meaning not in axes:
-            _constant(table, meaning, column, at, owner)
-    x = np.stack([np.where(at >= 0, values[axis][at], np.nan) for axis in axes], axis=-1)
-    grid, x, filled = _filled(grid, x, max_hole, trim=not columns.crowd)
-    length = values["length"][owner] if "length" in values else None
-    group = tuple(words["group"][owner]) if "group" in words else None
-    goal = None
-    if "dest_x" in values:
-        goal = np.stack([values[f"dest_{axis}"][owner] for axis in axes], axis=-1)
-    elif columns.exits:
-        start, end = (np.stack([values[a][i] for a in axes], -1) for i in _ends(known))
-        goal = destinations(exits_of(columns.exits, start, end, people, group), start)
-    return Sequence(
-        name=name,
-        recording=run,
-        time=grid,
-        x=x,
-        agents=tuple(people),
-        length=None if length is None or np.isnan(length).all() else length,
-        kind=tuple(words["kind"][owner]) if "kind" in words else None,
-        group=group,
-        destination=goal,
-        walls=segments,
-        filled=filled,
-    )
+    crowd = rows.x.shape[1] == 2
+    parts = _occupied(found) if crowd else spans(of)
+    if crowd and any(record.uneven.any() for record in found):
+        # people begin and end between two times of the grid
+        parts = [(a + 1, b - 1) for a, b in parts]
+    whole = [(a, b) for a, b in parts if b - a + 1 >= LEAST]
+    lost = last + 1 - sum(b - a + 1 for a, b in whole)
+    note = []
+    if whole and lost * dt > options.fill + dt / 2:
+        who = "nobody is" if crowd else "not all vehicles are"
+        note = [
+            f"sequence {name}: {who} there at {lost} of {last + 1} times, for longer than "
+            f"data.fill={options.fill:g} s; cut into {len(whole)} "
+            f"sequence{'s' * (len(whole) > 1)} without these times"
+        ]
+    made = []
+    for number, (a, b) in enumerate(whole or [(first, last)]):
+        called = name if len(whole) < 2 else f"{name}_{number:03d}"
+        ordered = of if crowd else sorted(of, key=lambda member: _place(member, a))
+        time = measured_times(rows, grid, a, b)
+        made.append(sequence_of(called, rows, ordered, a, b, grid, time=time))
+    return made, found, note
 
 
-def _known(at: np.ndarray, positions: list[np.ndarray]) -> np.ndarray:
-    """Rows by time and agent, -1 where none or one without a position; of an agent who has no
-    position at all the rows as they are."""
-    known = np.where((at >= 0) & np.isfinite([x[at] for x in positions]).all(axis=0), at, -1)
-    return np.where((known >= 0).any(axis=0), known, at)
+def _occupied(found: list[Record]) -> list[tuple[int, int]]:
+    """First and last times of the intervals in which anybody is there."""
+    parts: list[tuple[int, int]] = []
+    for record in sorted(found, key=lambda r: r.first):
+        if parts and record.first <= parts[-1][1] + 1:
+            parts[-1] = parts[-1][0], max(parts[-1][1], record.last)
+        else:
+            parts.append((record.first, record.last))
+    return parts
 
 
-def _filled(
-    grid: np.ndarray, x: np.ndarray, longest: float, trim: bool
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Times, positions with short holes filled, and how many were.
-
-    Args:
-        trim: whether times at either end go at which not all agents are there, if these are short.
-    """
-    if not np.isnan(x).any() or len(grid) < 2:
-        return grid, x, 0
-    step = float(np.median(np.diff(grid)))
-    x, filled = fill(x, step, longest)
-    present = np.flatnonzero(np.isfinite(x).all(axis=(1, 2)))
-    if trim and len(present):
-        low, high = int(present[0]), int(present[-1]) + 1
-        most = longest / step + 1e-6
-        low, high = low if low <= most else 0, high if len(grid) - high <= most else len(grid)
-        grid, x, filled = grid[low:high], x[low:high], filled[low:high]
-    return grid, x, int(filled.sum())
+def _place(member: Member, at: int) -> float:
+    """m, where a vehicle is at a time, or first."""
+    for record in member.records:
+        if record.last >= at:
+            return float(record.x[max(at - record.first, 0), 0])
+    return np.inf
 
 
-def _ends(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every agent's first and last row in the table, of those at its times (-1: none)."""
-    known = [column[column >= 0] for column in at.T]
-    return np.array([rows[0] for rows in known]), np.array([rows[-1] for rows in known])
+def _goals(rows: Trajectories, options: TableOptions) -> np.ndarray:
+    """``(R, 2)`` m, the destinations of people by their exits."""
+    exits, goal = read_exits(options.exits), np.full_like(rows.x, np.nan)
+    code = pd.DataFrame({"r": rows.recording, "s": rows.sequence, "a": rows.agent})
+    known = np.isfinite(rows.x).all(axis=1)
+    for numbers in code.groupby(["r", "s", "a"], sort=False).indices.values():
+        own = np.asarray(numbers)[np.argsort(rows.time[numbers], kind="stable")]
+        there = own[known[own]] if known[own].any() else own
+        start, end = rows.x[there[:1]], rows.x[there[-1:]]
+        group = None if rows.group is None else [str(rows.group[own[0]])]
+        chosen = exits_of(exits, start, end, [str(rows.agent[own[0]])], group)
+        goal[own] = destinations(chosen, start)
+    return goal
 
 
 def _is_crowd(options: TableOptions) -> bool:
@@ -245,56 +218,24 @@ def _is_crowd(options: TableOptions) -> bool:
     return options.domain == "crowd"
 
 
-def _people(agent: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Distinct agents in order of their names, and each row's number among them."""
-    names = sorted(set(agent), key=natural)
-    number = {name: i for i, name in enumerate(names)}
-    return names, np.array([number[name] for name in agent])
-
-
-def _grid(
-    table: Table, name: str, time: np.ndarray, rows: np.ndarray, longest: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sampling times of a sequence, and each row's number among them.
-
-    Times that all agents lack are added where no more than ``longest`` s are missing. A longer hole
-    stays: it is a fault of the sequence, see :func:`nnode.data.quality.find_faults`.
-    """
-    # Agents' rows may differ in the last digits of a time that is meant to be the same.
-    unique, first, code = np.unique(np.round(time[rows], 9), return_index=True, return_inverse=True)
-    step = np.diff(unique)
-    if step.size:
-        usual = float(np.median(step))
-        uneven = np.flatnonzero(
-            np.abs(step - usual * np.maximum(np.round(step / usual), 1)) > UNEVEN * usual
-        )
-        if uneven.size:
-            k = int(uneven[0])
-            raise DataError(
-                f"{table.path}, {table.row(rows[first[k + 1]])}: sequence {name} steps from "
-                f"{unique[k]:g} s to {unique[k + 1]:g} s, expected steps of {usual:g} s; "
-                "interpolate it to equal steps or cut it there into two sequences"
-            )
-        number = np.round(step / usual)
-        more = np.where((number - 1) * usual <= longest + 1e-6, number - 1, 0).astype(int)
-        if more.any():
-            place = np.arange(len(unique)) + np.concatenate([[0], np.cumsum(more)])
-            return np.interp(np.arange(place[-1] + 1), place, unique), place[code]
-    return unique, code
-
-
-def _constant(
-    table: Table, key: str, column: np.ndarray, at: np.ndarray, owner: np.ndarray
-) -> None:
+def _constant(rows: Trajectories, key: str, column: str) -> None:
     """Refuse a property of an agent that changes within a sequence."""
-    value, own = column[at], column[owner]
-    differs = (value != own) & (at >= 0)
-    if value.dtype.kind == "f":
-        differs &= ~(np.isnan(value) & np.isnan(own))
+    values: np.ndarray
+    if key.startswith("dest_"):
+        assert rows.destination is not None
+        values = rows.destination[:, "xy".index(key[-1])]
+    else:
+        values = getattr(rows, key)
+    names = {"r": rows.recording, "s": rows.sequence, "a": rows.agent}
+    owner = pd.DataFrame(names).groupby(["r", "s", "a"], sort=False).ngroup().to_numpy()
+    first = np.unique(owner, return_index=True)[1][owner]
+    differs = values != values[first]
+    if values.dtype.kind == "f":
+        differs &= ~(np.isnan(values) & np.isnan(values[first]))
     if differs.any():
-        row = int(at[differs].min())
+        row = int(np.flatnonzero(differs)[0])
         raise DataError(
-            f"{table.path}, {table.row(row)}: column {key!r} holds {column[row]!s}; it belongs "
+            f"{rows.path}, {rows.where(row)}: column {column!r} holds {values[row]!s}; it belongs "
             "to the agent and must be the same in all its rows of a sequence"
         )
 

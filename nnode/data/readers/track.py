@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -137,16 +137,18 @@ def _sound(run: Run, v: np.ndarray, most: float | None) -> np.ndarray:
 
 def cut_run(run: Run, options: OpenAccOptions) -> Iterator[Sequence]:
     """Cut a run into platoons, see :func:`nnode.data.readers.openacc.read_openacc`."""
-    most = int(options.max_hole / run.dt + 1e-6) - 1  # samples within a hole of that duration
+    most = int(options.fill / run.dt + 1e-6)  # samples that may be missing
     v = _filled(run.v, most)
-    gap = _filled(_sound(run, v, options.max_error), most)
+    sound = _sound(run, v, options.max_error)
+    gap = _filled(sound, most)
+    added = (np.isfinite(v) & np.isnan(run.v)) | (np.isfinite(gap) & np.isnan(sound))
     driven = np.stack([_driven(column, run.dt) for column in v.T], 1)
     every = round((options.dt or run.dt) / run.dt)
     if every < 1 or abs((options.dt or run.dt) / run.dt - every) > 1e-6 * every:
         raise ConfigError(
             f"data.dt={options.dt:g} s is no multiple of the {run.dt:g} s of {run.path.name}"
         )
-    v, gap, driven = v[::every], gap[::every], driven[::every]
+    v, gap, driven, added = v[::every], gap[::every], driven[::every], added[::every]
     dt = run.dt * every
     # with the vehicle in front; the first has nobody there
     linked = np.isfinite(v) & np.isfinite(gap)
@@ -162,7 +164,8 @@ def cut_run(run: Run, options: OpenAccOptions) -> Iterator[Sequence]:
             end = i + 1 + int(after[0]) if len(after) else len(whole)
             if end - i < options.min_vehicles:
                 continue
-            yield _sequence(run, number, (i, end), rows, (v, gap, driven), dt, options)
+            made = _sequence(run, number, (i, end), rows, (v, gap, driven), dt, options)
+            yield replace(made, filled=int(added[rows, i:end].sum()))
             number += 1
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from nnode.data.options import JuelichOptions
 from nnode.data.readers.juelich import cut_people, juelich_files, load_people
@@ -73,16 +74,18 @@ class Tracks:
     def of(cls, path: str) -> Tracks:
         """Read the text file of the paper's recording."""
         options = JuelichOptions(recording=RECORDING, walls=WALLS)
-        table, rate = load_people(Path(path), options)
-        walls = cut_people(Path(path), table, rate, options, None)[0].walls
+        rows, dt = load_people(Path(path), options)
+        walls = cut_people((rows, dt), options, None)[0].walls
         assert walls is not None
+        table = pd.DataFrame({"id": rows.agent.astype(int), "frame": np.round(rows.time / dt)})
+        table[["x", "y"]] = rows.x
         wide = table.pivot(index="frame", columns="id", values=["x", "y"])
         wide = wide.reindex(np.arange(wide.index.min(), wide.index.max() + 1))
         x = np.stack([wide["x"].to_numpy(), wide["y"].to_numpy()], -1)
         there = np.isfinite(x[..., 0])
         who = np.arange(x.shape[1])
         last = len(x) - 1 - there[::-1].argmax(0)
-        return cls(x, x[there.argmax(0), who], x[last, who], walls, rate)
+        return cls(x, x[there.argmax(0), who], x[last, who], walls, 1 / dt)
 
     def cut(self, how: Convention, offset: int) -> Batch:
         """Consecutive sequences from frame ``offset`` on, of those tracked in all their frames."""

@@ -116,8 +116,8 @@ def test_an_option_that_a_checkpoint_does_not_know_has_its_default(
     given: list[str] = []
     hydra = SimpleNamespace(overrides=SimpleNamespace(task=given))
     monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
-    now, saved = {"data": {"max_hole": 0.5, "smooth": None}}, {"data": {"smooth": None}}
+    now, saved = {"data": {"fill": 0.5, "smooth": None}}, {"data": {"smooth": None}}
     refuse_changes(now, saved, ())
-    given.append("data.max_hole=0.5")
-    with pytest.raises(ConfigError, match=r"data\.max_hole cannot change"):
+    given.append("data.fill=0.5")
+    with pytest.raises(ConfigError, match=r"data\.fill cannot change"):
         refuse_changes(now, saved, ())

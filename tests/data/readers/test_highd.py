@@ -103,7 +103,7 @@ def test_another_file_of_the_recording(recording: Path) -> None:
         ("07_recordingMeta.csv", "7,25,-1", "7,0,-1", ["frameRate", "positive"]),
         ("07_recordingMeta.csv", "7,25,-1\n", "7,25,-1\n8,25,-1\n", ["one row", "2 rows"]),
         ("07_tracks.csv", "1,1,0.0,8.0", "1,1,here,8.0", ["line 2", "'here'"]),
-        ("07_tracks.csv", "2,1,0.8,8.0", "1,1,0.8,8.0", ["line 3", "vehicle 1", "second time"]),
+        ("07_tracks.csv", "2,1,0.8,8.0", "1,1,0.8,8.0", ["line 3", "agent 1", "second time"]),
     ],
 )
 def test_one_clear_error(recording: Path, name: str, old: str, new: str, words: list[str]) -> None:

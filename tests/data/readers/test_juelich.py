@@ -178,7 +178,10 @@ def test_headerless_files_need_rate_and_unit(tmp_path: Path) -> None:
         (HEADER + "1 0 5\n" * 30, r"line 3: expected"),
         (HEADER + lines(0, 30, 1) + "1 31 nan 5 0\n", r"line 34: expected"),
         (HEADER + lines(0, 30, 1) + "1.5 31 5 5 0\n", r"line 34: expected"),
-        (HEADER + lines(0, 30, 1) + lines(30, 30, 1), "person 1 stands twice in frame 30"),
+        (
+            HEADER + lines(0, 30, 1) + lines(30, 30, 1),
+            "frame 30: agent 1 stands there a second time",
+        ),
         (HEADER + lines(0, 10, 1), "no sequence"),
     ],
 )

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from hypothesis import HealthCheck, given, settings
@@ -164,7 +165,7 @@ def test_several_polygons() -> None:
         ({"rows": [*ROWS, (21.5, 1, 0, 0, 0, 0)]}, ["21.5", "whole numbers"]),
         ({"rows": [*ROWS, (10**12, 1, 0, 0, 0, 0)]}, ["1000000000000", "consecutive"]),
         ({"rows": [*ROWS, (1e300, 1, 0, 0, 0, 0)]}, ["1e+300", "whole numbers"]),
-        ({"rows": [*ROWS, ROWS[0]]}, ["person 1 stands twice in frame 0"]),
+        ({"rows": [*ROWS, ROWS[0]]}, ["frame 0: agent 1 stands there a second time"]),
         ({"areas": (ROOM, ROOM.replace("10", "12"))}, ["2 of them", "data.geometry"]),
         ({"areas": ("POINT (1 1)",)}, ["table geometry", "Point"]),
         ({"extra": "DROP TABLE metadata;"}, ["no table metadata", "trajectory_data"]),
@@ -225,3 +226,26 @@ def test_damage_ends_in_an_error_of_the_package(
     except (DataError, ConfigError):
         return
     assert all(np.isfinite(s.x).all() for s in found)
+
+
+def test_a_table_of_people(tmp_path: Path) -> None:
+    """Any names and units; times that jitter are interpolated to equal ones, and that is told."""
+    rng, parts = np.random.default_rng(6), []
+    for n in range(3):
+        time = 0.2 * np.arange(30) + rng.uniform(-0.03, 0.03, 30)
+        parts.append(
+            pd.DataFrame({"who": f"person {n}", "ms": 1000 * time, "px": 130 * time, "py": 80 * n})
+        )
+    path = tmp_path / "people.csv"
+    pd.concat(parts).to_csv(path, index=False, sep=";")
+    columns = {"agent": "who", "time": "ms", "x": "px", "y": "py"}
+    options = WalkwayOptions(
+        path=str(path), columns=columns, position_unit="cm", time_unit="ms", t_seq=1.0
+    )
+    found = read_walkway(path, options)
+    assert len(found) >= 4
+    assert "are interpolated to steps of 0.2 s" in found.notes[0]
+    for s in found[1:-1]:  # at both ends somebody begins later, or ends before
+        assert s.agents == ("person 0", "person 1", "person 2")
+        np.testing.assert_allclose(s.x[:, :, 1], np.tile([0.0, 0.8, 1.6], (6, 1)), atol=1e-9)
+        np.testing.assert_allclose(np.diff(s.x[:, :, 0], axis=0), 0.26, atol=1e-9)

@@ -137,7 +137,7 @@ def test_files_that_are_something_else(tmp_path: Path) -> None:
         read(path)
     two = pd.concat([period("i-80", "1600"), period("i-80", "1600").assign(Local_Y=1.0).iloc[:1]])
     two.to_csv(path, index=False)
-    with pytest.raises(DataError, match=r"line 4002: vehicle 1 at time 0.1 s .* in line 2"):
+    with pytest.raises(DataError, match=r"line 4002: agent 1 stands .* at 0.1 s .*in line 2"):
         read(path)
 
 

@@ -114,6 +114,7 @@ def test_gaps_that_are_none_count_as_holes(
     with caplog.at_level(logging.INFO):
         found = read(path)
     assert [s.n_agents for s in found] == [4, 3, 4]
+    assert [s.filled for s in found] == [3, 0, 0]
     np.testing.assert_allclose(np.diff(found[0].x[:, 2:, 0], axis=1), GAP[0] + 5.0)
     assert "3 of 301 gaps of TESLA to SMART" in caplog.text
     assert np.ptp(read(path, max_error=None)[0].x[:, 3] - read(path, max_error=None)[0].x[:, 2]) > 2

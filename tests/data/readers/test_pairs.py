@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.clusters import clusters, index_of
+from nnode.data.cut import Reading
 from nnode.data.options import Gaps, PairOptions, SplitMode, SplitOptions
 from nnode.data.prepare import prepare
 from nnode.data.quality import find_faults
@@ -105,6 +106,28 @@ def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
         read(path, gaps=Gaps.error)
 
 
+def test_uneven_times_of_pairs_are_interpolated_and_told(tmp_path: Path) -> None:
+    table = drive(0, 50)
+    table["time"] += np.random.default_rng(2).uniform(-0.02, 0.02, 51)
+    table["x_follower"], table["x_leader"] = 10 * table.time, 24 + 11 * table.time
+    path = save(tmp_path / "one.csv", table.drop(columns="spacing"))
+    found = read(path, dt=0.1)
+    assert isinstance(found, Reading)
+    (s,) = found
+    assert "are interpolated to steps of 0.1 s" in found.notes[0]
+    np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time, atol=1e-9)
+    np.testing.assert_allclose(s.x[:, 1, 0], 24 + 11 * s.time, atol=1e-9)
+
+
+def test_pairs_in_frames(tmp_path: Path) -> None:
+    table = drive().assign(time=lambda t: (10 * t.time).round().astype(int))
+    path = save(tmp_path / "one.csv", table)
+    (s,) = read(path, time_unit="frame", frame_rate=10.0)
+    np.testing.assert_allclose(s.time, 0.1 * np.arange(51), atol=1e-12)
+    with pytest.raises(ConfigError, match="frame_rate=None: expected a positive number"):
+        read(path, time_unit="frame")
+
+
 def test_a_coarser_grid(tmp_path: Path) -> None:
     path = save(tmp_path / "one.csv", drive(3, 50))
     with pytest.raises(ConfigError, match=r"dt=0\.05 s is finer than the 0\.1 s"):
@@ -119,7 +142,7 @@ def test_a_coarser_grid(tmp_path: Path) -> None:
     [
         ({"spacing": np.linspace(20, 30, 51)}, "one length of the leader"),
         ({"leader": np.arange(51)}, "line 3: column 'leader' holds 1, before it 0"),
-        ({"time": 0.0}, "a second row of one pair at 0 s"),
+        ({"time": 0.0}, "line 3: agent 1 of p stands there a second time at 0 s"),
         ({"x_leader": "?"}, "line 2: column 'x_leader' holds '\\?'"),
     ],
 )
@@ -265,7 +288,7 @@ def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptur
     holed = spaced(3).drop(index=range(5, 51, 5))
     parts = [spaced(1), spaced(2, k=4), holed, spaced(4, spacing=0.2, leader_length=0.5)]
     path = save(tmp_path / "p.csv", *parts)
-    store = prepare(PairOptions(path=str(path), min_samples=10, max_hole=0.0), tmp_path / "store")
+    store = prepare(PairOptions(path=str(path), min_samples=10, fill=0.0), tmp_path / "store")
     left = {entry["name"]: entry["why"] for entry in store.manifest["left_out"]}
     assert left == {
         "pairs/2": "fewer than data.min_samples=10 times",
@@ -277,7 +300,7 @@ def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptur
     assert "records that are left out, as there is no sequence of them: 2 (" in said
     assert "1 of 2 sequences are left out for their faults: overlap in 1" in said
 
-    store = prepare(PairOptions(path=str(path), window=4.0, max_hole=0.0), tmp_path / "store")
+    store = prepare(PairOptions(path=str(path), window=4.0, fill=0.0), tmp_path / "store")
     assert store.manifest["left_out"] == [
         {"name": "pairs/2", "why": "no data.window=4 s without a gap"},
         {"name": "pairs/3", "why": "no data.window=4 s without a gap"},

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from nnode.data.cut import Reading
 from nnode.data.options import TableOptions
 from nnode.data.quality import find_faults
 from nnode.data.readers.table import read_table, table_files
-from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 
 
@@ -20,9 +20,7 @@ def rows(sequence: object, agent: object, x: np.ndarray, t0: float = 0.0, **more
     return pd.DataFrame({"sequence": sequence, "time": time, "agent": agent, "x": x, **more})
 
 
-def read(
-    tmp_path: Path, *parts: pd.DataFrame, suffix: str = ".csv", **options: object
-) -> list[Sequence]:
+def read(tmp_path: Path, *parts: pd.DataFrame, suffix: str = ".csv", **options: object) -> Reading:
     path = tmp_path / f"own{suffix}"
     table = pd.concat(parts)
     table.to_csv(path, index=False) if suffix == ".csv" else table.to_parquet(path)
@@ -102,13 +100,14 @@ def test_recordings_are_chosen_by_name(tmp_path: Path) -> None:
         read(tmp_path, *parts, recording="r5")
 
 
-def test_an_absent_agent_is_a_gap(tmp_path: Path) -> None:
-    late = rows("s", "late", LINE + 50).iloc[2:]
-    (s,) = read(tmp_path, rows("s", "a", LINE), late, max_hole=0.1)
-    np.testing.assert_array_equal(np.isnan(s.x[:, 1, 0]), [True, True, False, False, False])
-    (fault,) = find_faults(s, "traffic")
-    assert (fault.kind, fault.agents) == ("gap_in_time", (1,))
-    assert "2 of 5 samples" in fault.detail
+def test_a_platoon_whose_vehicles_never_meet_has_gaps(tmp_path: Path) -> None:
+    early, late = rows("s", "a", LINE), rows("s", "late", LINE + 50, t0=1.0)
+    (s,) = read(tmp_path, early, late)
+    assert np.isnan(s.x[:5, 1, 0]).all()
+    faults = find_faults(s, "traffic")
+    assert {(fault.kind, fault.agents) for fault in faults} == {
+        ("gap_in_time", (0,)), ("gap_in_time", (1,)),
+    }  # fmt: skip
 
 
 def test_walls(tmp_path: Path) -> None:
@@ -126,13 +125,6 @@ def test_walls(tmp_path: Path) -> None:
     walls.write_text("x1,y1,x2\n0,0,5\n")
     with pytest.raises(DataError, match=r"no column 'y2'; it has: x1, y1, x2"):
         read_table(files["table"], options, files["walls"])
-
-
-def test_uneven_times(tmp_path: Path) -> None:
-    part = rows("s", "a", LINE)
-    part.loc[3:, "time"] += 0.05
-    with pytest.raises(DataError, match=r"line 5: sequence own/s steps from 0.2 s to 0.35 s"):
-        read(tmp_path, part)
 
 
 def driven(*, cars: int = 3, samples: int = 80) -> pd.DataFrame:
@@ -156,8 +148,42 @@ def test_short_holes_are_filled(tmp_path: Path) -> None:
     np.testing.assert_allclose(s.x, whole.x, atol=2e-3)
     # a straight line would start late by half the change of speed over the hole
     np.testing.assert_allclose(np.diff(s.x, axis=0), np.diff(whole.x, axis=0), atol=2e-3)
-    (kept,) = read(tmp_path, lacking, max_hole=0.0)
-    assert {fault.kind for fault in find_faults(kept, "traffic")} == {"gap_in_time"}
+    parts = read(tmp_path, lacking, fill=0.0)
+    assert [len(part.time) for part in parts] == [10, 5, 39, 17]
+    assert not any(part.filled or np.isnan(part.x).any() for part in parts)
+
+
+@pytest.mark.parametrize("common", [True, False])
+def test_uneven_times_are_interpolated_and_told(tmp_path: Path, common: bool) -> None:
+    """Times that jitter by a fifth of a step, in all vehicles' rows alike or in each one's."""
+    table, rng = driven(), np.random.default_rng(5)
+    late = rng.uniform(-0.02, 0.02, 80 if common else 240)
+    time = table.time + (np.tile(late, 3) if common else late)
+    # the positions are those at the uneven times
+    x = 15 * time + 6 * np.sin(0.5 * time) + 30 * table.agent.str[1:].astype(int)
+    found = read(tmp_path, table.assign(time=time, x=x))
+    assert isinstance(found, Reading)
+    (s,) = found
+    (note,) = found.notes
+    assert "times are uneven" in note
+    assert "are interpolated to steps of 0.1 s" in note
+    exact = 15 * s.time + 6 * np.sin(0.5 * s.time)
+    np.testing.assert_allclose(np.diff(s.time), 0.1, atol=1e-9)
+    np.testing.assert_allclose(s.x[:, :, 0], exact[:, None] + [0, 30, 60], atol=3e-3)
+    assert read(tmp_path, driven()).notes == []
+
+
+def test_uneven_times_of_people(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    time = np.sort(0.2 * np.arange(40) + rng.uniform(-0.04, 0.04, 40))
+    parts = [
+        pd.DataFrame({"sequence": "s", "time": time + 0.01 * n, "agent": f"p{n}",
+                      "x": 1.3 * (time + 0.01 * n), "y": float(n)})
+        for n in range(3)
+    ]  # fmt: skip
+    (s,) = read(tmp_path, *parts, domain="crowd")
+    assert s.n_samples > 35
+    np.testing.assert_allclose(s.x[:, :, 0], np.tile(1.3 * s.time[:, None], (1, 3)), atol=1e-9)
 
 
 def test_a_platoon_begins_when_all_are_there(tmp_path: Path) -> None:
@@ -168,12 +194,26 @@ def test_a_platoon_begins_when_all_are_there(tmp_path: Path) -> None:
     assert not np.isnan(s.x).any()
 
 
-def test_a_long_hole_is_a_fault_of_its_sequence(tmp_path: Path) -> None:
+@pytest.mark.parametrize("whose", ["c1", "all"])
+def test_a_long_hole_cuts_a_platoon_in_two(tmp_path: Path, whose: str) -> None:
     table = driven()
-    other = table.assign(sequence="other")
-    sound, holed = read(tmp_path, table[~table.time.between(3.95, 5.05)], other)
-    assert "gap_in_time" in {fault.kind for fault in find_faults(holed, "traffic")}
-    assert find_faults(sound, "traffic") == []
+    hole = table.time.between(3.95, 5.05) & ((table.agent == whose) | (whose == "all"))
+    found = read(tmp_path, table[~hole], table.assign(sequence="t"))
+    before, behind, sound = found
+    assert [s.name for s in found] == ["own/s_000", "own/s_001", "own/t"]
+    assert (before.time[-1], behind.time[0]) == (pytest.approx(3.9), pytest.approx(5.1))
+    assert sound.n_samples == 80
+    assert not any(find_faults(s, "traffic") for s in found)
+    (note,) = found.notes
+    assert "sequence own/s: not all vehicles are there at 11 of 80 times" in note
+
+
+def test_a_crowd_is_cut_where_nobody_is_there(tmp_path: Path) -> None:
+    parts = [rows("s", n, LINE[[0] * 40] + np.arange(40) * 0.1, y=float(n)) for n in range(3)]
+    table = pd.concat(parts)
+    before, behind = read(tmp_path, table[~table.time.between(1.95, 3.05)], domain="crowd")
+    assert (before.time[-1], behind.time[0]) == (pytest.approx(1.9), pytest.approx(3.1))
+    assert before.n_agents == behind.n_agents == 3
 
 
 def test_one_agent_twice(tmp_path: Path) -> None:

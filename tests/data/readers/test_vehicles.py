@@ -118,6 +118,29 @@ def test_interpolates_and_never_extrapolates(tmp_path: Path) -> None:
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
 
 
+def test_uneven_times_are_told_and_a_coarser_grid_is_not(tmp_path: Path) -> None:
+    cars = pd.concat([drive(name, 0, 4, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))])
+    assert read(save(tmp_path / "even.csv", cars)).notes == []  # type: ignore[attr-defined]
+    late = np.random.default_rng(1).uniform(-0.02, 0.02, len(cars))
+    path = save(tmp_path / "road.csv", cars.assign(time=cars.time + late))
+    (note,) = read(path).notes  # type: ignore[attr-defined]
+    assert note.startswith("road: times are uneven")
+    assert note.endswith("are interpolated to steps of 0.2 s")
+
+
+def test_a_grid_that_is_finer_than_the_file_is_told(tmp_path: Path) -> None:
+    cars = pd.concat([drive(name, 0, 9, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))])
+    found = read(save(tmp_path / "road.csv", cars), dt=0.05)
+    assert "no multiples of 0.05 s" in found.notes[0]  # type: ignore[attr-defined]
+
+
+def test_recordings_and_sequences_together_tell_rows_apart(tmp_path: Path) -> None:
+    cars = pd.concat([drive(name, 0, 4, x0) for name, x0 in (("a", 60), ("b", 30), ("c", 0))])
+    parts = [cars.assign(recording=r, sequence=s) for r in "xy" for s in (1, 2)]
+    found = read(save(tmp_path / "road.csv", *parts))
+    assert [s.recording for s in found] == ["x 1", "x 2", "y 1", "y 2"]
+
+
 def test_maximal_intervals(tmp_path: Path) -> None:
     path = save(
         tmp_path / "t.csv",
@@ -169,8 +192,8 @@ def test_long_holes_are_not_interpolated(tmp_path: Path) -> None:
     parts = [drive(n, 0, 4, x0) for n, x0 in (("a", 0), ("b", 30), ("c", 60))]
     parts[1] = parts[1][(parts[1].time < 1.05) | (parts[1].time > 2.95)]
     path = save(tmp_path / "t.csv", *parts)
-    assert [s.n_samples for s in read(path, max_hole=1.0)] == [6, 6]
-    assert [s.n_samples for s in read(path, max_hole=2.0)] == [21]
+    assert [s.n_samples for s in read(path, fill=1.0)] == [6, 6]
+    assert [s.n_samples for s in read(path, fill=2.0)] == [21]
 
 
 def test_windows_share_their_boundary_sample(platoon: Path) -> None:
@@ -247,12 +270,14 @@ def test_bad_options(platoon: Path, options: dict, message: str) -> None:
         ("", "is empty; expected a line of column names"),
         ("vehicle,time,x\n", "has no rows below its columns vehicle, time, x"),
         ("vehicle,t,x\n1,0,0\n", r"no column 'time'; it has: vehicle, t, x.*data.columns.time="),
-        ("vehicle;time;x\n1;0;0\n", "must be separated by commas"),
         ("vehicle,time,x\n1,0,0\n\n1,0.1,abc\n", r"line 4: column 'x' holds 'abc'"),
         ("vehicle,time,x\n1,0,0\n1,,2\n", r"line 3: column 'time' holds nothing"),
         ("vehicle,time,x\n1,0,inf\n", r"line 2: column 'x' holds 'inf'"),
         ("vehicle,time,x\n1,0,0\n,0.1,2\n", r"line 3: column 'vehicle' is empty"),
-        ("vehicle,time,x\n1,0,0\n2,0,9\n1,0,1\n", r"line 4: vehicle 1 at time 0 s .* in line 2"),
+        (
+            "vehicle,time,x\n1,0,0\n2,0,9\n1,0,1\n",
+            r"line 4: agent 1 stands .* at 0 s .*in line 2",
+        ),
         ("vehicle,time,x\n1,0,0\n1,0.1,1\n1,0.2,2\n", r"no sequence; at no time are 3 vehicles"),
         ("vehicle,time,x\n1,0,0,5,6\n1,0\n1,2,3,4,5,6,7\n", "cannot be read as a comma-separated"),
     ],

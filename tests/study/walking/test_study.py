@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,3 +76,9 @@ def test_predictions_that_go_straight() -> None:
     np.testing.assert_allclose(tasks.along_stream(batch)[0], [[1.2, 0], [-1.2, 0]], atol=1e-9)
     x = tasks.straight(batch, batch.v[0])
     np.testing.assert_allclose(x[-1, 0], [[0.6, 0], [49.4, 0]], atol=1e-9)
+
+
+def test_who_stood_before_is_predicted_to_stay() -> None:
+    one = walker("a", 0.8)
+    batch = collate([replace(one, preferred=np.array([[0.0, 0.0], [-1.2, 0.0]]))])
+    np.testing.assert_allclose(tasks.along_stream(batch)[0], [[0, 0], [-1.2, 0]], atol=1e-9)

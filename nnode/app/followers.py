@@ -1,0 +1,123 @@
+"""Errors of every follower of lanes, pair by pair and driver by driver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from nnode.calibrate.evaluate import Simulate
+from nnode.data.clusters import Index
+from nnode.data.sequence import Batch
+from nnode.errors import printable
+from nnode.files import csv_text, write_text
+from nnode.plots import traffic
+from nnode.plots.style import save
+
+#: Rows of a table that are printed, those with the largest errors.
+SHOWN = 10
+#: Columns of both tables, with their units.
+COLUMNS = {
+    "spacing_rmse": "spacing RMSE (m)", "spacing_bias": "spacing bias (m)",
+    "speed_rmse": "speed RMSE (m/s)", "speed_bias": "speed bias (m/s)",
+    "final_error": "final error (m)",
+}  # fmt: skip
+
+
+@torch.no_grad()
+def follower_errors(simulate: Simulate, batches: Iterable[Batch], index: Index) -> pd.DataFrame:
+    """One row per sequence and follower, over all samples after the first.
+
+    A spacing error is that of the distance to the vehicle ahead, both simulated, or measured where
+    the model is given a measured leader. Biases are simulated minus measured. Speeds of models of
+    first order are forward differences, as those of data without speeds.
+
+    Args:
+        simulate: the model.
+        batches: lanes.
+        index: what is known of the sequences, see :func:`nnode.data.clusters.index_of`.
+
+    Returns:
+        Columns ``sequence``, ``recording`` (or the site of several), ``driver`` (the identifier,
+        or else the sequence and the place in it), ``samples`` and :data:`COLUMNS`.
+    """
+    known = {entry["name"]: entry for entry in index}
+    rows = []
+    for batch in batches:
+        found = simulate(batch)
+        error = (found.x - batch.x)[..., 0]
+        speed = found.v[..., 0] if found.v is not None else _slopes(found.x[..., 0], batch.dt)
+        measured = batch.v[..., 0] if found.v is not None else _slopes(batch.x[..., 0], batch.dt)
+        late = speed - measured
+        for b, name in enumerate(batch.names):
+            entry = known[name]
+            for n in range(int(batch.agent[b].sum()) - 1):
+                there = batch.valid[:, b, n].numpy(force=True)
+                k = np.flatnonzero(there)[1:]
+                gap = (error[:, b, n + 1] - error[:, b, n]).numpy(force=True)[k]
+                slip = late[:, b, n].numpy(force=True)[k]
+                rows.append(
+                    {
+                        "sequence": name,
+                        "recording": entry.get("site") or entry["recording"],
+                        "driver": entry["agents"][n] if entry["agents"] else f"{name} {n}",
+                        "samples": len(k),
+                        "spacing_rmse": float(np.sqrt((gap**2).mean())),
+                        "spacing_bias": float(gap.mean()),
+                        "speed_rmse": float(np.sqrt((slip**2).mean())),
+                        "speed_bias": float(slip.mean()),
+                        "final_error": float(abs(error[k[-1], b, n])),
+                    }
+                )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def _slopes(x: torch.Tensor, dt: float) -> torch.Tensor:
+    step = x.diff(dim=0) / dt
+    return torch.cat([step, step[-1:]])
+
+
+def by_driver(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row per driver: all samples of all his sequences together."""
+    weight = rows["samples"]
+    sums = pd.DataFrame(
+        {
+            **{key: rows[key] for key in ("recording", "driver", "samples", "final_error")},
+            "sequences": 1,
+            **{key: rows[key] ** 2 * weight for key in ("spacing_rmse", "speed_rmse")},
+            **{key: rows[key] * weight for key in ("spacing_bias", "speed_bias")},
+        }
+    ).groupby(["recording", "driver"], sort=False).sum()  # fmt: skip
+    for key in ("spacing_rmse", "speed_rmse"):
+        sums[key] = np.sqrt(sums[key] / sums["samples"])
+    for key in ("spacing_bias", "speed_bias"):
+        sums[key] /= sums["samples"]
+    sums["final_error"] /= sums["sequences"]
+    return sums.reset_index()
+
+
+def write_followers(rows: pd.DataFrame, folder: Path) -> None:
+    """Print the largest errors, and write ``pairs.csv``, ``drivers.csv`` and ``pairs.png``."""
+    drivers = by_driver(rows)
+    heads_of = {"pairs": ("sequence", "driver"), "drivers": ("recording", "driver", "sequences")}
+    for (name, heads), table in zip(heads_of.items(), (rows, drivers), strict=True):
+        write_text(folder / f"{name}.csv", csv_text(table))
+        _print(name, table.nlargest(SHOWN, "spacing_rmse"), heads, len(table))
+    print(f"plot: {save(traffic.follower_errors(rows), folder / 'pairs.png')}")
+
+
+def _print(name: str, table: pd.DataFrame, heads: tuple[str, ...], number: int) -> None:
+    shown = f"the {len(table)} largest spacing errors of {number}; all in {name}.csv"
+    printed = Table(title=f"{name}: {shown}" if number > len(table) else name)
+    for head in (*heads, *COLUMNS.values()):
+        printed.add_column(head, justify="right")
+    for _, row in table.iterrows():
+        names = (escape(printable(str(row[head]))) for head in heads)
+        printed.add_row(*names, *(f"{row[key]:.3g}" for key in COLUMNS))
+    Console(width=140).print(printed)

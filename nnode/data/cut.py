@@ -1,0 +1,362 @@
+"""Sequences cut from agents' records: by lane, by pair or sequence of the source, by presence.
+
+By lane follows Section 4.2 of the calibration paper: every lane by itself, the lateral coordinate
+dropped, and sequences in which the same vehicles are in view. All ways end in
+:func:`sequence_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from nnode.data.options import Agents, LaneOptions, check_known, positive, wanted
+from nnode.data.sequence import Sequence
+from nnode.data.trajectories import Grid, Record, Trajectories, records
+from nnode.errors import ConfigError, DataError
+
+
+class Reading(list[Sequence]):
+    """Sequences of a reader that tells what it left out and what it changed.
+
+    Attributes:
+        left_out: ``name`` and ``why`` of each record of which there is no sequence.
+        notes: sentences about what was interpolated or cut.
+    """
+
+    def __init__(
+        self,
+        sequences: Iterable[Sequence] = (),
+        left_out: Iterable[dict[str, str]] = (),
+        notes: Iterable[str] = (),
+    ) -> None:
+        super().__init__(sequences)
+        self.left_out = list(left_out)
+        self.notes = list(notes)
+
+    def add(self, other: list[Sequence]) -> None:
+        """Append what another file gave."""
+        self += other
+        if isinstance(other, Reading):
+            self.left_out += other.left_out
+            self.notes += other.notes
+
+
+#: Agents' records, and the first and the last time of their sequence.
+_Platoon = tuple[list[Record], int, int]
+
+
+@dataclass
+class Member:
+    """An agent of a sequence: its name, a row of the table that tells what it is, its records."""
+
+    agent: str
+    row: int
+    records: list[Record] = field(default_factory=list)
+
+
+def members(table: Trajectories, found: Iterable[Record]) -> list[Member]:
+    """Every agent that the rows name, in order of names as text, with its records."""
+    names, rows = np.unique(table.agent.astype(str), return_index=True)
+    own = {name: Member(name, int(row)) for name, row in zip(names, rows, strict=True)}
+    for record in found:
+        own[record.agent].records.append(record)
+    return list(own.values())
+
+
+def sequence_of(
+    name: str, table: Trajectories, of: list[Member], first: int, last: int, grid: Grid, **more: Any
+) -> Sequence:
+    """The sequence of some agents from one time of the grid to another one.
+
+    Args:
+        name: of the sequence.
+        table: that the records are from.
+        of: its agents, in their order; NaN where one has no record.
+        more: further fields of :class:`~nnode.data.sequence.Sequence`.
+    """
+    shape = (last - first + 1, len(of), table.x.shape[1])
+    x, v = np.full(shape, np.nan), np.full(shape, np.nan)
+    filled = 0
+    for n, member in enumerate(of):
+        for record in member.records:
+            low, high = max(first, record.first), min(last, record.last) + 1
+            if low < high:
+                part = slice(low - record.first, high - record.first)
+                x[low - first : high - first, n] = record.x[part]
+                if record.v is not None:
+                    v[low - first : high - first, n] = record.v[part]
+                filled += int(record.filled[part].sum())
+    rows = np.array([member.row for member in of], dtype=int)
+    length = None if table.length is None else table.length[rows]
+    told: dict[str, Any] = {
+        "recording": table.name,
+        "agents": tuple(member.agent for member in of),
+        "length": None if length is None or np.isnan(length).all() else length,
+        "kind": None if table.kind is None else tuple(table.kind[rows]),
+        "group": None if table.group is None else tuple(table.group[rows]),
+        "destination": None if table.destination is None else table.destination[rows],
+        "v": None if np.isnan(v).all() else v,
+        "filled": filled,
+        "time": grid.origin + grid.dt * np.arange(first, last + 1),
+    }
+    return Sequence(name=name, x=x, **(told | more))
+
+
+def told_uneven(found: Iterable[Record], dt: float) -> list[str]:
+    """A sentence about records whose times are uneven, if there are such."""
+    every = list(found)
+    number = sum(int(r.uneven.sum()) for r in every)
+    total = sum(len(r.x) for r in every)
+    if not number:
+        return []
+    return [
+        f"times are uneven, or no multiples of {dt:g} s: {number} of {total} samples "
+        f"({number / total:.0%}) are interpolated to steps of {dt:g} s"
+    ]
+
+
+def spans(of: list[Member]) -> list[tuple[int, int]]:
+    """First and last times of the maximal intervals in which all agents are there."""
+    every = [record for member in of for record in member.records]
+    return [
+        (first, last)
+        for present, first, last in _intervals(every)
+        if len(present) == len(of) and of
+    ]
+
+
+def windows(first: int, last: int, steps: int) -> Iterator[tuple[int, int]]:
+    """Consecutive windows of so many steps that share their boundary sample."""
+    for start in range(first, last - steps + 1, steps):
+        yield start, start + steps
+
+
+def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") -> Reading:
+    """Cut vehicles into sequences, lane by lane.
+
+    Without ``window`` a sequence is a maximal interval during which the same vehicles are in
+    view. With it, time is cut into consecutive windows that share their boundary sample, and a
+    sequence is a platoon of vehicles in view throughout; where a vehicle is in view for part of
+    the window, the platoon is cut at its place, so that nobody follows a vehicle that is not
+    its leader. With ``pairs`` a sequence is a vehicle and the one in front of it, as long as that
+    is the same one, in whole windows where there are such.
+
+    Args:
+        table: to the names of whose recordings ``_`` and the lane are added.
+        options: lanes, time grid and the way of cutting, checked by :func:`check_cutting`.
+        lane_word: stands before the lane's name.
+
+    Returns:
+        Sequences named ``recording/number``. Vehicles are ordered by position, the leader last.
+
+    Raises:
+        ConfigError: an unknown lane or recording.
+        DataError: one vehicle twice at one time, or no sequence at all.
+    """
+    chosen, grid = _lanes(options, table), Grid(options.dt)
+    names_of_kinds = {str(code): str(name) for code, name in dict(options.kinds).items()}
+    lanes: dict[str, tuple[str, Trajectories, list[Record]]] = {}
+    notes: list[str] = []
+    for (recording,), rows in table.parts("recording"):
+        stem = recording or table.name
+        reused = stem if options.agents is Agents.auto else ""
+        every = records(rows, grid, fill=options.fill, smoothing=options.smooth, reused=reused)
+        notes += [f"{stem}: {text}" for text in told_uneven(every, grid.dt)]
+        present = {""} if rows.lane is None else set(rows.lane)
+        for lane in (name for name in chosen if name in present):
+            own = [r for r in every if rows.lane is None or rows.lane[r.row] == lane]
+            lanes[f"{stem}_{lane_word}{lane}" if lane else stem] = stem, rows, own
+    asked = wanted(options.recording)
+    if asked is not None:
+        check_known(asked, lanes)
+        lanes = {name: lanes[name] for name in asked}
+    found = []
+    for name, (stem, rows, own) in lanes.items():
+        for number, (platoon, first, last) in enumerate(_platoons(own, options)):
+            of = [Member(record.agent, record.row, [record]) for record in platoon]
+            kinds = None
+            if rows.kind is not None:
+                codes = (str(rows.kind[record.row]) for record in platoon)
+                kinds = tuple(names_of_kinds.get(code, code) for code in codes)
+            found.append(
+                sequence_of(
+                    f"{name}/{number:03d}", rows, of, first, last, grid,
+                    recording=name, site=stem, kind=kinds,
+                )
+            )  # fmt: skip
+    if not found:
+        vehicles = {record.agent for _, _, own in lanes.values() for record in own}
+        raise DataError(
+            f"{table.path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
+            f"lane for {options.min_samples} samples of {options.dt:g} s"
+            + (f" throughout a window of {options.window:g} s" if options.window else "")
+            + f" ({len(vehicles)} vehicles, {len(lanes)} lanes); lower data.min_vehicles, "
+            "data.min_samples or data.window"
+        )
+    return Reading(found, notes=notes)
+
+
+def by_presence(
+    every: list[Record],
+    steps: int,
+    least: int = 1,
+    axis: int = 0,
+    view: tuple[float, float] | None = None,
+) -> Iterator[_Platoon]:
+    """Consecutive windows, each with those who are there throughout.
+
+    Windows begin with the first record and share their boundary sample.
+
+    Args:
+        steps: of a window.
+        least: fewest agents.
+        axis, view: m, whoever is there is within these ends of a coordinate at all times.
+    """
+    if not every:
+        return
+    begin = np.array([record.first for record in every])
+    end = np.array([record.last for record in every])
+    low, number = int(begin.min()), end - begin
+    # windows that lie within a record: two records may lie years apart
+    starts = {
+        low + k * steps
+        for a, b in zip(begin[number >= steps], end[number >= steps], strict=True)
+        for k in range(-((low - int(a)) // steps), (int(b) - low) // steps)
+    }
+    for first in sorted(starts):
+        last = first + steps
+        there = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
+        if view is not None:
+            paths = [record.x[first - record.first : last - record.first + 1] for record in there]
+            inside = [
+                (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
+            ]
+            there = [record for record, good in zip(there, inside, strict=True) if good]
+        if len(there) >= least:
+            yield there, first, last
+
+
+def check_cutting(options: LaneOptions) -> None:
+    """Refuse options of the cutting that are out of their range.
+
+    Raises:
+        ConfigError: names the option.
+    """
+    positive("dt", options.dt)
+    if options.min_vehicles < 1 or options.min_samples < 1:
+        raise ConfigError("data.min_vehicles and data.min_samples must be at least 1")
+    if options.window is not None:
+        samples = positive("window", options.window) / options.dt
+        if abs(samples - round(samples)) > 1e-6:
+            raise ConfigError(
+                f"data.window={options.window:g} s is no whole number of steps of "
+                f"data.dt={options.dt:g} s"
+            )
+        if round(samples) + 1 < options.min_samples:
+            raise ConfigError(
+                f"data.window={options.window:g} s has {round(samples) + 1} samples, fewer than "
+                f"data.min_samples={options.min_samples}"
+            )
+
+
+def _lanes(options: LaneOptions, table: Trajectories) -> list[str]:
+    if table.lane is None and options.lane is not None:
+        raise ConfigError(
+            f"data.lane={options.lane}, but {table.path} has no lane column; set "
+            "data.columns.lane or data.lane=null"
+        )
+    present = {""} if table.lane is None else set(table.lane)
+    return chosen_lanes(options.lane, present, f"{table.path} has")
+
+
+def chosen_lanes(lane: Any, present: set[str], who: str) -> list[str]:
+    """Names of the lanes that ``data.lane`` chooses among those that there are.
+
+    Raises:
+        ConfigError: an unknown lane; ``who`` has the lanes that it lists.
+    """
+    known = sorted(present, key=lambda name: (len(name), name))
+    if lane is None:
+        return known
+    chosen = [lane] if isinstance(lane, str | int | float) else lane
+    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
+    for name in names:
+        if name not in present:
+            raise ConfigError(f"data.lane={name}: {who} the lanes {', '.join(known[:20])}")
+    return names
+
+
+def _platoons(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
+    """Vehicles, first and last grid time of every sequence of one lane, in order of time."""
+    if not lane:
+        return
+    if options.pairs:
+        pieces, least = _pairs(lane, options), 2
+    else:
+        pieces = _intervals(lane) if options.window is None else _windows(lane, options)
+        least = options.min_vehicles
+    for platoon, first, last in pieces:
+        if len(platoon) >= least and last - first + 1 >= options.min_samples:
+            yield _in_order(platoon, first), first, last
+
+
+def _in_order(platoon: list[Record], at: int) -> list[Record]:
+    return sorted(platoon, key=lambda r: float(r.x[at - r.first, 0]))
+
+
+def _intervals(every: list[Record]) -> Iterator[_Platoon]:
+    changes = sorted({r.first for r in every} | {r.last + 1 for r in every})
+    for first, after in pairwise(changes):
+        yield [r for r in every if r.first <= first and r.last >= after - 1], first, after - 1
+
+
+def _pairs(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
+    """Followers with their leaders, as long as nobody comes between them, in order of time."""
+    found: dict[tuple[int, int], list[tuple[Record, Record, int, int]]] = {}
+    for platoon, first, last in _intervals(lane):
+        for follower, leader in pairwise(_in_order(platoon, first)):
+            known = found.setdefault((id(follower), id(leader)), [])
+            if known and known[-1][3] + 1 == first:
+                first_of_all = known.pop()[2]
+                known.append((follower, leader, first_of_all, last))
+            else:
+                known.append((follower, leader, first, last))
+    every = sorted((span for own in found.values() for span in own), key=lambda span: span[2])
+    for follower, leader, first, last in every:
+        steps = last - first if options.window is None else round(options.window / options.dt)
+        for start, end in windows(first, last, max(steps, 1)):
+            yield [follower, leader], start, end
+
+
+def _windows(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
+    assert options.window is not None
+    steps = round(options.window / options.dt)
+    start, end = min(r.first for r in lane), max(r.last for r in lane)
+    # only windows in which somebody is in view: two records may lie years apart
+    busy = {
+        k
+        for r in lane
+        for k in range((r.first - start) // steps - 1, (r.last - start) // steps + 1)
+    }
+    for first in sorted(start + k * steps for k in busy if 0 <= k <= (end - start) // steps - 1):
+        last = first + steps
+        seen = [r for r in lane if r.first <= last and r.last >= first]
+        whole = _in_order([r for r in seen if r.first <= first and r.last >= last], first)
+        if not whole:
+            continue
+        x = np.stack([r.x[first - r.first : last - r.first + 1, 0] for r in whole], axis=1)
+        broken: set[int] = set()
+        for r in seen:
+            if r.first > first or r.last < last:
+                a, b = max(first, r.first), min(last, r.last)
+                own = r.x[a - r.first : b - r.first + 1]
+                behind = (x[a - first : b - first + 1] < own).sum(axis=1)
+                broken.update(int(n) for n in behind)
+        borders = sorted({0, len(whole)} | broken)
+        for low, high in pairwise(borders):
+            yield whole[low:high], first, last

@@ -1,0 +1,309 @@
+"""Trajectories as a table, one row per agent and time, and agents' records at equal times.
+
+A reader makes :class:`Trajectories` of a file's columns, in SI units. :func:`records` makes them
+equally spaced: short holes are filled, long ones end a record, uneven times are interpolated.
+:mod:`nnode.data.cut` makes sequences of records.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from nnode.data.identity import given_anew, numbered
+from nnode.data.options import positive
+from nnode.data.smooth import across, smooth
+from nnode.errors import DataError
+
+log = logging.getLogger(__name__)
+
+#: A step longer than so many usual ones is a hole.
+HOLE = 1.5
+#: Share of the sampling interval by which a time may miss the grid without being interpolated.
+UNEVEN = 0.01
+#: Steps are counted up to this number: it is exact, and adding to it as well.
+LATEST = 2.0**52
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectories:
+    """R rows in any order, in SI units, of one recording or of several.
+
+    What belongs to an agent (``length``, ``kind``, ``group``, ``destination``) is taken from the
+    first row of its record.
+
+    Attributes:
+        path: of the file, for messages.
+        name: of the recording, where there is no column of it.
+        where: in words, where row i stands in the file.
+        agent: ``(R,)`` identifiers, text.
+        time: ``(R,)`` s.
+        x: ``(R, D)`` m, along the lane (growing as vehicles drive on) or in the plane; NaN where
+            a sample is missing.
+        v: ``(R, D)`` m/s, NaN where a sample is missing, or None.
+        recording: ``(R,)`` names, or None: all rows are of one.
+        sequence: ``(R,)`` names of the sequences or pairs that the source is cut into, or None.
+        lane: ``(R,)`` names, or None: there is one.
+        length: ``(R,)`` m, NaN where unknown, or None.
+        kind, group, split: ``(R,)`` names, or None.
+        destination: ``(R, D)`` m, or None.
+    """
+
+    path: Path
+    name: str
+    where: Callable[[int], str]
+    agent: np.ndarray
+    time: np.ndarray
+    x: np.ndarray
+    v: np.ndarray | None = None
+    recording: np.ndarray | None = None
+    sequence: np.ndarray | None = None
+    lane: np.ndarray | None = None
+    length: np.ndarray | None = None
+    kind: np.ndarray | None = None
+    group: np.ndarray | None = None
+    split: np.ndarray | None = None
+    destination: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def at(self, rows: np.ndarray) -> Trajectories:
+        """Some of the rows, by number."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        own: dict[str, Any] = {
+            name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)
+        }
+        return replace(self, where=lambda i: self.where(int(rows[i])), **own)
+
+    def parts(self, *names: str) -> Iterator[tuple[tuple[str, ...], Trajectories]]:
+        """The rows of every combination of names, such as ``recording``, in order of first rows."""
+        known = [column for name in names if (column := getattr(self, name)) is not None]
+        if not known:
+            yield tuple("" for _ in names), self
+            return
+        groups = pd.DataFrame(dict(enumerate(known))).groupby(list(range(len(known))), sort=False)
+        for rows in sorted(groups.indices.values(), key=min):
+            own = self.at(np.sort(rows))
+            columns = (getattr(own, name) for name in names)
+            yield tuple("" if column is None else str(column[0]) for column in columns), own
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Equally spaced times: ``origin + k * dt`` s."""
+
+    dt: float
+    origin: float = 0.0
+
+
+@dataclass(frozen=True)
+class Record:
+    """An agent's record without a hole; sample i is at time ``first + i`` of the grid.
+
+    Attributes:
+        agent: its identifier.
+        row: of the table, where the record begins.
+        first: number of the first time.
+        x: ``(K, D)`` m.
+        v: ``(K, D)`` m/s, or None.
+        filled: ``(K,)`` whether the sample was missing.
+        uneven: ``(K,)`` whether it was interpolated because times are uneven.
+    """
+
+    agent: str
+    row: int
+    first: int
+    x: np.ndarray
+    v: np.ndarray | None
+    filled: np.ndarray
+    uneven: np.ndarray
+
+    @property
+    def last(self) -> int:
+        """Number of the last time."""
+        return self.first + len(self.x) - 1
+
+
+def usual_step(table: Trajectories) -> float:
+    """The sampling interval (s) of agents' rows; NaN where no agent has two.
+
+    It is the mean of steps and of the parts of multiple ones, so that times which were rounded do
+    not drift; of uneven times it is rounded to two or three digits.
+    """
+    names = [n for n in ("recording", "sequence", "agent") if getattr(table, n) is not None]
+    code = pd.DataFrame({n: getattr(table, n) for n in names}).groupby(names, sort=False).ngroup()
+    order = np.lexsort((table.time, code))
+    return usual_interval(np.diff(table.time[order])[np.diff(code.to_numpy()[order]) == 0])
+
+
+def usual_interval(step: np.ndarray) -> float:
+    """The sampling interval (s) that steps are multiples of, see :func:`usual_step`."""
+    step = step[step > 0]
+    if not step.size:
+        return float("nan")
+    usual = float(np.median(step))
+    step = step[step < LATEST * usual]
+    number = np.maximum(np.round(step / usual), 1)
+    # whatever the order of rows
+    mean = math.fsum(step) / float(number.sum())
+    if (np.abs(step - number * usual) <= UNEVEN * usual).all():
+        return mean
+    short = float(f"{mean:.2g}")
+    return short if abs(short - mean) <= 2 * UNEVEN * mean else float(f"{mean:.3g}")
+
+
+def measured_times(table: Trajectories, grid: Grid, first: int, last: int) -> np.ndarray:
+    """``(K,)`` s: the times of a grid as the table writes them, where its times are those."""
+    k = (table.time - grid.origin) / grid.dt
+    near = np.round(k)
+    at = np.arange(first, last + 1)
+    if (np.abs(k - near) > UNEVEN).any():
+        return grid.origin + grid.dt * at
+    number, row = np.unique(near, return_index=True)
+    return np.asarray(np.interp(at, number, table.time[row]))
+
+
+def records(
+    table: Trajectories,
+    grid: Grid,
+    *,
+    fill: float,
+    smoothing: float | None = None,
+    reused: str = "",
+) -> list[Record]:
+    """Agents' records at the times of a grid, by agent and time.
+
+    Holes in which no more than ``fill`` s are missing are filled by a local cubic, speeds by a
+    straight line; longer ones end a record, and so does a change of lane. Where times miss those
+    of the grid, positions and speeds are interpolated.
+
+    Args:
+        table: rows of one recording.
+        fill: s.
+        smoothing: s, window of local cubics in place of the measured positions and speeds; None:
+            as they are.
+        reused: name of the recording in a message; where it is given, an identifier that turns up
+            where its agent cannot have got to is that of another agent.
+
+    Raises:
+        DataError: one agent twice at one time, or a time that steps cannot count; names the rows.
+    """
+    far = np.flatnonzero(~(np.abs(table.time - grid.origin) < LATEST * grid.dt))
+    if far.size:
+        raise DataError(
+            f"{table.path}, {table.where(int(far[0]))}: the time is {table.time[far[0]]:g} s, "
+            f"which steps of {grid.dt:g} s cannot count; correct it"
+        )
+    code, ids = pd.factorize(table.agent, sort=True)
+    order = np.lexsort((table.time, code))
+    _once(table, order, code[order])
+    known = np.isfinite(table.x).all(axis=1)
+    if table.v is not None:
+        known &= np.isfinite(table.v).all(axis=1)
+    order = order[known[order]]
+    if not len(order):
+        return []
+    time, x, own = table.time[order], table.x[order], code[order]
+    v = None if table.v is None else table.v[order]
+    step, other = np.diff(time), np.diff(own) != 0
+    usual = float(np.median(step[~other])) if (~other).any() else grid.dt
+    hole = ~other & (step > HOLE * usual) & (step - usual > fill + 1e-6)
+    number = np.ones(len(order), dtype=int)
+    if reused:
+        number = _numbers(ids[own], time, x[:, 0], other, hole, reused)
+    if smoothing is not None:
+        positive("smooth", smoothing)
+        x, v = _smoothed(time, x, other | hole, smoothing)
+    ends = other | hole
+    if table.lane is not None:
+        ends |= table.lane[order][1:] != table.lane[order][:-1]
+    taken, found = set(map(str, ids)), []
+    for rows in np.split(np.arange(len(order)), np.flatnonzero(ends) + 1):
+        agent = numbered(str(ids[own[rows[0]]]), int(number[rows[0]]), taken)
+        made = _on_grid(time[rows], x[rows], None if v is None else v[rows], grid, usual)
+        if made is not None:
+            found.append(Record(agent, int(order[rows[0]]), *made))
+    return found
+
+
+def _once(table: Trajectories, order: np.ndarray, code: np.ndarray) -> None:
+    """Refuse two rows of one agent at one time."""
+    twice = np.flatnonzero((np.diff(code) == 0) & (np.diff(table.time[order]) <= 0))
+    if twice.size:
+        i, j = sorted(order[twice[0] : twice[0] + 2].tolist())
+        whose = "" if table.sequence is None else f" of {table.sequence[j]}"
+        raise DataError(
+            f"{table.path}, {table.where(j)}: agent {table.agent[j]}{whose} stands there a second "
+            f"time at {table.time[j]:g} s (first in {table.where(i)}); expected one row per agent "
+            "and time: name the column that tells agents of one name apart (data.columns)"
+        )
+
+
+_Made = tuple[int, np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]
+
+
+def _on_grid(
+    time: np.ndarray, x: np.ndarray, v: np.ndarray | None, grid: Grid, usual: float
+) -> _Made | None:
+    """First time, positions, speeds, which were missing and which are between uneven times."""
+    k = (time - grid.origin) / grid.dt
+    near = np.round(k)
+    if (np.abs(k - near) <= UNEVEN).all() and (np.diff(near) > 0).all():
+        k = near
+    first, last = int(np.ceil(k[0] - 1e-6)), int(np.floor(k[-1] + 1e-6))
+    if last < first:
+        return None
+    at = np.arange(first, last + 1, dtype=float)
+    after = np.searchsorted(k, at - 1e-6).clip(0, len(k) - 1)
+    before = np.maximum(after - 1, 0)
+    between = (k[after] > at + 1e-6) & (k[before] < at - 1e-6)
+    filled = between & (time[after] - time[before] > HOLE * usual)
+    away = np.minimum(np.abs(k[after] - at), np.abs(at - k[before]))
+    places = _interpolated(at, k, x)
+    for i in np.unique(before[filled]):
+        inside = filled & (before == i)
+        places[inside] = across(time, x, int(i), grid.origin + grid.dt * at[inside])
+    speeds = None if v is None else _interpolated(at, k, v)
+    return first, places, speeds, filled, between & ~filled & (away > UNEVEN)
+
+
+def _interpolated(at: np.ndarray, k: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, k, column) for column in values.T], -1)
+
+
+def _numbers(
+    ids: np.ndarray, time: np.ndarray, x: np.ndarray, other: np.ndarray, hole: np.ndarray, name: str
+) -> np.ndarray:
+    """Each row's agent among those of its identifier, counted from 1."""
+    new = given_anew(time, x, other, hole)
+    if new.any():
+        row = int(np.flatnonzero(new)[0]) + 1
+        log.info(
+            "%s: %d identifiers are used again for another vehicle, after a time or over a "
+            "distance that are none of one vehicle (such as %s, another one from %g s on); "
+            "data.agents=global takes them as they stand",
+            name, len(set(ids[1:][new])), ids[row], time[row],
+        )  # fmt: skip
+    so_far = np.concatenate([[0], np.cumsum(new)])
+    start = np.concatenate([[0], np.where(other, np.arange(1, len(ids)), 0)])
+    return np.asarray(1 + so_far - so_far[np.maximum.accumulate(start)])
+
+
+def _smoothed(
+    time: np.ndarray, x: np.ndarray, ends: np.ndarray, window: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and speeds of local cubics, every record without a long hole by itself."""
+    x, v = x.copy(), np.empty_like(x)
+    for rows in np.split(np.arange(len(time)), np.flatnonzero(ends) + 1):
+        for d in range(x.shape[1]):
+            x[rows, d], v[rows, d] = smooth(time[rows], x[rows, d], window)
+    # a vehicle that stands shall not roll back
+    return x, np.maximum(v, 0.0) if x.shape[1] == 1 else v

@@ -1,0 +1,1 @@
+"""Public benchmarks of prediction: people behind automated cars, and people in open scenes."""

@@ -1,0 +1,114 @@
+"""Data as they come: how a table is written down, and where its origin lies, changes no result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.interpolate import CubicSpline
+
+import nnode
+from tests.app.following import table
+
+#: The same platoons in other words: what changes, and the options that go with it.
+Form = Callable[[pd.DataFrame], pd.DataFrame]
+STAMP = pd.Timestamp("2024-05-06 07:08:09")
+
+
+def at_map_coordinates(t: pd.DataFrame) -> pd.DataFrame:
+    return t.assign(x=t.x + 5_340_000.0)
+
+
+def later(t: pd.DataFrame) -> pd.DataFrame:
+    return t.assign(time=t.time + 1000.0)
+
+
+def with_dates(t: pd.DataFrame) -> pd.DataFrame:
+    return t.assign(time=STAMP + pd.to_timedelta(t.time, unit="s"))
+
+
+def with_clock_times(t: pd.DataFrame) -> pd.DataFrame:
+    return t.assign(time=[(STAMP + pd.Timedelta(s, "s")).strftime("%H:%M:%S.%f") for s in t.time])
+
+
+def in_nanoseconds(t: pd.DataFrame) -> pd.DataFrame:
+    since = STAMP.value + (t.time * 1e9).round().astype("int64")
+    return t.assign(time=since)
+
+
+def renamed(t: pd.DataFrame) -> pd.DataFrame:
+    # in the order of the names before, so that clusters are drawn alike
+    return t.assign(
+        agent="car no. " + t.agent.astype(str), sequence="run " + t.sequence.astype(str)
+    )
+
+
+def shuffled(t: pd.DataFrame) -> pd.DataFrame:
+    return t.sample(frac=1.0, random_state=5)
+
+
+def in_feet(t: pd.DataFrame) -> pd.DataFrame:
+    return t.assign(x=t.x / 0.3048, length=t.length / 0.3048)
+
+
+def in_frames(t: pd.DataFrame) -> pd.DataFrame:
+    return t.assign(time=(t.time / 0.1).round().astype(int))
+
+
+OPTIONS = {
+    in_nanoseconds: {"time_unit": "ns"},
+    in_feet: {"position_unit": "ft"},
+    in_frames: {"time_unit": "frame", "frame_rate": 10.0},
+}
+FORMS: list[Form] = [
+    at_map_coordinates, later, with_dates, with_clock_times, in_nanoseconds, renamed, shuffled,
+    in_feet, in_frames,
+]  # fmt: skip
+
+
+def fitted(given: nnode.Sequences) -> pd.DataFrame:
+    found: pd.DataFrame = nnode.Calibrator("idm", epochs=6).fit(given).parameters_
+    return found
+
+
+@pytest.fixture(scope="module")
+def platoons() -> pd.DataFrame:
+    return table(platoons=3, seconds=6.0)
+
+
+@pytest.fixture(scope="module")
+def known(platoons: pd.DataFrame) -> pd.DataFrame:
+    return fitted(nnode.sequences(platoons))
+
+
+@pytest.mark.parametrize("form", FORMS, ids=lambda form: form.__name__)
+def test_a_fit_does_not_depend_on_how_the_table_is_written(
+    platoons: pd.DataFrame, known: pd.DataFrame, form: Form
+) -> None:
+    found = fitted(nnode.sequences(form(platoons), **OPTIONS.get(form, {})))
+    # at a map's coordinates positions have lost the digits below 1e-9 m
+    np.testing.assert_allclose(found.estimate, known.estimate, rtol=1e-5)
+
+
+def test_samples_that_are_missing_or_late_hardly_change_a_fit(
+    platoons: pd.DataFrame, known: pd.DataFrame
+) -> None:
+    """2 % of the rows are missing; times jitter by up to 0.01 s, and positions with them."""
+    rng = np.random.default_rng(8)
+    lacking = platoons[rng.random(len(platoons)) > 0.02]
+    given = nnode.sequences(lacking)
+    assert sum(s.filled for s in given) > 0
+    found = fitted(given)
+    parts = []
+    for _, own in platoons.groupby(["sequence", "agent"]):
+        late = np.where(own.time.between(0.2, 5.8), rng.uniform(-0.01, 0.01, len(own)), 0.0)
+        path = CubicSpline(own.time, own.x)
+        parts.append(own.assign(time=own.time + late, x=path(own.time + late)))
+    jitter = pd.concat(parts)
+    given = nnode.sequences(jitter)
+    assert "times are uneven" in given.manifest["notes"][0]
+    for one in (found, fitted(given)):
+        for name in ("idm.T", "idm.s0"):
+            assert one.estimate[name] == pytest.approx(known.estimate[name], rel=0.1)
