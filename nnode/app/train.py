@@ -14,7 +14,7 @@ from nnode.app.cli.runs import RESULT
 from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver, check, model_of, trainer_of
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.interrupt import Interrupted
 from nnode.calibrate.options import TrainerOptions
@@ -44,6 +44,8 @@ RESUMABLE = (
 )
 #: Table of each sequence's own parameters, of ``trainer.pooling``.
 OWN = "own_parameters.csv"
+#: Table of drivers, of ``trainer.drivers``.
+DRIVERS = "drivers.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
 
 
@@ -98,6 +100,10 @@ def train(config: DictConfig, folder: Path) -> None:
         "best checkpoint": trainer.best_path,
         "last checkpoint": trainer.last_path,
     }
+    if result.drivers is not None:
+        save_checkpoint(result.checkpoint, trainer.best_path)
+        paths["drivers"] = folder / DRIVERS
+        write_text(folder / DRIVERS, csv_text(result.drivers.table))
     if result.own is not None:
         paths["own parameters"] = folder / OWN
         write_text(folder / OWN, csv_text(result.own))

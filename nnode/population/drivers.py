@@ -9,11 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model.system import System
 from nnode.population.estimate import Estimate, Variances, estimate, fit_variances
 from nnode.population.followers import MODES, Followers, Paths, score_bias
 from nnode.population.likelihood import Marginal, PushNoise, marginal
+from nnode.simulation.rhs import formula_of
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
@@ -32,6 +34,10 @@ LONGEST, TOLERANCE = 0.3, 1e-2
 #: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
 #: estimate's standard error.
 PAIRS = 2
+#: Fewer followers say nothing of how drivers differ.
+LEAST_DRIVERS = 5
+#: s, longest step of the simulations, by the Runge-Kutta method of fourth order.
+STEP = 0.2
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +97,28 @@ def fit_drivers(
         model = Followers(system, paths, names) if names else plain
         found = _estimated(model, noise)
     return _corrected(found, np.random.default_rng(seed), pairs) if pairs else found
+
+
+def obstacle(system: System, sequences: list[Sequence]) -> str | None:
+    """Why drivers who differ have no place in a model or in its data; None: they have."""
+    physical = sum(value.numel() for value, _ in system.physical().values())
+    if system.domain != "traffic":
+        return "people meet everybody in their sequence, and only cars follow measured leaders"
+    if sum(p.numel() for p in system.parameters() if p.requires_grad) > physical:
+        return "the model contains a network, whose weights are no quantities of a driver"
+    lane = formula_of(system)
+    if lane is None:
+        return "the model is no formula of a lane"
+    if any(name not in ("x", "v") for name, _ in lane.ahead):
+        return "the model reads what other drivers remember, which was not measured"
+    if "dt" in getattr(system.formula, "symbols", ()):
+        return "the law is a map from step to step"
+    number = sum(s.n_agents - 1 for s in sequences)
+    if number < LEAST_DRIVERS:
+        return f"there are {number} followers behind measured leaders, fewer than {LEAST_DRIVERS}"
+    if not np.ptp([s.dt for s in sequences]) < 1e-6:
+        return "the sequences have different sampling intervals"
+    return None
 
 
 def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
