@@ -297,9 +297,6 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
     found, own, speeds = _by_tangents(trainer, model, store)
-    status = _status(trainer, model, store)
-    if status == "stalled":
-        log.warning("%s", STALLED)
     # an epoch of an older checkpoint that was resumed may know its parameters by other names
     known = {name: best.get(f"parameters/{name}") for name in model.physical()}
     values = {name: value for name, value in known.items() if value is not None}
@@ -313,6 +310,11 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         costs = {part: _cost(trainer, model, part) for part in costs}
         speeds = {k: v for k, v in speeds.items() if k not in ("change", "sequences")}
         speeds["kind"] = "fitted to each driver"
+        status = "converged" if drivers.converged else "stopped"
+    else:
+        status = _status(trainer, model, store)
+    if status == "stalled":
+        log.warning("%s", STALLED)
     told = found.get("parameters", {})
     rows = {
         name: _row(values[name], unit, told.get(name))
@@ -353,7 +355,7 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     The search starts at the last state of the training, which a run that is resumed has as well.
     """
     drivers = trainer.options.drivers
-    if drivers in (None, NONE):
+    if drivers == NONE:
         return None
     names = trainer.provenance.split["train"]
     if drivers == AUTO:

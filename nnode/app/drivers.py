@@ -7,17 +7,17 @@ import logging
 from collections.abc import Callable
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
 
 from nnode.calibrate.options import Pooling, TrainerOptions
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model import System
-from nnode.model.laws import CAR_FOLLOWING_LAWS, Law
-from nnode.model.term import short_names
+from nnode.model.term import Term, short_names
 
 if TYPE_CHECKING:
     from nnode.population.drivers import Population
@@ -28,19 +28,17 @@ AUTO, NONE = "auto", "none"
 #: m, root mean square error of pooled parameters below which paths are explained exactly, as those
 #: of a model's own simulation are.
 EXACT = 0.01
+#: Share of the admissible interval that searches start away from its ends.
+INSIDE = 0.01
 
 
 def planned(
-    options: TrainerOptions,
-    model: System,
-    optimizer: str,
-    sequences: Callable[[], list[Sequence]],
+    options: TrainerOptions, model: System, sequences: Callable[[], list[Sequence]]
 ) -> str | list[str]:
     """What is done about drivers who differ: ``auto``, ``none``, or names of parameters.
 
     Args:
         options: of the trainer, as they were given.
-        optimizer: its name.
         sequences: reads those of the training.
 
     Raises:
@@ -48,19 +46,15 @@ def planned(
             where they have no place.
     """
     given = options.drivers
-    law = model.terms[0] if len(model.terms) else None
-    if given is None:
-        if not isinstance(law, Law) or law.name not in CAR_FOLLOWING_LAWS:
-            return NONE
-    elif given not in (AUTO, NONE) and not _names(given):
+    if given == NONE:
+        return NONE
+    if given != AUTO and not _names(given):
         raise ConfigError(
             f"trainer.drivers={given} is unknown, expected auto, none, or a list of parameters of "
             "the law such as [T, v0]"
         )
-    if given == NONE:
-        return NONE
     asked = f"trainer.drivers={_words(given)}"
-    if given is not None and options.pooling is not Pooling.pooled:
+    if options.pooling is not Pooling.pooled:
         raise ConfigError(
             f"{asked} and trainer.pooling={options.pooling.value} both give drivers parameters of "
             "their own; choose one of them"
@@ -68,18 +62,12 @@ def planned(
     from nnode.population.drivers import known_names, obstacle  # compiled code takes a second
 
     reason = obstacle(model, sequences())
-    if reason is not None and given is not None:
-        raise ConfigError(f"{asked} has no place here: {reason}; take trainer.drivers=none")
-    if given is None:
-        reason = reason or _least_squares(options, optimizer)
     if reason is not None:
-        log.info("all drivers share their parameters: %s", reason)
-        return NONE
-    if given in (None, AUTO):
+        raise ConfigError(f"{asked} has no place here: {reason}; take trainer.drivers=none")
+    if given == AUTO:
         return AUTO
-    assert isinstance(law, Law)
-    own = [name for name in model.physical() if name.startswith(f"{law.name}.")]
-    known_names(given, own)
+    law = cast(Term, model.terms[0])
+    known_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
     return list(given)
 
 
@@ -91,16 +79,6 @@ def _names(given: Any) -> bool:
 
 def _words(given: Any) -> str:
     return f"[{', '.join(given)}]" if _names(given) else str(given)
-
-
-def _least_squares(options: TrainerOptions, optimizer: str) -> str | None:
-    """The first option that asks for the least squares of all drivers together."""
-    usual = TrainerOptions()
-    for name in ("pooling", "start_speeds", "cost"):
-        value = getattr(options, name)
-        if value is not getattr(usual, name):
-            return f"trainer.{name}={value.value}"
-    return None if optimizer == "gauss_newton" else f"optimizer={optimizer}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +94,7 @@ class Drivers:
         differ: short names of the parameters that differ between drivers.
         variability: see :class:`nnode.app.calibration.Calibration`.
         table: the same.
+        converged: whether the estimation did.
         bias: of the parameters by short name, by how much they were corrected, as a share where
             they are positive.
     """
@@ -127,6 +106,7 @@ class Drivers:
     differ: list[str]
     variability: pd.DataFrame
     table: pd.DataFrame
+    converged: bool
     bias: dict[str, float]
 
     def summary(self) -> list[str]:
@@ -150,6 +130,7 @@ class Drivers:
             "differ": self.differ,
             "variability": {str(name): row for name, row in rows.items()},
             "bias": self.bias,
+            "converged": self.converged,
             "table": self.table.to_dict("records"),
         }
 
@@ -178,10 +159,19 @@ def calibrated_drivers(
     from nnode.population.followers import paths_of
 
     double = copy.deepcopy(model).double()
+    vector = ParameterVector(double)
+    low, high = vector.bounds
+    inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
+    vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
     found = fit_drivers(double, paths_of(sequences, STEP), drivers, seed=seed)
+    if not found.estimate.converged:
+        log.warning(
+            "the estimation of drivers who differ did not converge: take another law, fewer "
+            "parameters that differ (trainer.drivers=[T]), or trainer.drivers=none"
+        )
     followers, theta = found.model, found.estimate.theta
     row = followers.natural(theta)
-    followers.vector.fill_(row)
+    vector.fill_(row)
     whole = copy.deepcopy(model)
     whole.load_state_dict({k: v.to(whole.state_dict()[k]) for k, v in double.state_dict().items()})
     parameters, correlation, number = _intervals(found, cluster)
@@ -194,6 +184,7 @@ def calibrated_drivers(
         differ=[short[name] for name in found.random],
         variability=_variability(found),
         table=_table(found, sequences),
+        converged=found.estimate.converged,
         bias={
             short[name]: float(np.expm1(bias) if in_logs else bias)
             for name, bias, in_logs in zip(followers.names, found.bias, followers.logs, strict=True)

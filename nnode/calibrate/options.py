@@ -111,10 +111,9 @@ class TrainerOptions:
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
     pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
-    # auto | none | [T, v0]: parameters that differ between drivers, see nnode.population; auto: of
-    # which the data tell so; null: auto for laws of the field that gauss_newton calibrates to
-    # positions, otherwise none
-    drivers: Any = None
+    # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
+    # those of which the data tell how they differ
+    drivers: Any = "none"
     # auto | given | fitted: first speeds of training sequences, those of the data, or the best;
     # auto: as the noise of the measurement asks for
     start_speeds: StartSpeeds = StartSpeeds.auto

@@ -56,9 +56,9 @@ class Calibrator:
         effects: beside it, names or ``{"name": ..., parameter: value}``.
         leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
-        drivers: ``auto``, ``none`` or names of parameters such as ``["T", "v0"]``, which differ
-            between drivers; ``auto``: those of which the data tell how they differ; None: ``auto``
-            for the field's laws, ``none`` for all others. See ``docs/method.md``.
+        drivers: ``none``, ``auto`` or names of parameters such as ``["T", "v0"]``, which differ
+            between drivers; ``auto``: those of which the data tell how they differ. Laws of lanes
+            are then calibrated by a mixed-effects model, see ``docs/method.md``.
         pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
             pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
         start_speeds: ``auto``, ``given``, or ``fitted`` beside the parameters to each training
@@ -86,7 +86,7 @@ class Calibrator:
     effects: ListLike[str | Mapping[str, Any]] = ()
     leader: str | None = None
     cost: str = "integral"
-    drivers: str | ListLike[str] | None = None
+    drivers: str | ListLike[str] = "none"
     pooling: str = "pooled"
     start_speeds: str = "auto"
     optimizer: str | Mapping[str, Any] | None = None
@@ -226,8 +226,8 @@ class Calibrator:
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
         trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
-        words = self.drivers is None or isinstance(self.drivers, str)
-        trainer["drivers"] = self.drivers if words else list(self.drivers or ())
+        named = isinstance(self.drivers, str)
+        trainer["drivers"] = self.drivers if named else list(self.drivers)
         trainer |= {"pooling": self.pooling, "start_speeds": self.start_speeds}
         trainer["device"] = Device.cpu.value
         data = OmegaConf.structured(data_of(given))
@@ -285,7 +285,7 @@ def fit(
     model: str | Mapping[str, Any] | System = "lin",
     walls: str | Path | None = None,
     leader: str | None = None,
-    drivers: str | ListLike[str] | None = None,
+    drivers: str | ListLike[str] = "none",
     epochs: int = 100,
     heldout: float = 0.2,
     seed: int = 0,
