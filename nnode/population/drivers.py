@@ -86,9 +86,17 @@ def fit_drivers(
             estimates are not corrected.
 
     Raises:
-        ConfigError: a name that the law does not have, or a model without a formula.
+        ConfigError: a name that the law does not have, a model without a formula, or simulations
+            that blow up.
     """
     plain, noise = Followers(system, paths), PushNoise(paths.error)
+    begin = plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0)))
+    if not np.isfinite(begin.columns).all():
+        raise ConfigError(
+            "drivers who differ: followers behind their measured leaders are not simulated to "
+            f"finite positions in steps of {2 * paths.half:g} s; start from other parameters, or "
+            "take drivers=none"
+        )
     law = [name for name, own in zip(plain.names, plain.logs & plain.law, strict=True) if own]
     if drivers == "auto":
         found = _differing(plain, law, noise)
