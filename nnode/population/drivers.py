@@ -19,6 +19,8 @@ from nnode.simulation.rhs import formula_of
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
+#: Share of an upper bound that an estimate is away from it at least; one that is nearer is none.
+NEAR = 1e-3
 #: A parameter differs between drivers if the data leave less than this share of its variance, in
 #: the median over drivers.
 SHRINKAGE = 0.7
@@ -208,26 +210,26 @@ def _better(best: Population, names: list[str], price: float) -> Population | No
             break
         system, paths = best.model.system, best.model.paths
         found = _estimated(Followers(system, paths, [*best.random, name]), best.noise, best)
-        if _differs(found.marginal) and found.marginal.loglik > limit:
+        if _differs(found.estimate) and found.marginal.loglik > limit:
             return found
     return None
 
 
 def _linearised(best: Population, name: str) -> float:
     """The logarithm of the marginal likelihood with one more parameter that differs, the samples'
-    linearisation kept; minus infinity where the data do not tell how it differs."""
+    linearisation kept."""
     model, found = best.model, best.estimate
     random = [*model.random, model.names.index(name)]
     data = replace(found.data, random=found.data.fixed[..., random])
     variances = fit_variances(data, best.noise, _widened(found.variances), tolerance=TOLERANCE)
     products = best.noise.products(data, variances.noise)
-    there = marginal(data, products, variances.spread, variances.start)
-    return there.loglik if _differs(there) else -math.inf
+    return marginal(data, products, variances.spread, variances.start).loglik
 
 
-def _differs(found: Marginal) -> bool:
+def _differs(found: Estimate) -> bool:
     """Whether the data tell how each of the parameters differs."""
-    return bool((np.median(found.shrinkage, 0) < SHRINKAGE).all())
+    told = np.median(found.marginal.shrinkage, 0) < SHRINKAGE
+    return bool((told & (found.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
 
 
 def _variances(model: Followers) -> Variances:

@@ -160,3 +160,18 @@ def test_a_run_that_is_stopped_while_drivers_are_told_apart_goes_on(
     for name, row in fitted.parameters_.iterrows():
         assert written[name]["value"] == pytest.approx(row["estimate"], rel=1e-9)
         assert written[name]["value"] != float(before[name][0])
+
+
+@pytest.mark.thorough
+def test_drivers_of_noisy_positions_are_told_apart() -> None:
+    """Twenty platoons of five cars, whose positions a satellite's receiver measures."""
+    differ = {"T": 0.15, "v0": 0.15}
+    measured, _ = table(201, platoons=20, cars=5, seconds=60.0, noise=0.3, differ=differ)
+    found = nnode.fit(measured, model="idm", drivers="auto", heldout=0.0)
+    assert found.drivers is not None
+    assert sorted(found.drivers.differ) == ["T", "v0"]
+    values = found.parameters.estimate
+    for name in ("T", "v0"):
+        assert values[f"idm.{name}"] == pytest.approx(TRUE[name], rel=0.05)
+        assert 12 < found.drivers.variability.estimate[name] < 18
+    assert values["idm.s0"] == pytest.approx(TRUE["s0"], abs=0.5)
