@@ -85,7 +85,7 @@ def fit_drivers(
             as ``T``.
         seed: of the simulations that tell the bias.
         pairs: of these simulations, see :func:`nnode.population.followers.score_bias`; 0: the
-            estimates are not corrected.
+            estimates are not corrected, nor are those that did not converge.
 
     Raises:
         ConfigError: a name that the law does not have, a model without a formula, or simulations
@@ -106,7 +106,8 @@ def fit_drivers(
         names = [] if drivers == "none" else known_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
         found = _estimated(model, noise)
-    return _corrected(found, np.random.default_rng(seed), pairs) if pairs else found
+    sound = pairs > 0 and found.estimate.converged
+    return _corrected(found, np.random.default_rng(seed), pairs) if sound else found
 
 
 def obstacle(system: System, sequences: list[Sequence]) -> str | None:
