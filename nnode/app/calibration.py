@@ -352,7 +352,8 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
 def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     """What the data tell of drivers who differ, where that is asked for.
 
-    The search starts at the last state of the training, which a run that is resumed has as well.
+    Searches start at the last state of the training and at its first, which a run that is resumed
+    has as well.
     """
     drivers = trainer.options.drivers
     if drivers == NONE:
@@ -369,9 +370,11 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in names]
     log.info("calibrating to %d sequences with drivers who differ", len(indices))
-    seed = int(trainer.provenance.config["seed"])
+    seed, row = int(trainer.provenance.config["seed"]), trainer.history[0]
+    known = {name: row.get(f"parameters/{name}") for name in trainer.model.physical()}
+    first = {name: value for name, value in known.items() if value is not None}
     return calibrated_drivers(
-        copy.deepcopy(trainer.model).cpu(), [store[i] for i in indices], drivers,
+        copy.deepcopy(trainer.model).cpu(), first, [store[i] for i in indices], drivers,
         clusters(store.index)[indices], seed,
     )  # fmt: skip
 

@@ -6,7 +6,7 @@ import copy
 import logging
 from collections.abc import Callable
 from collections.abc import Sequence as ListLike
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -28,6 +28,9 @@ AUTO, NONE = "auto", "none"
 #: m, root mean square error of pooled parameters below which paths are explained exactly, as those
 #: of a model's own simulation are.
 EXACT = 0.01
+#: m, errors of measurement of positions that were smoothed before. Smoothing leaves errors that
+#: last over samples, and models take them for pushes if errors are assumed to be small.
+SMOOTHED = 0.1
 #: Share of the admissible interval that searches start away from its ends.
 INSIDE = 0.01
 
@@ -141,13 +144,14 @@ def _estimate(row: pd.Series) -> str:
 
 
 def calibrated_drivers(
-    model: System, sequences: list[Sequence], drivers: str | list[str], cluster: np.ndarray,
-    seed: int,
+    model: System, first: dict[str, float], sequences: list[Sequence], drivers: str | list[str],
+    cluster: np.ndarray, seed: int,
 ) -> Drivers:  # fmt: skip
     """Calibrate to drivers who differ.
 
     Args:
-        model: where the search starts.
+        model: where one search starts.
+        first: parameters by address, where another search starts.
         drivers: see :func:`planned`.
         cluster: ``(S,)`` of each sequence, see :func:`nnode.data.clusters.clusters`.
         seed: of the simulations that tell the bias.
@@ -156,14 +160,21 @@ def calibrated_drivers(
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
     """
     from nnode.population.drivers import STEP, fit_drivers  # compiled code takes a second
-    from nnode.population.followers import paths_of
+    from nnode.population.followers import FLOOR, paths_of
 
     double = copy.deepcopy(model).double()
     vector = ParameterVector(double)
     low, high = vector.bounds
     inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
     vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
-    found = fit_drivers(double, paths_of(sequences, STEP), drivers, seed=seed)
+    paths = paths_of(sequences, STEP)
+    if paths.error <= FLOOR:
+        log.info(
+            "positions show no errors that are new at every sample, so that they were smoothed: "
+            "errors of %g m are assumed", SMOOTHED,
+        )  # fmt: skip
+        paths = replace(paths, error=SMOOTHED)
+    found = fit_drivers(double, paths, drivers, first, seed=seed)
     if not found.estimate.converged:
         log.warning(
             "the estimation of drivers who differ did not converge: take another law, fewer "

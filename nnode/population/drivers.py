@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,16 +73,18 @@ class Population:
 
 
 def fit_drivers(
-    system: System, paths: Paths, drivers: str | Iterable[str] = "auto", *, seed: int = 0,
-    pairs: int = PAIRS,
+    system: System, paths: Paths, drivers: str | Iterable[str] = "auto",
+    first: Mapping[str, float] | None = None, *, seed: int = 0, pairs: int = PAIRS,
 ) -> Population:  # fmt: skip
     """Calibrate a law to drivers who differ.
 
     Args:
-        system: the law, with effects; searches start at its parameters.
+        system: the law, with effects; a search starts at its parameters.
         paths: the followers.
         drivers: ``auto``: parameters of which the data tell how they differ; ``none``; or names,
             as ``T``.
+        first: parameters by name, as ``idm.T``, where another search starts; that which ends at
+            the larger likelihood counts.
         seed: of the simulations that tell the bias.
         pairs: of these simulations, see :func:`nnode.population.followers.score_bias`; 0: the
             estimates are not corrected, nor are those that did not converge.
@@ -99,13 +101,16 @@ def fit_drivers(
             f"finite positions in steps of {2 * paths.half:g} s; start from other parameters, or "
             "take drivers=none"
         )
+    row = plain.natural(plain.start)
+    other = [(first or {}).get(n, v) for n, v in zip(plain.names, row, strict=True)]
+    starts = [plain.start] if first is None else [plain.start, plain.at(np.array(other))]
     law = [name for name, own in zip(plain.names, plain.logs & plain.law, strict=True) if own]
     if drivers == "auto":
-        found = _differing(plain, law, noise)
+        found = _differing(plain, law, noise, starts)
     else:
         names = [] if drivers == "none" else known_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
-        found = _estimated(model, noise)
+        found = _best(model, noise, starts)
     sound = pairs > 0 and found.estimate.converged
     return _corrected(found, np.random.default_rng(seed), pairs) if sound else found
 
@@ -171,15 +176,10 @@ def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Popul
     return replace(found, estimate=there, bias=before.theta - theta)
 
 
-def _estimated(model: Followers, noise: PushNoise, begin: Population | None = None) -> Population:
-    """The estimate of a model.
-
-    Args:
-        begin: that with one parameter less that differs, where the search starts.
-    """
-    theta, variances = model.start, _variances(model)
-    if begin is not None:
-        theta, variances = begin.estimate.theta, _widened(begin.estimate.variances)
+def _estimated(
+    model: Followers, noise: PushNoise, theta: np.ndarray, variances: Variances
+) -> Population:
+    """The estimate of a model; the search starts at parameters and standard deviations."""
     found = estimate(
         model, noise, theta, variances, low=model.low, high=model.high,
         longest=LONGEST, tolerance=TOLERANCE,
@@ -187,7 +187,15 @@ def _estimated(model: Followers, noise: PushNoise, begin: Population | None = No
     return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
 
 
-def _differing(plain: Followers, names: list[str], noise: PushNoise) -> Population:
+def _best(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
+    """The estimate of a model from several starts, that of the largest likelihood."""
+    found = [_estimated(model, noise, theta, _variances(model)) for theta in starts]
+    return max(found, key=lambda one: one.marginal.loglik)
+
+
+def _differing(
+    plain: Followers, names: list[str], noise: PushNoise, starts: list[np.ndarray]
+) -> Population:
     """The law with those parameters that differ between drivers, as far as the data tell.
 
     Parameters are added one after the other, while twice the logarithm of the marginal likelihood
@@ -195,7 +203,7 @@ def _differing(plain: Followers, names: list[str], noise: PushNoise) -> Populati
     ranked by the marginal likelihood of the samples as they are linearised without them, with
     variances of their own; only the best is then estimated.
     """
-    best = _estimated(plain, noise)
+    best = _best(plain, noise, starts)
     price = math.log(max(len(plain.paths.names), 2)) / 2
     while (better := _better(best, names, price)) is not None:
         best = better
@@ -210,7 +218,8 @@ def _better(best: Population, names: list[str], price: float) -> Population | No
         if value <= limit:
             break
         system, paths = best.model.system, best.model.paths
-        found = _estimated(Followers(system, paths, [*best.random, name]), best.noise, best)
+        model, before = Followers(system, paths, [*best.random, name]), best.estimate
+        found = _estimated(model, best.noise, before.theta, _widened(before.variances))
         if _differs(found.estimate) and found.marginal.loglik > limit:
             return found
     return None
