@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import copy
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
+from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
 from nnode.app.training import straight_loader, stream
-from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
-from nnode.calibrate.evaluate import sensitivity
+from nnode.calibrate.checkpoint import Checkpoint, copied, save_checkpoint
+from nnode.calibrate.evaluate import Metrics, evaluate, sensitivity
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
@@ -49,6 +50,8 @@ _MOVED = 1e-4
 #: Share of the first cost below which the data are fitted without any error, as those of a model's
 #: own simulation are: relative changes of such a cost say nothing.
 _EXACT = 1e-6
+#: Sequences that are simulated at once.
+_TOGETHER = 32
 STALLED = (
     "the line search stalled: the last epoch found no lower cost, although the gradient is not 0; "
     "these parameters may be no minimum. Start from other parameters, or take "
@@ -78,6 +81,13 @@ class Calibration:
             row per sequence with ``cost_pool`` (with those of all) and ``cost``; None: there are
             none. ``parameters`` and ``cost_heldout`` are the pool's, which another sequence gets.
         pooling: how they came about, and costs of second halves, which they were not calibrated on.
+        drivers: what was found of drivers who differ, with ``drivers.variability``: standard
+            deviations of parameters between drivers (%, of logarithms), of the pushes that disturb
+            them (m/s or m/s²) and of the errors of measurement (m), and the time that pushes last
+            (s), with intervals of 95 %; and ``drivers.table``: a row per driver with the own
+            parameters, their standard errors, and ``shrinkage``, the share of the variance between
+            drivers that the driver's data leave. ``parameters`` are then the medians over drivers.
+            None: all drivers share their parameters.
         start_speeds: ``kind``, measured, smoothed or fitted; of fitted ones ``sequences``, first
             speeds (m/s) by vehicle, and their root mean square ``change`` from those that
             simulations start with otherwise.
@@ -105,6 +115,7 @@ class Calibration:
     history: pd.DataFrame
     own: pd.DataFrame | None
     pooling: dict[str, Any]
+    drivers: Drivers | None
     start_speeds: dict[str, Any]
     noise: Noise
     filled: int
@@ -144,6 +155,8 @@ class Calibration:
                 + ", ".join(f"{k} {v:.4g}" for k, v in self.pooling["second_half"].items())
                 + f" {unit}; another sequence gets the pool's parameters"
             )
+        if self.drivers is not None:
+            lines += self.drivers.summary()
         if self.clusters == 1:
             lines.append(
                 "no intervals: the training sequences are one cluster, of those that share agents "
@@ -244,6 +257,8 @@ class Calibration:
             found["clusters"] = self.clusters
         if self.own is not None:
             found["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
+        if self.drivers is not None:
+            found["drivers"] = self.drivers.plain()
         found["start_speeds"] = self.start_speeds
         found["noise"], found["filled"] = self.noise.plain(), self.filled
         found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
@@ -282,15 +297,29 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
     found, own, speeds = _by_tangents(trainer, model, store)
-    status = _status(trainer, model, store)
+    # an epoch of an older checkpoint that was resumed may know its parameters by other names
+    known = {name: best.get(f"parameters/{name}") for name in model.physical()}
+    values = {name: value for name, value in known.items() if value is not None}
+    costs = {part: best.get(f"cost/{part}", float("nan")) for part in ("train", "heldout")}
+    drivers = _drivers(trainer, store)
+    if drivers is not None:
+        model = drivers.model
+        found = {key: getattr(drivers, key) for key in ("parameters", "correlation", "clusters")}
+        checkpoint = replace(checkpoint, model=copied(dict(model.state_dict())))
+        values = {name: float(value) for name, (value, _) in model.physical().items()}
+        costs = {part: _cost(trainer, model, part) for part in costs}
+        speeds = {k: v for k, v in speeds.items() if k not in ("change", "sequences")}
+        speeds["kind"] = "fitted to each driver"
+        status = "converged" if drivers.converged else "stopped"
+    else:
+        status = _status(trainer, model, store)
     if status == "stalled":
         log.warning("%s", STALLED)
-    known = found.get("parameters", {})
-    # an epoch of an older checkpoint that was resumed may know its parameters by other names
+    told = found.get("parameters", {})
     rows = {
-        name: _row(best[f"parameters/{name}"], unit, known.get(name))
+        name: _row(values[name], unit, told.get(name))
         for name, (_, unit) in model.physical().items()
-        if f"parameters/{name}" in best
+        if name in values
     }
     columns = ["estimate", "lower", "upper", "unit", "at_bound", "identified"]
     correlation = found.get("correlation")
@@ -299,9 +328,9 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         parameters=pd.DataFrame.from_dict(rows, orient="index", columns=columns),
         correlation=None if correlation is None else pd.DataFrame.from_dict(correlation, "index"),
         clusters=found.get("clusters"),
-        cost=best["cost/train"],
+        cost=costs["train"],
         cost_start=first["cost/train"],
-        cost_heldout=best.get("cost/heldout", float("nan")),
+        cost_heldout=costs["heldout"],
         heldout_start=first.get("cost/heldout", float("nan")),
         cost_unit=trainer.options.cost.unit,
         epoch=trainer.best_epoch,
@@ -309,6 +338,7 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         history=pd.DataFrame(history),
         own=None if own is None else own.table,
         pooling=own.facts if own else {},
+        drivers=drivers,
         start_speeds=speeds,
         noise=noise_of(store),
         filled=sum(one["samples"] for one in store.manifest.get("filled", [])),
@@ -317,6 +347,52 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         seconds=seconds,
         checkpoint=checkpoint,
     )
+
+
+def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
+    """What the data tell of drivers who differ, where that is asked for.
+
+    Searches start at the last state of the training and at its first, which a run that is resumed
+    has as well.
+    """
+    drivers = trainer.options.drivers
+    if drivers == NONE:
+        return None
+    names = trainer.provenance.split["train"]
+    if drivers == AUTO:
+        rmse = _metrics(trainer, trainer.model, "train").rmse
+        if rmse <= EXACT:
+            log.info(
+                "all drivers share their parameters, which explain the paths to %.2g m "
+                "(root mean square)", rmse,
+            )  # fmt: skip
+            return None
+    places = {entry["name"]: i for i, entry in enumerate(store.index)}
+    indices = [places[name] for name in names]
+    log.info("calibrating to %d sequences with drivers who differ", len(indices))
+    seed, row = int(trainer.provenance.config["seed"]), trainer.history[0]
+    known = {name: row.get(f"parameters/{name}") for name in trainer.model.physical()}
+    first = {name: value for name, value in known.items() if value is not None}
+    return calibrated_drivers(
+        copy.deepcopy(trainer.model).cpu(), first, [store[i] for i in indices], drivers,
+        clusters(store.index)[indices], seed,
+    )  # fmt: skip
+
+
+def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
+    """Errors of a model on the training or on the held-out sequences."""
+    loader = trainer.train if part == "train" else trainer.heldout
+    assert loader is not None
+    data = cast(SequenceDataset, loader.dataset)
+    batches = stream(straight_loader(data.store, list(data.indices), _TOGETHER), trainer.dtype)
+    return evaluate(lambda b: trainer.solver(model, b), batches, trainer.options.cost)
+
+
+def _cost(trainer: Trainer, model: System, part: str) -> float:
+    """Mean cost of a sequence; NaN where none is held out."""
+    if part == "heldout" and trainer.heldout is None:
+        return float("nan")
+    return _metrics(trainer, model, part).J
 
 
 def _status(trainer: Trainer, model: System, store: Source) -> str:

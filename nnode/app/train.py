@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import logging
+import signal
 import time
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.app.calibration import calibrated
+from nnode.app.calibration import Calibration, calibrated
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.runs import RESULT
 from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver, check, model_of, trainer_of
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.distributed import World
-from nnode.calibrate.interrupt import Interrupted
+from nnode.calibrate.interrupt import BreakingGuard, Interrupted
 from nnode.calibrate.options import TrainerOptions
+from nnode.calibrate.trainer import Trainer
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.store import Store
@@ -44,6 +46,8 @@ RESUMABLE = (
 )
 #: Table of each sequence's own parameters, of ``trainer.pooling``.
 OWN = "own_parameters.csv"
+#: Table of drivers, of ``trainer.drivers``.
+DRIVERS = "drivers.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
 
 
@@ -83,21 +87,23 @@ def train(config: DictConfig, folder: Path) -> None:
     start = time.monotonic()
     try:
         trainer.fit()
+        if not world.first:
+            return
+        result = _result(trainer, store, start)
     except Interrupted as stop:
         again = [shell_override("resume", trainer.last_path)]
         again.append(shell_override("hydra.run.dir", folder))
         command = " ".join([typed("python scripts/train.py"), *again])
         raise Interrupted(f"{stop}\nresume with: {command}", stop.signal) from None
-    if not world.first:
-        return
-    with Stages("results", {"costs and intervals": 1.0}) as stages:
-        stages.begin("costs and intervals")
-        result = calibrated(trainer, store, time.monotonic() - start)
     paths = {
         "tensorboard": folder / "tensorboard",
         "best checkpoint": trainer.best_path,
         "last checkpoint": trainer.last_path,
     }
+    if result.drivers is not None:
+        save_checkpoint(result.checkpoint, trainer.best_path)
+        paths["drivers"] = folder / DRIVERS
+        write_text(folder / DRIVERS, csv_text(result.drivers.table))
     if result.own is not None:
         paths["own parameters"] = folder / OWN
         write_text(folder / OWN, csv_text(result.own))
@@ -106,6 +112,24 @@ def train(config: DictConfig, folder: Path) -> None:
     for what, path in paths.items():
         if path.exists():
             print(f"{what}: {path}")
+
+
+def _result(trainer: Trainer, store: Store, start: float) -> Calibration:
+    """What the training came to.
+
+    Raises:
+        Interrupted: on a signal; the training is in its last checkpoint.
+    """
+    with BreakingGuard() as guard, Stages("results", {"costs and intervals": 1.0}) as stages:
+        stages.begin("costs and intervals")
+        try:
+            return calibrated(trainer, store, time.monotonic() - start)
+        except KeyboardInterrupt:
+            number = guard.requested or signal.SIGINT
+            raise Interrupted(
+                f"stopped by {signal.Signals(number).name} while results were computed; the "
+                f"training is in {trainer.last_path}", number,
+            ) from None  # fmt: skip
 
 
 def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:

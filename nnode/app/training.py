@@ -13,6 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import DataLoader
 
+from nnode.app.drivers import NONE, planned
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
@@ -169,11 +170,15 @@ def trainer_of(
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)
+    _check_same_data(store, checkpoint)
+    parts = _parts(store, data, checkpoint)
+    options.drivers = planned(options, model, lambda: [store[i] for i in parts.train])
     exact = optimizer_options.name == "gauss_newton"
     source: Source = store
     if options.start_speeds is StartSpeeds.auto:
         source = sound_speeds(store, model.domain, model.order)
-        fits = exact and isinstance(source, SmoothSpeeds)
+        # drivers who differ have starts of their own
+        fits = exact and options.drivers == NONE and isinstance(source, SmoothSpeeds)
         options.start_speeds = StartSpeeds.fitted if fits else StartSpeeds.given
     if options.start_speeds is StartSpeeds.fitted and not exact:
         raise ConfigError(
@@ -181,8 +186,6 @@ def trainer_of(
             f"optimizer={optimizer_options.name}; data.start_speeds=smoothed takes any"
         )
     seed = int(config.seed)
-    _check_same_data(store, checkpoint)
-    parts = _parts(store, data, checkpoint)
     loader = make_loader(
         SequenceDataset(source, parts.train),
         data.loader,

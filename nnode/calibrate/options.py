@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -110,6 +111,9 @@ class TrainerOptions:
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
     pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
+    # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
+    # those of which the data tell how they differ
+    drivers: Any = "none"
     # auto | given | fitted: first speeds of training sequences, those of the data, or the best;
     # auto: as the noise of the measurement asks for
     start_speeds: StartSpeeds = StartSpeeds.auto

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model.system import System
 from nnode.population.estimate import Estimate, Variances, estimate, fit_variances
 from nnode.population.followers import MODES, Followers, Paths, score_bias
 from nnode.population.likelihood import Marginal, PushNoise, marginal
+from nnode.simulation.rhs import formula_of
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
+#: Share of an upper bound that an estimate is away from it at least; one that is nearer is none.
+NEAR = 1e-3
 #: A parameter differs between drivers if the data leave less than this share of its variance, in
 #: the median over drivers.
 SHRINKAGE = 0.7
@@ -32,6 +36,10 @@ LONGEST, TOLERANCE = 0.3, 1e-2
 #: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
 #: estimate's standard error.
 PAIRS = 2
+#: Fewer followers say nothing of how drivers differ.
+LEAST_DRIVERS = 5
+#: s, longest step of the simulations, by the Runge-Kutta method of fourth order.
+STEP = 0.2
 
 log = logging.getLogger(__name__)
 
@@ -65,32 +73,68 @@ class Population:
 
 
 def fit_drivers(
-    system: System, paths: Paths, drivers: str | Iterable[str] = "auto", *, seed: int = 0,
-    pairs: int = PAIRS,
+    system: System, paths: Paths, drivers: str | Iterable[str] = "auto",
+    first: Mapping[str, float] | None = None, *, seed: int = 0, pairs: int = PAIRS,
 ) -> Population:  # fmt: skip
     """Calibrate a law to drivers who differ.
 
     Args:
-        system: the law, with effects; searches start at its parameters.
+        system: the law, with effects; a search starts at its parameters.
         paths: the followers.
         drivers: ``auto``: parameters of which the data tell how they differ; ``none``; or names,
             as ``T``.
+        first: parameters by name, as ``idm.T``, where another search starts; that which ends at
+            the larger likelihood counts.
         seed: of the simulations that tell the bias.
         pairs: of these simulations, see :func:`nnode.population.followers.score_bias`; 0: the
-            estimates are not corrected.
+            estimates are not corrected, nor are those that did not converge.
 
     Raises:
-        ConfigError: a name that the law does not have, or a model without a formula.
+        ConfigError: a name that the law does not have, a model without a formula, or simulations
+            that blow up.
     """
     plain, noise = Followers(system, paths), PushNoise(paths.error)
+    begin = plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0)))
+    if not np.isfinite(begin.columns).all():
+        raise ConfigError(
+            "drivers who differ: followers behind their measured leaders are not simulated to "
+            f"finite positions in steps of {2 * paths.half:g} s; start from other parameters, or "
+            "take drivers=none"
+        )
+    row = plain.natural(plain.start)
+    other = [(first or {}).get(n, v) for n, v in zip(plain.names, row, strict=True)]
+    starts = [plain.start] if first is None else [plain.start, plain.at(np.array(other))]
     law = plain.that_may_differ
     if drivers == "auto":
-        found = _differing(_estimated(plain, noise))
+        found = _differing(_best(plain, noise, starts))
     else:
         names = [] if drivers == "none" else known_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
-        found = _estimated(model, noise)
-    return _corrected(found, np.random.default_rng(seed), pairs) if pairs else found
+        found = _best(model, noise, starts)
+    sound = pairs > 0 and found.estimate.converged
+    return _corrected(found, np.random.default_rng(seed), pairs) if sound else found
+
+
+def obstacle(system: System, sequences: list[Sequence]) -> str | None:
+    """Why drivers who differ have no place in a model or in its data; None: they have."""
+    physical = sum(value.numel() for value, _ in system.physical().values())
+    if system.domain != "traffic":
+        return "people meet everybody in their sequence, and only cars follow measured leaders"
+    if sum(p.numel() for p in system.parameters() if p.requires_grad) > physical:
+        return "the model contains a network, whose weights are no quantities of a driver"
+    lane = formula_of(system)
+    if lane is None:
+        return "the model is no formula of a lane"
+    if any(name not in ("x", "v") for name, _ in lane.ahead):
+        return "the model reads what other drivers remember, which was not measured"
+    if "dt" in getattr(system.formula, "symbols", ()):
+        return "the law is a map from step to step"
+    number = sum(s.n_agents - 1 for s in sequences)
+    if number < LEAST_DRIVERS:
+        return f"there are {number} followers behind measured leaders, fewer than {LEAST_DRIVERS}"
+    if not np.ptp([s.dt for s in sequences]) < 1e-6:
+        return "the sequences have different sampling intervals"
+    return None
 
 
 def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) -> Population:
@@ -102,19 +146,18 @@ def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) 
         fixed: only deviations are estimated; parameters are the system's, variances those before.
     """
     model, known = Followers(system, paths, before.random), before.estimate
-    variances, low, high = _started(known.variances, model), model.low, model.high
-    if fixed:
-        variances = replace(variances, low=variances.row, high=variances.row)
-        low = high = model.start
+    variances = _started(known.variances, model)
     same = before.model.paths.names == paths.names
     same &= known.start.shape == (len(paths.agent), model.starts)
+    modes = (known.agents, known.start) if same else (None, None)
+    if not fixed:
+        return _differing(_estimated(model, before.noise, model.start, variances, *modes))
+    theta, there = model.start, replace(variances, low=variances.row, high=variances.row)
     found = estimate(
-        model, before.noise, model.start, variances, low=low, high=high,
-        longest=LONGEST, tolerance=TOLERANCE,
-        agents=known.agents if same else None, start=known.start if same else None,
+        model, before.noise, theta, there, low=theta, high=theta, tolerance=MODES, agents=modes[0],
+        start=modes[1],
     )  # fmt: skip
-    again = replace(before, model=model, estimate=found, bias=np.zeros(len(found.theta)))
-    return again if fixed else _differing(again)
+    return replace(before, model=model, estimate=found, bias=np.zeros(len(theta)))
 
 
 def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
@@ -156,20 +199,23 @@ def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Popul
     return replace(found, estimate=there, bias=before.theta - theta)
 
 
-def _estimated(model: Followers, noise: PushNoise, begin: Population | None = None) -> Population:
-    """The estimate of a model.
-
-    Args:
-        begin: that with one parameter less that differs, where the search starts.
-    """
-    theta, variances = model.start, _variances(model)
-    if begin is not None:
-        theta, variances = begin.estimate.theta, _widened(begin.estimate.variances)
+def _estimated(
+    model: Followers, noise: PushNoise, theta: np.ndarray, variances: Variances,
+    agents: np.ndarray | None = None, start: np.ndarray | None = None,
+) -> Population:  # fmt: skip
+    """The estimate of a model; the search starts at parameters, standard deviations and, where they
+    are given, deviations of drivers and of starts."""
     found = estimate(
         model, noise, theta, variances, low=model.low, high=model.high,
-        longest=LONGEST, tolerance=TOLERANCE,
+        longest=LONGEST, tolerance=TOLERANCE, agents=agents, start=start,
     )  # fmt: skip
     return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
+
+
+def _best(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
+    """The estimate of a model from several starts, that of the largest likelihood."""
+    found = [_estimated(model, noise, theta, _variances(model)) for theta in starts]
+    return max(found, key=lambda one: one.marginal.loglik)
 
 
 def _differing(best: Population) -> Population:
@@ -195,27 +241,28 @@ def _better(best: Population, price: float) -> Population | None:
         if value <= limit:
             break
         system, paths = best.model.system, best.model.paths
-        found = _estimated(Followers(system, paths, [*best.random, name]), best.noise, best)
-        if _differs(found.marginal) and found.marginal.loglik > limit:
+        model, before = Followers(system, paths, [*best.random, name]), best.estimate
+        found = _estimated(model, best.noise, before.theta, _widened(before.variances))
+        if _differs(found.estimate) and found.marginal.loglik > limit:
             return found
     return None
 
 
 def _linearised(best: Population, name: str) -> float:
     """The logarithm of the marginal likelihood with one more parameter that differs, the samples'
-    linearisation kept; minus infinity where the data do not tell how it differs."""
+    linearisation kept."""
     model, found = best.model, best.estimate
     random = [*model.random, model.names.index(name)]
     data = replace(found.data, random=found.data.fixed[..., random])
     variances = fit_variances(data, best.noise, _widened(found.variances), tolerance=TOLERANCE)
     products = best.noise.products(data, variances.noise)
-    there = marginal(data, products, variances.spread, variances.start)
-    return there.loglik if _differs(there) else -math.inf
+    return marginal(data, products, variances.spread, variances.start).loglik
 
 
-def _differs(found: Marginal) -> bool:
+def _differs(found: Estimate) -> bool:
     """Whether the data tell how each of the parameters differs."""
-    return bool((np.median(found.shrinkage, 0) < SHRINKAGE).all())
+    told = np.median(found.marginal.shrinkage, 0) < SHRINKAGE
+    return bool((told & (found.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
 
 
 def _variances(model: Followers) -> Variances:

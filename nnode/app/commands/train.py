@@ -7,6 +7,8 @@ Examples:
   python scripts/train.py model=lin data=esimas solver=fused optimizer=lbfgs
   # the field's laws, by Gauss and Newton's method on exact tangents
   python scripts/train.py model=idm data=ngsim_pairs trainer.cost=spacing
+  # drivers who differ: which parameters, by how much, and those of each driver
+  python scripts/train.py model=idm data=openacc trainer.drivers=auto
   # your own table: columns sequence, time, agent, x; in SI units
   python scripts/train.py model=lin data=table data.path=mine.csv data.domain=traffic
   # sweeps: every model with every seed, one after the other, or on all cores
@@ -17,8 +19,8 @@ Examples:
   # go on with a run that was stopped
   python scripts/train.py resume=RUN/checkpoints/last.pt hydra.run.dir=RUN
 
-Results: result.json, checkpoints/best.pt and last.pt, and curves for TensorBoard. A sweep ends
-with sweep.csv. Ctrl-C saves, and says how to go on.
+Results: result.json, checkpoints/best.pt and last.pt, and curves for TensorBoard; with
+trainer.drivers also drivers.csv. A sweep ends with sweep.csv. Ctrl-C saves, and says how to go on.
 """
 
 from __future__ import annotations

@@ -56,6 +56,9 @@ class Calibrator:
         effects: beside it, names or ``{"name": ..., parameter: value}``.
         leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
+        drivers: ``none``, ``auto`` or names of parameters such as ``["T", "v0"]``, which differ
+            between drivers; ``auto``: those of which the data tell how they differ. Laws of lanes
+            are then calibrated by a mixed-effects model, see ``docs/method.md``.
         pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
             pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
         start_speeds: ``auto``, ``given``, or ``fitted`` beside the parameters to each training
@@ -83,6 +86,7 @@ class Calibrator:
     effects: ListLike[str | Mapping[str, Any]] = ()
     leader: str | None = None
     cost: str = "integral"
+    drivers: str | ListLike[str] = "none"
     pooling: str = "pooled"
     start_speeds: str = "auto"
     optimizer: str | Mapping[str, Any] | None = None
@@ -222,6 +226,8 @@ class Calibrator:
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
         trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
+        named = isinstance(self.drivers, str)
+        trainer["drivers"] = self.drivers if named else list(self.drivers)
         trainer |= {"pooling": self.pooling, "start_speeds": self.start_speeds}
         trainer["device"] = Device.cpu.value
         data = OmegaConf.structured(data_of(given))
@@ -279,6 +285,7 @@ def fit(
     model: str | Mapping[str, Any] | System = "lin",
     walls: str | Path | None = None,
     leader: str | None = None,
+    drivers: str | ListLike[str] = "none",
     epochs: int = 100,
     heldout: float = 0.2,
     seed: int = 0,
@@ -293,6 +300,7 @@ def fit(
         walls: CSV with x1, y1, x2, y2, m.
         model: see :class:`Calibrator`, as for the following.
         leader: what the first vehicle does.
+        drivers: which parameters differ between drivers.
         epochs: at most.
         heldout: share of the sequences that the calibration does not see.
         seed: of start values and of the division.
@@ -306,5 +314,7 @@ def fit(
     if not isinstance(data, Sequences):
         options["domain"] = domain
     given = sequences(data, **{key: value for key, value in options.items() if value is not None})
-    calibrator = Calibrator(model, leader=leader, epochs=epochs, heldout=heldout, seed=seed)
+    calibrator = Calibrator(
+        model, leader=leader, drivers=drivers, epochs=epochs, heldout=heldout, seed=seed
+    )
     return calibrator.fit(given).result_

@@ -1,0 +1,265 @@
+"""Calibration to drivers who differ: where it has a place, and what it found, as tables."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable
+from collections.abc import Sequence as ListLike
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pandas as pd
+
+from nnode.calibrate.options import Pooling, TrainerOptions
+from nnode.calibrate.parameters import ParameterVector
+from nnode.data.sequence import Sequence
+from nnode.errors import ConfigError
+from nnode.model import System
+from nnode.model.term import Term, short_names
+
+if TYPE_CHECKING:
+    from nnode.population.drivers import Population
+
+log = logging.getLogger(__name__)
+
+AUTO, NONE = "auto", "none"
+#: m, root mean square error of pooled parameters below which paths are explained exactly, as those
+#: of a model's own simulation are.
+EXACT = 0.01
+#: m, errors of measurement of positions that were smoothed before. Smoothing leaves errors that
+#: last over samples, and models take them for pushes if errors are assumed to be small.
+SMOOTHED = 0.1
+#: Share of the admissible interval that searches start away from its ends.
+INSIDE = 0.01
+
+
+def planned(
+    options: TrainerOptions, model: System, sequences: Callable[[], list[Sequence]]
+) -> str | list[str]:
+    """What is done about drivers who differ: ``auto``, ``none``, or names of parameters.
+
+    Args:
+        options: of the trainer, as they were given.
+        sequences: reads those of the training.
+
+    Raises:
+        ConfigError: a value that is none of these, an unknown parameter, or drivers who differ
+            where they have no place.
+    """
+    given = options.drivers
+    if given == NONE:
+        return NONE
+    if given != AUTO and not _names(given):
+        raise ConfigError(
+            f"trainer.drivers={given} is unknown, expected auto, none, or a list of parameters of "
+            "the law such as [T, v0]"
+        )
+    asked = f"trainer.drivers={_words(given)}"
+    if options.pooling is not Pooling.pooled:
+        raise ConfigError(
+            f"{asked} and trainer.pooling={options.pooling.value} both give drivers parameters of "
+            "their own; choose one of them"
+        )
+    from nnode.population.drivers import known_names, obstacle  # compiled code takes a second
+
+    reason = obstacle(model, sequences())
+    if reason is not None:
+        raise ConfigError(f"{asked} has no place here: {reason}; take trainer.drivers=none")
+    if given == AUTO:
+        return AUTO
+    law = cast(Term, model.terms[0])
+    known_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
+    return list(given)
+
+
+def _names(given: Any) -> bool:
+    """Whether an option is a list of words."""
+    listed = isinstance(given, ListLike) and not isinstance(given, str)
+    return bool(listed and len(given) and all(isinstance(name, str) for name in given))
+
+
+def _words(given: Any) -> str:
+    return f"[{', '.join(given)}]" if _names(given) else str(given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drivers:
+    """A law calibrated to drivers who differ.
+
+    Attributes:
+        model: the law with the parameters of the typical driver, the medians.
+        parameters: address to ``low``, ``high``, ``at_bound``, ``identified``; see
+            :func:`nnode.calibrate.intervals.intervals`.
+        correlation: of the estimates, by address, of logarithms where parameters are positive.
+        clusters: their number.
+        differ: short names of the parameters that differ between drivers.
+        variability: see :class:`nnode.app.calibration.Calibration`.
+        table: the same.
+        converged: whether the estimation did.
+        bias: of the parameters by short name, by how much they were corrected, as a share where
+            they are positive.
+    """
+
+    model: System
+    parameters: dict[str, Any]
+    correlation: dict[str, dict[str, float]]
+    clusters: int
+    differ: list[str]
+    variability: pd.DataFrame
+    table: pd.DataFrame
+    converged: bool
+    bias: dict[str, float]
+
+    def summary(self) -> list[str]:
+        """What differs between drivers, and what disturbs them."""
+        rows = self.variability.iterrows()
+        found = {str(name): row for name, row in rows}
+        said = {name: _estimate(row) for name, row in found.items()}
+        differ = [f"{name} by {said[name]}" for name in self.differ]
+        every = ", ".join(differ) if differ else "none that the data tell"
+        return [
+            f"{len(self.table)} drivers; parameters that differ between them (standard deviation): "
+            f"{every}; the parameters below are the medians",
+            f"pushes of {said['push']} that last {said['push_time']}; errors of measurement of "
+            f"{said['measurement']}",
+        ]
+
+    def plain(self) -> dict[str, Any]:
+        """For ``result.json``."""
+        rows = self.variability.replace({np.nan: None}).to_dict("index")
+        return {
+            "differ": self.differ,
+            "variability": {str(name): row for name, row in rows.items()},
+            "bias": self.bias,
+            "converged": self.converged,
+            "table": self.table.to_dict("records"),
+        }
+
+
+def _estimate(row: pd.Series) -> str:
+    ends = f" [{row['lower']:.3g}, {row['upper']:.3g}]" if np.isfinite(row["lower"]) else ""
+    return f"{row['estimate']:.3g} {row['unit']}{ends}"
+
+
+def calibrated_drivers(
+    model: System, first: dict[str, float], sequences: list[Sequence], drivers: str | list[str],
+    cluster: np.ndarray, seed: int,
+) -> Drivers:  # fmt: skip
+    """Calibrate to drivers who differ.
+
+    Args:
+        model: where one search starts.
+        first: parameters by address, where another search starts.
+        drivers: see :func:`planned`.
+        cluster: ``(S,)`` of each sequence, see :func:`nnode.data.clusters.clusters`.
+        seed: of the simulations that tell the bias.
+
+    Raises:
+        ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
+    """
+    from nnode.population.drivers import STEP, fit_drivers  # compiled code takes a second
+    from nnode.population.followers import FLOOR, paths_of
+    from nnode.population.intervals import variations
+
+    double = copy.deepcopy(model).double()
+    vector = ParameterVector(double)
+    low, high = vector.bounds
+    inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
+    vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
+    paths = paths_of(sequences, STEP)
+    if paths.error <= FLOOR:
+        log.info(
+            "positions show no errors that are new at every sample, so that they were smoothed: "
+            "errors of %g m are assumed", SMOOTHED,
+        )  # fmt: skip
+        paths = replace(paths, error=SMOOTHED)
+    found = fit_drivers(double, paths, drivers, first, seed=seed)
+    if not found.estimate.converged:
+        log.warning(
+            "the estimation of drivers who differ did not converge: take another law, fewer "
+            "parameters that differ (trainer.drivers=[T]), or trainer.drivers=none"
+        )
+    followers, theta = found.model, found.estimate.theta
+    row = followers.natural(theta)
+    vector.fill_(row)
+    whole = copy.deepcopy(model)
+    whole.load_state_dict({k: v.to(whole.state_dict()[k]) for k, v in double.state_dict().items()})
+    parameters, correlation, number = _intervals(found, cluster)
+    short = short_names(followers.names)
+    return Drivers(
+        model=whole,
+        parameters=parameters,
+        correlation=correlation,
+        clusters=number,
+        differ=[short[name] for name in found.random],
+        variability=pd.DataFrame.from_dict(variations(found), orient="index"),
+        table=_table(found, sequences),
+        converged=found.estimate.converged,
+        bias={
+            short[name]: float(np.expm1(bias) if in_logs else bias)
+            for name, bias, in_logs in zip(followers.names, found.bias, followers.logs, strict=True)
+        },
+    )
+
+
+def _intervals(
+    found: Population, cluster: np.ndarray
+) -> tuple[dict[str, Any], dict[str, dict[str, float]], int]:
+    """Intervals, correlations and the number of clusters, as
+    :func:`nnode.calibrate.intervals.intervals` gives them."""
+    from nnode.calibrate.intervals import VAGUE
+    from nnode.population.intervals import at_bounds, influence
+
+    model, theta, paths = found.model, found.estimate.theta, found.model.paths
+    own = np.zeros(len(paths.names), dtype=int)
+    own[paths.agent] = cluster[paths.sequence]
+    number = len(np.unique(own))
+    known, free = influence(found, own)
+    low, high = at_bounds(found)
+    half = np.full(len(theta), np.inf)
+    half[free] = known.half_widths()
+    if number < 2:
+        half[:] = np.inf
+    ends = [model.natural(np.clip(theta + s * half, model.low, model.high)) for s in (-1.0, 1.0)]
+    widest = model.natural(model.high) - model.natural(model.low)
+    value = np.abs(model.natural(theta))
+    scale = np.where(np.isfinite(widest), VAGUE * widest, value)
+    parameters: dict[str, Any] = {}
+    for i, name in enumerate(model.names):
+        sure = bool(np.isfinite(half[i]))
+        parameters[name] = {
+            "low": float(ends[0][i]) if sure else None,
+            "high": float(ends[1][i]) if sure else None,
+            "at_bound": "low" if low[i] else "high" if high[i] else None,
+            "identified": sure and bool(ends[1][i] - ends[0][i] < scale[i]) if number > 1 else None,
+        }
+    table = np.full((len(theta), len(theta)), np.nan)
+    covariance = known.covariance()
+    spread = np.sqrt(np.diag(covariance))
+    spread = np.where((spread > 0) & np.isfinite(half[free]), spread, np.nan)
+    table[np.ix_(free, free)] = covariance / np.outer(spread, spread)
+    correlation = {
+        name: dict(zip(model.names, map(float, line), strict=True))
+        for name, line in zip(model.names, table, strict=True)
+    }
+    return parameters, correlation, number
+
+
+def _table(found: Population, sequences: list[Sequence]) -> pd.DataFrame:
+    """A row per driver: the own parameters, their standard errors and shrinkage."""
+    model, paths, known = found.model, found.model.paths, found.estimate
+    first = np.unique(paths.agent, return_index=True)[1]
+    short = short_names(model.names)
+    table: dict[str, Any] = {
+        "driver": list(paths.names),
+        "sequence": [sequences[b].name for b in paths.sequence[first]],
+    }
+    errors = np.sqrt(found.marginal.variances)
+    for k, q in enumerate(model.random):
+        name, value = short[model.names[q]], np.exp(known.theta[q] + known.agents[:, k])
+        table[name] = value
+        table[f"{name}_error"] = value * errors[:, k]
+        table[f"{name}_shrinkage"] = found.marginal.shrinkage[:, k]
+    return pd.DataFrame(table)

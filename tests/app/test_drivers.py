@@ -1,0 +1,177 @@
+"""Calibrating to drivers who differ, in Python and by the command."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import nnode
+from nnode.errors import ConfigError
+from tests.app.conftest import ROOT, Script, environment
+from tests.app.different import LASTING, PUSH, TRUE, table
+from tests.app.following import TRUE as EXACT
+from tests.app.following import pairs
+
+DIFFER = {"T": 0.15}
+
+
+Own = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def drawn() -> tuple[pd.DataFrame, Own]:
+    return table(1, platoons=6, cars=4, seconds=30.0, noise=0.05, differ=DIFFER)
+
+
+@pytest.fixture(scope="module")
+def small(drawn: tuple[pd.DataFrame, Own]) -> pd.DataFrame:
+    return drawn[0]
+
+
+@pytest.fixture(scope="module")
+def fitted(small: pd.DataFrame) -> nnode.Calibrator:
+    return nnode.Calibrator("idm", drivers=["T"], seed=3).fit(small)
+
+
+def test_the_typical_driver_and_every_driver_are_found(
+    drawn: tuple[pd.DataFrame, Own], fitted: nnode.Calibrator
+) -> None:
+    found = fitted.result_
+    assert found.drivers is not None
+    for name in ("T", "s0"):
+        row = found.parameters.loc[f"idm.{name}"]
+        assert row["lower"] < TRUE[name] < row["upper"] < 2 * row["lower"]
+    rows = found.drivers.variability
+    for name, true in {"T": 15.0, "push": PUSH, "push_time": LASTING}.items():
+        assert rows.lower[name] < true < rows.upper[name]
+    assert list(rows.unit) == ["m/s²", "s", "%", "m"]
+    assert rows.estimate["measurement"] == pytest.approx(0.05, rel=0.1)
+    own = drawn[1]["T"]
+    drivers = found.drivers.table.set_index("driver")
+    true = {str(10 * b + i + 1): own[b, i] for b in range(6) for i in range(3)}
+    away = (drivers["T"] - pd.Series(true)) / drivers["T_error"]
+    assert len(drivers) == 18
+    assert away.abs().max() < 5
+    assert (away.abs() < 2).mean() > 0.8
+    assert (drivers["T_shrinkage"] < 0.2).all()
+    assert "18 drivers; parameters that differ" in found.summary()
+
+
+def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
+    script: Script, tmp_path: Path, small: pd.DataFrame
+) -> None:
+    small.to_parquet(tmp_path / "table.parquet")
+    done = script(
+        "train", "model=idm", "trainer.drivers=[T]", "data=table", "seed=3", "data.domain=traffic",
+        f"data.path={tmp_path / 'table.parquet'}", f"hydra.run.dir={tmp_path}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    written = json.loads((tmp_path / "result.json").read_text())
+    found = nnode.Calibrator("idm", drivers=["T"], seed=3, heldout=0.2).fit(small).result_
+    assert found.drivers is not None
+    ours = found.plain(written["paths"])
+    for key in ("parameters", "drivers"):
+        assert json.dumps(ours[key], sort_keys=True) == json.dumps(written[key], sort_keys=True)
+    own = pd.read_csv(tmp_path / "drivers.csv", dtype={"driver": str})
+    pd.testing.assert_frame_equal(own, found.drivers.table)
+    model = nnode.load(tmp_path / "checkpoints" / "best.pt")
+    values = {name: float(value) for name, (value, _) in model.physical().items()}
+    assert values == {name: row["value"] for name, row in written["parameters"].items()}
+    done = script(
+        "evaluate", f"checkpoint={tmp_path}/checkpoints/best.pt", f"hydra.run.dir={tmp_path}/e"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("model", ["idm", "fvdm"])
+def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model: str) -> None:
+    given = pairs(number=6, seconds=20.0)
+    found = nnode.Calibrator(model, drivers="auto", method="ballistic").fit(given)
+    if model == "idm":
+        assert found.result_.drivers is None
+        assert found.parameters_.estimate["idm.T"] == pytest.approx(EXACT["T"], rel=1e-4)
+    else:  # another law leaves more than that
+        assert found.result_.drivers is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"drivers": ["foo"]}, r"drivers=foo is no parameter .* v0, T, s0, a, b"),
+        ({"drivers": "some"}, r"drivers=some is unknown, expected auto, none, or a list"),
+        ({"drivers": []}, r"drivers=\[\] is unknown"),
+        ({"drivers": "auto", "pooling": "alone"}, r"choose one of them"),
+        ({"drivers": "auto", "model": "krauss"}, r"map from step to step; take .*drivers=none"),
+        ({"drivers": ["v0"], "model": "n2"}, r"a network, whose weights"),
+        (
+            {"drivers": "auto", "effects": ["reaction_delay"]},
+            r"not simulated to finite .* drivers=none",
+        ),
+    ],
+)
+def test_what_has_no_place_is_refused(
+    small: pd.DataFrame, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        nnode.Calibrator(**{"model": "idm", **options}).fit(small)
+
+
+def test_too_few_followers_are_refused(small: pd.DataFrame) -> None:
+    with pytest.raises(ConfigError, match="3 followers behind measured leaders, fewer than 5"):
+        nnode.Calibrator("idm", drivers="auto").fit(small[small["sequence"] == 0])
+
+
+@pytest.mark.thorough
+def test_a_run_that_is_stopped_while_drivers_are_told_apart_goes_on(
+    script: Script, tmp_path: Path, small: pd.DataFrame, fitted: nnode.Calibrator
+) -> None:
+    small.to_parquet(tmp_path / "table.parquet")
+    folder = tmp_path / "run"
+    words = [
+        "model=idm", "trainer.drivers=[T]", "data=table", "seed=3", "data.domain=traffic",
+        "data.split.heldout=0", f"data.path={tmp_path / 'table.parquet'}",
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "scripts/train.py", *words, f"hydra.run.dir={folder}"],
+        cwd=ROOT, env=environment(), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "with drivers who differ" in line:
+            break
+    before = nnode.load(folder / "checkpoints" / "best.pt").physical()
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM, errors
+    last = folder / "checkpoints" / "last.pt"
+    assert f"resume={last} hydra.run.dir={folder}" in errors
+    assert not (folder / "drivers.csv").exists()
+    done = script("train", f"resume={last}", f"hydra.run.dir={folder}")
+    assert done.returncode == 0, done.stderr
+    written = json.loads((folder / "result.json").read_text())["parameters"]
+    for name, row in fitted.parameters_.iterrows():
+        assert written[name]["value"] == pytest.approx(row["estimate"], rel=1e-9)
+        assert written[name]["value"] != float(before[name][0])
+
+
+@pytest.mark.thorough
+def test_drivers_of_noisy_positions_are_told_apart() -> None:
+    """Twenty platoons of five cars, whose positions a satellite's receiver measures."""
+    differ = {"T": 0.15, "v0": 0.15}
+    measured, _ = table(201, platoons=20, cars=5, seconds=60.0, noise=0.3, differ=differ)
+    found = nnode.fit(measured, model="idm", drivers="auto", heldout=0.0)
+    assert found.drivers is not None
+    assert sorted(found.drivers.differ) == ["T", "v0"]
+    values = found.parameters.estimate
+    for name in ("T", "v0"):
+        assert values[f"idm.{name}"] == pytest.approx(TRUE[name], rel=0.05)
+        assert 12 < found.drivers.variability.estimate[name] < 18
+    assert values["idm.s0"] == pytest.approx(TRUE["s0"], abs=0.5)
