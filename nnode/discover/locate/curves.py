@@ -80,9 +80,9 @@ def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> l
             drawn = made(engine, fit, seed) if drawn is None else drawn
             columns = partial(columns_of, variable=look.variable)
             bias = score_bias(drawn, columns, engine.cluster)
-            look = _Look(engine, fit, screen, look.variable, bias)
-            own = min(at_least(row)[0] for row in look.squares)
-            p_value = float((least <= own + 1e-12).mean())
+            again = _Look(engine, fit, screen, look.variable, bias)
+            own = min(at_least(row)[0] for row in again.squares)
+            p_value = max(p_value, float((least <= own + 1e-12).mean()))
         found.append(look.best(before, p_value))
     return sorted(found, key=lambda one: -one.gain.gain)
 

@@ -193,8 +193,12 @@ def _screened(
         for effect in left:
             if effect.name in shown:
                 _unbiased(look, effect, drawn, found.screen)
-        found.screen = Screen(found.fit, engine.cluster, seed + begun, levels=levels)
-        found.scores = found.screen.scores(look)
+        again = Screen(found.fit, engine.cluster, seed + begun, levels=levels).scores(look)
+        least = {score.effect.name: score.p_value for score in again}
+        found.scores = [
+            replace(score, p_value=max(score.p_value, least.get(score.effect.name, 1.0)))
+            for score in found.scores
+        ]
     return found.screen
 
 
