@@ -67,20 +67,17 @@ class Comparing:
     """Models on some sequences.
 
     Args:
+        engine: of these sequences.
         base: the model around which residuals are whitened and weighted.
-        label: ``(S,)`` clusters of the sequences.
-        like: see :func:`engine_of`.
     """
 
-    def __init__(
-        self, sequences: list[Sequence], base: System, label: np.ndarray, like: Engine | None = None
-    ) -> None:
-        self._windows = engine_of(base, sequences, label, like=like)
+    def __init__(self, engine: Engine, base: System) -> None:
+        self._windows = engine
         self._windows.settle(base, ParameterVector(base).row)
         #: whose errors are shown
         self._shown = self._windows
         if not isinstance(self._windows, FollowersEngine | CrowdEngine):
-            self._shown = engine_of(base, sequences, label, whole=True)
+            self._shown = engine_of(base, engine.sequences, whole=True)
 
     @property
     def drivers(self) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.found import Simulation
-from nnode.discover.judge.confirm import Comparing, engine_of
+from nnode.discover.judge.confirm import Comparing, windows_of
 from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
 from nnode.errors import DataError, SimulationError
 from nnode.model.system import Crowd, System
@@ -70,13 +70,13 @@ def later(
     if not used or not early:
         return None
     try:
-        engine = engine_of(system, early)
+        engine = windows_of(system, early)
         engine.settle(system, ParameterVector(system).row)
         people, shared = (
             _carried(early, last, numbers(engine, system, one, common=common))
             for common in (False, True)
         )
-        comparing = Comparing(last, system, label[used])
+        comparing = Comparing(windows_of(system, last, label[used]), system)
         each = {
             MODELS[0]: system,
             MODELS[1]: with_people(system, one, people),

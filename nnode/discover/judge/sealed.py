@@ -131,7 +131,7 @@ class Sealed:
         self.domain = str(base.domain)
         self.base, self.opened, self.sealed = base, opened, sealed
         self.label, self.clusters, self.seed = label, clusters, seed
-        self.comparing = Comparing(sealed, base, label, engine)
+        self.comparing = Comparing(engine_of(base, sealed, label, like=engine), base)
         self.before = self.comparing.squares(base)
         self.tried: dict[str, _Tried] = {}
         self._corrected: Fit | None = None
