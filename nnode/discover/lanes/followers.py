@@ -213,19 +213,18 @@ class FollowersEngine(TrafficEngine):
         assert best.population is not None
         self._take(best.population)
 
-    def drawn(self, fit_system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
+    def drawn(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
         """Engines of paths that a model would have had, with deviations of drivers, pushes and
         errors of measurement as they were estimated under it: two draws of opposite signs."""
-        null = copy.copy(self)
-        null.settle(fit_system, row)
-        assert null.population is not None
-        before, found = null.population, []
-        model = before.model
+        assert self.population is not None
+        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+        paths = self._paths(self._longest(fixed, row[None]))
+        null, found = fit_again(self.population, fixed, paths, fixed=True), []
         for draw in opposite(seed):
-            one = copy.copy(null)
-            paths = model.drawn(before.estimate, draw)
+            one = copy.copy(self)
+            paths = null.model.drawn(null.estimate, draw)
             one._known = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
-            one._take(fit_again(before, model.system, paths, fixed=True))
+            one._take(fit_again(null, fixed, paths, fixed=True))
             found.append(one)
         return found
 
