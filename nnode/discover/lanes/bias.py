@@ -3,8 +3,8 @@
 The linearisation at drivers' estimates and the errors of smoothed leaders shift scores a little,
 which many data would tell from nothing. So the calibrated model makes paths of its own; what is
 scored there is the shift. What is found must stand out with and without it: where a model is quite
-wrong, its paths are so, too. Draws come in pairs of opposite signs, in which what is linear in pushes,
-deviations and errors cancels.
+wrong, its paths are so, too. Draws come in pairs of opposite signs, in which what is linear in
+pushes, deviations and errors cancels.
 """
 
 from __future__ import annotations
