@@ -33,6 +33,8 @@ SHORT, LONG, LASTING = 1.0, 1 / 3, 3.0
 START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 #: Step of a parameter's logarithm at most, and how closely estimates converge.
 LONGEST, TOLERANCE = 0.3, 1e-2
+#: At most so many parameters are estimated to differ before the best is chosen.
+RANKED = 2
 #: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
 #: estimate's standard error.
 PAIRS = 2
@@ -224,7 +226,7 @@ def _differing(best: Population) -> Population:
     Parameters are added one after the other, while twice the logarithm of the marginal likelihood
     rises by more than the logarithm of the number of drivers (Schwarz's criterion). Candidates are
     ranked by the marginal likelihood of the samples as they are linearised without them, with
-    variances of their own; only the best is then estimated.
+    variances of their own; the best two are then estimated.
     """
     price = math.log(max(len(best.model.paths.names), 2)) / 2
     while (better := _better(best, price)) is not None:
@@ -237,15 +239,17 @@ def _better(best: Population, price: float) -> Population | None:
     limit = best.marginal.loglik + price
     left = [name for name in best.model.that_may_differ if name not in best.random]
     ranked = [(_linearised(best, name), name) for name in left]
-    for value, name in sorted(ranked, reverse=True):
-        if value <= limit:
-            break
+    tried = [name for value, name in sorted(ranked, reverse=True) if value > limit]
+    better: list[Population] = []
+    for name in tried:
         system, paths = best.model.system, best.model.paths
         model, before = Followers(system, paths, [*best.random, name]), best.estimate
         found = _estimated(model, best.noise, before.theta, _widened(before.variances))
         if _differs(found.estimate) and found.marginal.loglik > limit:
-            return found
-    return None
+            better.append(found)
+        if len(better) == RANKED:
+            break
+    return max(better, key=lambda one: one.marginal.loglik, default=None)
 
 
 def _linearised(best: Population, name: str) -> float:
@@ -298,10 +302,15 @@ def _started(variances: Variances, model: Followers) -> Variances:
 
 
 def _widened(variances: Variances) -> Variances:
-    """With one more parameter that differs."""
+    """With one more parameter that differs. Pushes that last as long as they may stood in for
+    that, and the search begins with others."""
     at = len(variances.noise) + len(variances.spread)
+    push, lasts = variances.noise
+    if lasts >= (1 - NEAR) * variances.high[1]:
+        push, lasts = push / 2, np.clip(LASTING, *np.stack([variances.low, variances.high])[:, 1])
     return replace(
         variances,
+        noise=np.array([push, lasts]),
         spread=np.append(variances.spread, SPREAD),
         low=np.insert(variances.low, at, LEAST_SPREAD),
         high=np.insert(variances.high, at, MOST_SPREAD),

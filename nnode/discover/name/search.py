@@ -222,14 +222,46 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         return None
     scores = sorted(scores, key=lambda score: -score.gain)
     shown = min(score.p_value for score in scores) <= alpha
+    if not shown and isinstance(engine, FollowersEngine):
+        return None  # strong effects show in the variances of the likeliest model
     hinted = set() if hint is None else {effect.name for effect in effects_of(hint)}
     tried = [s for s in scores if s.gain >= rules().rival * scores[0].gain][:RIVALS]
     tried += [score for score in scores if score.effect.name in hinted and score not in tried]
+    candidates = _in_order(engine, found, tried, hint, shown)
+    good = [
+        c for c in candidates
+        if c.removed >= engine.least
+        and c.gain.gain > 0
+        and c.there < rules().level
+        and c.strength_excludes_neutral(screen.label(c.name))
+        and c.ordered
+    ]  # fmt: skip
+    passing = [c for c in good if c.score.p_value <= alpha]
+    if not passing and not isinstance(engine, FollowersEngine):
+        passing = [c for c in good if _sure(c, screen, len(scores))]
+    if not passing:
+        return None
+    best = _simplest(passing, screen)
+    if best.score.p_value > alpha:
+        best.score = replace(best.score, p_value=best.there * len(scores))
+    tests = [(other, _between(other, best, screen)) for other in candidates if other is not best]
+    return Step(best, [(other, test) for other, test in tests if _rivals(best, other, test)])
+
+
+def _in_order(
+    engine: Engine, found: Search, tried: list[Score], hint: System | None, shown: bool
+) -> list[Candidate]:
+    """Effects calibrated with the model, the best first; none where nothing is left to explain.
+
+    Args:
+        shown: whether a score passes; otherwise only a leading effect that is sure is followed.
+    """
+    screen, candidates = found.screen, list[Candidate]()
+    assert screen is not None
     square = square_of(engine, found.fit.system)
     found.square = found.square or square
     if square < EXACT:
-        return None
-    candidates: list[Candidate] = []
+        return []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
         start = _hinted(hint, found.fit.system, score.effect.name)
@@ -240,28 +272,12 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
         removed = (square - square_of(engine, fit.system)) / found.square
         candidates.append(_candidate(score, fit, found.fit, screen, removed))
         # a strong effect is far from linear: held-out clusters may be sure of what no score shows
-        if not shown and len(candidates) == 1 and not _sure(candidates[0], screen, len(scores)):
-            return None
-    if shown and isinstance(engine, FollowersEngine):
+        leads = shown or len(candidates) > 1
+        if not leads and not _sure(candidates[0], screen, len(found.scores)):
+            return []
+    if isinstance(engine, FollowersEngine):
         candidates = _in_best_variances(engine, candidates, found)
-    candidates = _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
-    good = [
-        c for c in candidates
-        if c.removed >= engine.least
-        and c.gain.gain > 0
-        and c.there < rules().level
-        and c.strength_excludes_neutral(screen.label(c.name))
-        and c.ordered
-    ]  # fmt: skip
-    passing = [c for c in good if c.score.p_value <= alpha]
-    passing = passing or [c for c in good if _sure(c, screen, len(scores))]
-    if not passing:
-        return None
-    best = _simplest(passing, screen)
-    if best.score.p_value > alpha:
-        best.score = replace(best.score, p_value=best.there * len(scores))
-    tests = [(other, _between(other, best, screen)) for other in candidates if other is not best]
-    return Step(best, [(other, test) for other, test in tests if _rivals(best, other, test)])
+    return _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
 
 
 def _in_best_variances(
