@@ -146,7 +146,10 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
     """The case with what was said of it."""
     begun, table = time.monotonic(), platoons(**case)
     found = nnode.diagnose(
-        table, "traffic", model=case["law"], options=DiscoverOptions(page=False, replay=False, compare=[])
+        table,
+        "traffic",
+        model=case["law"],
+        options=DiscoverOptions(page=False, replay=False, compare=[]),
     ).plain()
     names = [one["name"] for one in found["effects"]]
     others = {other["name"] for one in found["effects"] for other in one["alternatives"]}

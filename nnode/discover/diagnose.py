@@ -14,7 +14,7 @@ import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model, not_offered
+from nnode.discover.able import check_model, drivers_differ, not_offered
 from nnode.discover.compare.laws import Nearer, imitated
 from nnode.discover.division import Division, divide
 from nnode.discover.found import Found
@@ -143,7 +143,8 @@ def _diagnosed(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     known = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
-    refused = {e.name: reason for e in known if (reason := not_offered(e, system))}
+    differ = drivers_differ(system, sequences)
+    refused = {e.name: reason for e in known if (reason := not_offered(e, system, differ))}
     wanted = [effect for effect in known if effect.name not in refused]
     effects = [effect for effect in wanted if not issubclass(effect, IndividualEffect)]
     look = _looked_for(system, sequences, options, effects, clock, stages, hint)
@@ -216,7 +217,7 @@ def _diagnosed(
         effects=effects_found,
         leads=leads_found,
         agents=agents,
-        drivers=_drivers(engine, found.fit),
+        drivers=_drivers(engine, found.fit, notes),
         data_faults=[],
         not_testable=[one.name for one in absent if not one.testable],
         absences=absent,
@@ -244,13 +245,25 @@ def _diagnosed(
     )
 
 
-def _drivers(engine: Engine, fit: Fit) -> list[Variation]:
-    """What differs between drivers and over time, under the model with all that was found."""
+def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
+    """What differs between drivers and over time, under the model with all that was found.
+
+    Args:
+        notes: where pushes are as strong as they may be, this is added to them.
+    """
     if not isinstance(engine, FollowersEngine):
         return []
     engine.settle(fit.system, torch.from_numpy(fit.row))
     assert engine.population is not None
-    return [Variation(name, **row) for name, row in variations(engine.population).items()]
+    found = [Variation(name, **row) for name, row in variations(engine.population).items()]
+    push = next(one for one in found if one.name == "push")
+    if push.at_bound == "high":
+        notes.append(
+            f"Pushes of {push.estimate:.3g} {push.unit} are the strongest that are allowed: the "
+            "law explains little of how speeds change, and effects may be hidden behind them. "
+            "Compare other laws, or look at how the positions were measured."
+        )
+    return found
 
 
 def _without_imitations(

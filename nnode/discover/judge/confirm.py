@@ -48,7 +48,9 @@ def engine_of(
     """
     if whole and system.domain == "traffic":
         return TrafficEngine(sequences, np.inf, clusters, np.inf)
-    if not drivers_differ(system):
+    if like is not None and not isinstance(like, FollowersEngine):
+        return windows_of(system, sequences, clusters)
+    if like is None and not drivers_differ(system, sequences):
         return windows_of(system, sequences, clusters)
     of = like if isinstance(like, FollowersEngine) else None
     return FollowersEngine(sequences, clusters, like=of)

@@ -12,11 +12,11 @@ from scipy import stats
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.discover.lanes.bias import made, score_bias
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
 from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.rules import rules
+from nnode.discover.statistics.bias import made, score_bias
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError

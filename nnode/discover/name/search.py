@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.discover.lanes.bias import Made, made, score_bias
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves
 from nnode.discover.name.candidate import Candidate, calibrated
@@ -20,6 +19,7 @@ from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
+from nnode.discover.statistics.bias import Made, made, score_bias
 from nnode.discover.statistics.paired import compare, heldout, outdone, there
 from nnode.discover.statistics.profile import moved
 from nnode.discover.statistics.score import Score, Screen, Trace, traces
