@@ -19,7 +19,7 @@ from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
 from nnode.discover.division import divide
 from nnode.discover.inputs import read_inputs
-from nnode.discover.judge.confirm import engine_of
+from nnode.discover.judge.confirm import engine_of, windows_of
 from nnode.discover.name.search import settled
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
@@ -81,7 +81,7 @@ def peers_on_table(
         sequences = read_inputs(data, Path(scratch)).sequences
     division = divide(sequences, DiscoverOptions(seed=seed))
     opened, sealed = division.open, division.sealed
-    engine = engine_of(domain, [sequences[i] for i in opened], division.label[opened])
+    engine = windows_of(system, [sequences[i] for i in opened], division.label[opened])
     fit = settled(engine, copy.deepcopy(system).double())
     offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not e.individual]
     found = [trace for effect in offered for trace in traces(engine, fit, effect)]
@@ -89,7 +89,7 @@ def peers_on_table(
     values = np.concatenate([trace.columns for trace in found], axis=1)
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
-    whole = engine_of(domain, [sequences[i] for i in sealed], whole=True)
+    whole = engine_of(system, [sequences[i] for i in sealed], whole=True)
     whole.settle(fit.system, ParameterVector(fit.system).row)
     before, floor = square_of(whole, fit.system), whole.noise_floor()
     split = {"sealed": [sequences[i].name for i in sealed]}
