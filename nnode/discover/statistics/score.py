@@ -10,8 +10,7 @@ intervals, whose largest statistic is large by chance, does not raise the bar fo
 Residuals are not free of systematic errors: measured positions are smoothed, people are simulated
 among the measured paths of others who have reacted to them. Where nothing is hidden that makes
 some effects a twentieth of their least usual size, which many data would tell from nothing. So what
-is tested is whether an effect exceeds a tenth of that size. Sections of the road and times of the
-clock, which such errors know nothing of, are tested against nothing.
+is tested is whether an effect exceeds a tenth of that size.
 
 Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Hemerik, Goeman & Finos 2020
 (of scores that are free of nuisance parameters); Westfall & Young 1993 (least p-value over
@@ -331,9 +330,8 @@ class Screen:
 
 def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
     """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
-    not say what size is usual, and of an interval of the road or the clock."""
-    share = 0.0 if effect.consecutive else rules().minimal
-    found = [share * (one.min_effect_size or 0.0) for one in effect.strengths.values()]
+    not say what size is usual."""
+    found = [rules().minimal * (one.min_effect_size or 0.0) for one in effect.strengths.values()]
     return np.array(found or [0.0] * number)[:number]
 
 
