@@ -298,6 +298,7 @@ def test_estimates_stand_beside_the_truth(tmp_path: Path) -> None:
     report = {
         "verdict": "named",
         "effects": [effect],
+        "drivers": [{"name": "v0", "estimate": 4.8, "lower": 4.1, "upper": 5.6}],
         "split": {"open": ["a", "b"], "sealed": ["c"]},
         "places": [
             {"variable": "position", "low": 351, "high": 449, "deviation": -4.0, "error": 0.1}
@@ -321,7 +322,7 @@ def test_estimates_stand_beside_the_truth(tmp_path: Path) -> None:
         "effects named:      speed_zone (verdict: named)",
         "between 351 and 449 m, by -4.00 ± 0.10 m/s (the slow zone lies between 350 and 450 m)",
         f"speed_zone.alpha             truth {truth.alpha:g}   estimate 0.66 [0.6, 0.7]",
-        "driver_heterogeneity.sigma   truth 0.05   estimate not found",
+        "v0 between drivers (%)       truth 5      estimate 4.8 [4.1, 5.6]",
         "30 m² before, 0.25 m² after; noise 0.011 m² (truth: 0.01 m²)",
         str(tmp_path / "diagnosis" / "report.html"),
     ):

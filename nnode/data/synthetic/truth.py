@@ -36,12 +36,12 @@ def beside_truth(folder: Path | str) -> str:
 def _diagnosis(report: dict[str, Any], truth: SlowZone, folder: Path) -> list[str]:
     number = sum(len(names) for names in report["split"].values())
     hidden = {"speed_zone": {"alpha": truth.alpha, "a": truth.a, "b": truth.b}}
-    hidden["driver_heterogeneity"] = {"sigma": truth.drivers}
     found = {effect["name"]: effect["coefficients"] for effect in report["effects"]}
     lines = [
         f"diagnosis of the linear law on {number} platoons, among them "
         f"{len(report['split']['sealed'])} held back",
-        f"  hidden in the data: {', '.join(hidden)}; noise of {truth.noise:g} m",
+        f"  hidden in the data: {', '.join(hidden)}; drivers whose v0 differ; noise of "
+        f"{truth.noise:g} m",
         f"  effects named:      {', '.join(found) or 'none'} (verdict: {report['verdict']})",
     ]
     at = next((one for one in report["places"] if one["variable"] == "position"), None)
@@ -59,6 +59,9 @@ def _diagnosis(report: dict[str, Any], truth: SlowZone, folder: Path) -> list[st
     for name, value in (("v0", truth.v0), ("L", truth.L)):
         c = report["base"][f"lin.{name}"]
         lines.append(_row(name, c["unit"], value, c["after"]))
+    spread = {one["name"]: one for one in report["drivers"]}.get("v0", {})
+    ends = (spread.get(key) for key in ("estimate", "lower", "upper"))
+    lines.append(_row("v0 between drivers", "%", 100 * truth.drivers, *ends))
     gap = report["gap"]
     lines += [
         "  mean square error on the held-back platoons: "
