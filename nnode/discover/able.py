@@ -16,7 +16,7 @@ from nnode.model.formula import crowd_of
 from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
 from nnode.model.terms import SMALLEST
-from nnode.simulation.rhs import formula_of
+from nnode.population.followers import behind_leaders
 
 #: Errors of positions that are new at every sample, m, between which followers are simulated behind
 #: their own leaders. Below, positions were smoothed or simulated: SUMO's paths at 5 Hz, which have
@@ -69,8 +69,7 @@ def not_offered(effect: type[Effect], system: System, differ: bool = False) -> s
 def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
     """Whether how drivers differ is estimated with a model: with formulas of the positions and the
     speeds of a driver and of the vehicles ahead, where these were measured well enough."""
-    lane = formula_of(system)
-    if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
+    if behind_leaders(system) is None:
         return False
     return NOISE[0] < measured_noise(sequences).position < NOISE[1]
 

@@ -12,8 +12,8 @@ import numpy as np
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model.system import System
-from nnode.population.estimate import Estimate, Variances, estimate, fit_variances
-from nnode.population.followers import MODES, Followers, Paths, score_bias
+from nnode.population.estimate import Estimate, Variances, estimate, fit_deviations, fit_variances
+from nnode.population.followers import Followers, Paths, score_bias
 from nnode.population.likelihood import Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
 
@@ -154,12 +154,9 @@ def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) 
     modes = (known.agents, known.start) if same else (None, None)
     if not fixed:
         return _differing(_estimated(model, before.noise, model.start, variances, *modes))
-    theta, there = model.start, replace(variances, low=variances.row, high=variances.row)
-    found = estimate(
-        model, before.noise, theta, there, low=theta, high=theta, tolerance=MODES, agents=modes[0],
-        start=modes[1],
-    )  # fmt: skip
-    return replace(before, model=model, estimate=found, bias=np.zeros(len(theta)))
+    agents, start = modes
+    found = fit_deviations(model, before.noise, model.start, variances, agents=agents, start=start)
+    return replace(before, model=model, estimate=found, bias=np.zeros(len(model.start)))
 
 
 def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
@@ -195,9 +192,8 @@ def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Popul
         return found
     bias = np.clip(bias, -LONGEST, LONGEST)
     theta = np.clip(before.theta - bias, model.low, model.high)
-    fixed = replace(before.variances, low=before.variances.row, high=before.variances.row)
-    there = estimate(model, noise, theta, fixed, low=theta, high=theta, tolerance=MODES)
-    there = replace(there, variances=before.variances, converged=before.converged)
+    there = fit_deviations(model, noise, theta, before.variances)
+    there = replace(there, converged=before.converged)
     return replace(found, estimate=there, bias=before.theta - theta)
 
 

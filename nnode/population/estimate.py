@@ -26,6 +26,8 @@ from nnode.population.likelihood import Linearised, Marginal, Noise, Products, m
 DIFFERENCE = 1e-4
 #: Halvings of a step at most.
 HALVINGS = 6
+#: How closely deviations are found where parameters and variances are given, see :func:`estimate`.
+MODES = 0.02
 #: The smallest share of a step that turns back.
 LEAST = 0.2
 
@@ -171,6 +173,24 @@ def estimate(
         theta=theta, agents=agents, start=start, variances=variances, data=data,
         marginal=final, steps=taken, converged=converged,
     )  # fmt: skip
+
+
+def fit_deviations(
+    response: Response, noise: Noise, theta: np.ndarray, variances: Variances, *,
+    agents: np.ndarray | None = None, start: np.ndarray | None = None,
+) -> Estimate:  # fmt: skip
+    """Estimate the deviations of agents and of starts, parameters and variances given.
+
+    Args:
+        response, noise, agents, start: see :func:`estimate`.
+        theta: ``(P,)`` the parameters.
+    """
+    fixed = replace(variances, low=variances.row, high=variances.row)
+    found = estimate(
+        response, noise, theta, fixed, low=theta, high=theta, tolerance=MODES, agents=agents,
+        start=start,
+    )  # fmt: skip
+    return replace(found, variances=variances)
 
 
 def fit_variances(

@@ -28,7 +28,7 @@ from nnode.model.lane_rates import SAFE, Formulas
 from nnode.model.system import System
 from nnode.model.term import Term
 from nnode.model.terms import LaneDynamics, own_values, values_of
-from nnode.population.estimate import Estimate, estimate
+from nnode.population.estimate import Estimate, fit_deviations
 from nnode.population.likelihood import Linearised, Noise
 from nnode.simulation.linear import trapezoidal
 from nnode.simulation.numpy import simulated, strides
@@ -43,8 +43,6 @@ DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
 Push = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 #: Standard normal numbers of a shape.
 Draw = Callable[[tuple[int, ...]], np.ndarray]
-#: How closely modes are found where the parameters are given, see :func:`estimate`.
-MODES = 0.02
 #: States beside those of motion that disturbances may act through.
 STATES = 4
 
@@ -188,6 +186,15 @@ def _named(ahead: np.ndarray) -> dict[str, np.ndarray]:
     return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
+def behind_leaders(system: System) -> LaneDynamics | None:
+    """The formula of a model that needs no more than the positions and the speeds of the vehicles
+    ahead; None for others."""
+    lane = formula_of(system)
+    if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
+        return None
+    return lane
+
+
 def _followed(lane: LaneDynamics) -> int:
     """States through which disturbances act, those at the start as well."""
     number = len(lane.rates)
@@ -230,8 +237,8 @@ class Followers:
 
     def __init__(self, system: System, paths: Paths, random: list[str] | None = None) -> None:
         self.system, self.paths = system, paths
-        terms, lane = cast(list[Term], list(system.terms)), formula_of(system)
-        if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
+        terms, lane = cast(list[Term], list(system.terms)), behind_leaders(system)
+        if lane is None:
             raise ConfigError(
                 "drivers who differ need a model of a lane whose law and effects are formulas of "
                 "the positions and speeds of the vehicles ahead; take drivers=none"
@@ -441,16 +448,11 @@ def score_bias(
     Args:
         pairs: number of pairs.
     """
-    fixed = found.variances
-    fixed = replace(fixed, low=fixed.row, high=fixed.row)
     changes = []
     for _ in range(pairs):
         for draw in opposite(int(rng.integers(2**63))):
             paths = model.drawn(found, draw)
-            again = estimate(
-                model.behind(paths), noise, found.theta, fixed, low=found.theta, high=found.theta,
-                tolerance=MODES,
-            )  # fmt: skip
+            again = fit_deviations(model.behind(paths), noise, found.theta, found.variances)
             changes.append(again.marginal.change)
     return np.asarray(np.mean(changes, 0))
 

@@ -48,12 +48,11 @@ def engine_of(
     """
     if whole and system.domain == "traffic":
         return TrafficEngine(sequences, np.inf, clusters, np.inf)
-    if like is not None and not isinstance(like, FollowersEngine):
-        return windows_of(system, sequences, clusters)
-    if like is None and not drivers_differ(system, sequences):
-        return windows_of(system, sequences, clusters)
-    of = like if isinstance(like, FollowersEngine) else None
-    return FollowersEngine(sequences, clusters, like=of)
+    if isinstance(like, FollowersEngine):
+        return FollowersEngine(sequences, clusters, like=like)
+    if like is None and drivers_differ(system, sequences):
+        return FollowersEngine(sequences, clusters)
+    return windows_of(system, sequences, clusters)
 
 
 def windows_of(

@@ -159,23 +159,16 @@ class TrafficEngine:
         if effect.remembers():
             return self._whole(response, effect, probe)
         base = response.rates(response.system)
-        sources = []
-        if not probe.steps:
-            changed, _ = extended(response.system, effect(**probe.options))
-            sources.append(response.rates(changed) - base)
-        for name, step in probe.steps.items():
-            value = effect.strengths[name].neutral + step
-            changed, _ = extended(response.system, effect(**{**probe.options, name: value}))
-            sources.append((response.rates(changed) - base) / step)
+        sources = [
+            (response.rates(changed) - base) / step
+            for changed, step in changed_by_each(response.system, effect, probe)
+        ]
         return self._columns(response, response.response(torch.stack(sources)))
 
     def _whole(self, response: LinearResponse, effect: type[Effect], probe: Probe) -> Tensor:
         """``(1, n)`` change of the residuals by an effect of finite strength; zero where vehicles
         would be moved by more than all the road that was seen: that is no small change."""
-        values, amount = dict(probe.options), 1.0
-        for name, step in probe.steps.items():
-            values[name], amount = effect.strengths[name].neutral + step, step
-        changed, _ = extended(response.system, effect(**values))
+        changed, amount = changed_as_whole(response.system, effect, probe)
         with torch.no_grad():
             x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
         moved = torch.where(self.follows, x - response.states[..., 0], 0.0)
@@ -225,8 +218,7 @@ class TrafficEngine:
         """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
         away = self.batch.x[..., 0] - response.states[..., 0]
         residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
-        size = drawn_in(residual, self.large).abs()
-        weight = torch.where(residual.abs() <= self.large, 1.0, self.large / size)
+        weight = weights_of(residual, self.large)
         found = self.filter(torch.where(self.follows, -moved, 0.0)).permute(1, 2, 3, 0)[self.seen]
         return torch.nan_to_num(found.mul_(weight[:, None])).T
 
@@ -315,6 +307,32 @@ def drawn_in(residual: Tensor, most: float = LARGE) -> Tensor:
         return residual
     large = torch.sqrt((2 * most * size - most**2).clamp(min=0)).copysign(residual)
     return torch.where(size <= most, residual, large)
+
+
+def weights_of(residual: Tensor, most: float) -> Tensor:
+    """Derivatives of :func:`drawn_in`: less than 1 for large residuals."""
+    size = drawn_in(residual, most).abs()
+    return torch.where(residual.abs() <= most, 1.0, most / size)
+
+
+def changed_as_whole(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
+    """A model with an effect whose strengths are all varied by a probe's steps, and by how much;
+    by 1 where it varies none."""
+    values, amount = dict(probe.options), 1.0
+    for name, step in probe.steps.items():
+        values[name], amount = effect.strengths[name].neutral + step, step
+    return extended(system, effect(**values))[0], amount
+
+
+def changed_by_each(
+    system: System, effect: type[Effect], probe: Probe
+) -> list[tuple[System, float]]:
+    """A model with an effect of which one strength at a time is varied by a probe's step, and by
+    how much; as it is, by 1, where the probe varies none."""
+    if not probe.steps:
+        return [changed_as_whole(system, effect, probe)]
+    each = [replace(probe, steps={name: step}) for name, step in probe.steps.items()]
+    return [changed_as_whole(system, effect, one) for one in each]
 
 
 def fastest(system: System, rows: Tensor) -> float:

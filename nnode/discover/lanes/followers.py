@@ -23,17 +23,24 @@ from torch import Tensor
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.found import Simulation
-from nnode.discover.lanes.engine import LARGE, STEP, TrafficEngine, drawn_in
+from nnode.discover.lanes.engine import (
+    LARGE,
+    STEP,
+    TrafficEngine,
+    changed_as_whole,
+    changed_by_each,
+    drawn_in,
+    weights_of,
+)
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Curve
 from nnode.model.effects import Effect, Probe
-from nnode.model.extend import extended
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
 from nnode.population.drivers import Population, fit_again, fit_drivers
 from nnode.population.followers import Followers, Paths, Push, opposite, paths_of
-from nnode.population.likelihood import Whitening
+from nnode.population.likelihood import Whitening, marginal
 from nnode.simulation.numpy import strides
 from nnode.simulation.rhs import side_by_side
 
@@ -147,17 +154,10 @@ class FollowersEngine(TrafficEngine):
         response; of an effect with a memory, the change by it as a whole."""
         run, changes = self._run_of(system, row), []
         if effect.remembers():
-            values, amount = dict(probe.options), 1.0
-            for name, size in probe.steps.items():
-                values[name], amount = effect.strengths[name].neutral + size, size
-            changed, _ = extended(run.system, effect(**values))
+            changed, amount = changed_as_whole(run.system, effect, probe)
             return self._moved(run, self._finite(run, changed)[..., None] / amount)
         base = run.model.rates(run.own, run.states)
-        for name, size in probe.steps.items() or [("", 1.0)]:
-            values = dict(probe.options)
-            if name:
-                values[name] = effect.strengths[name].neutral + size
-            changed, _ = extended(run.system, effect(**values))
+        for changed, size in changed_by_each(run.system, effect, probe):
             model = self._model(changed, ParameterVector(changed).row)
             own = model.spread(model.start, self._deviations(model)[0])
             changes.append((model.rates(own, run.states) - base) / size)
@@ -297,17 +297,14 @@ class FollowersEngine(TrafficEngine):
         left: np.ndarray = away[0]
         if self._whitening is None or self.population is None:
             return left
-        data, own = self.population.estimate.data, self.population.estimate.variances
-        white = self._whitening(left[..., None])
-        for column, deviation, group in (
-            (data.start, own.start, np.arange(len(left))),
-            (data.random, own.spread, model.paths.agent),
-        ):
-            products = np.zeros((int(group.max()) + 1, column.shape[-1]))
-            both = np.einsum("fkq,fk->fq", self._whitening(column), white[..., 0])
-            np.add.at(products, group, both)
-            left = left - np.einsum("fkq,fq->fk", column, (deviation**2 * products)[group])
-        return left
+        own = self.population.estimate.variances
+        data = self.population.estimate.data
+        data = replace(data, residual=left, fixed=data.fixed[..., :0])
+        products = self.population.noise.products(data, own.noise)
+        found = marginal(data, products, own.spread, own.start)
+        left = left - np.einsum("fkh,fh->fk", data.start, found.start)
+        of_drivers = found.deviations[model.paths.agent]
+        return np.asarray(left - np.einsum("fkq,fq->fk", data.random, of_drivers))
 
     def _whitened(self, columns: np.ndarray) -> Tensor:
         """``(C, n)`` of columns ``(K, F, C)``."""
@@ -330,9 +327,7 @@ class FollowersEngine(TrafficEngine):
         fixed = ParameterVector(copy.deepcopy(plain)).fill_(row[: len(model.names)])
         own = model.spread(model.at(row.numpy()[: len(model.names)]), self._deviations(model)[0])
         step, after = model.linear(own, states[:, :, 0])
-        size = self._whitened(away.transpose(2, 1, 0))[0]
-        near = drawn_in(size, self.large).abs()
-        weight = torch.where(size.abs() <= self.large, 1.0, self.large / near)
+        weight = weights_of(self._whitened(away.transpose(2, 1, 0))[0], self.large)
         found = _Run(fixed, model, own, states[:, :, 0], step, after, weight)
         self._last_run = system, row.clone(), found
         return found

@@ -16,7 +16,7 @@ from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
 from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.bias import made, score_bias
+from nnode.discover.statistics.bias import made, mean_scores
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
@@ -79,7 +79,7 @@ def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> l
         if p_value < rules().sure and not look.variable.lengths:
             drawn = made(engine, fit, seed) if drawn is None else drawn
             columns = partial(columns_of, variable=look.variable)
-            bias = score_bias(drawn, columns, engine.cluster)
+            bias = mean_scores(drawn, columns, engine.cluster)
             again = _Look(engine, fit, screen, look.variable, bias)
             own = min(at_least(row)[0] for row in again.squares)
             p_value = max(p_value, float((least <= own + 1e-12).mean()))

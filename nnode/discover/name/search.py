@@ -19,7 +19,7 @@ from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.bias import Made, made, score_bias
+from nnode.discover.statistics.bias import Made, made, mean_scores
 from nnode.discover.statistics.paired import compare, heldout, outdone, there
 from nnode.discover.statistics.profile import moved
 from nnode.discover.statistics.score import Score, Screen, Trace, traces
@@ -208,7 +208,7 @@ def _unbiased(look: list[Trace], effect: type[Effect], drawn: Made, screen: Scre
     again = {id(fit): traces(engine, fit, effect) for engine, fit in drawn}
     for k, trace in enumerate(one for one in look if one.effect is effect):
         columns = {own: every[k].columns for own, every in again.items()}
-        trace.bias = score_bias(drawn, partial(_columns, columns), label)
+        trace.bias = mean_scores(drawn, partial(_columns, columns), label)
 
 
 def _columns(known: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:

@@ -37,7 +37,7 @@ def made(engine: Engine, fit: Fit, seed: int) -> Made:
     return found if all(np.isfinite(own.residual).all() for _, own in found) else []
 
 
-def score_bias(
+def mean_scores(
     drawn: Made, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
 ) -> np.ndarray | float:
     """``(G, k)`` mean scores of directions by cluster in paths that a model has made.
