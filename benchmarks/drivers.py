@@ -29,13 +29,19 @@ LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06}
 #: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s.
 HIDDEN = {
     "lin": {
-        "speed_zone": 0.9, "relative_speed": 0.2, "multi_anticipation": 0.2, "inertia": 0.3,
+        "speed_zone": 0.9,
+        "relative_speed": 0.2,
+        "multi_anticipation": 0.2,
+        "inertia": 0.3,
         "reaction_delay": 0.3,
     },
     "idm": {
-        "speed_zone": 0.6, "relative_speed": 0.2, "multi_anticipation": 0.2, "reaction_delay": 0.6,
+        "speed_zone": 0.6,
+        "relative_speed": 0.2,
+        "multi_anticipation": 0.2,
+        "reaction_delay": 0.6,
     },
-}  # fmt: skip
+}
 ZONE = (250.0, 420.0)
 V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
 
@@ -158,10 +164,14 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
     drivers = {one["name"]: one for one in found["drivers"]}
     return {
         **case,
-        "verdict": found["verdict"], "names": " ".join(names), "others": " ".join(sorted(others)),
-        "exact": set(names) == hidden and not others
+        "verdict": found["verdict"],
+        "names": " ".join(names),
+        "others": " ".join(sorted(others)),
+        "exact": set(names) == hidden
+        and not others
         and found["verdict"] == ("named" if hidden else "none"),
-        "among": hidden <= set(names) | others, "false": bool(set(names) - hidden),
+        "among": hidden <= set(names) | others,
+        "false": bool(set(names) - hidden),
         "size": HIDDEN[case["law"]].get(case["effect"], np.nan),
         "estimate": next(iter(values[0].values()))["value"] if values else np.nan,
         **{
@@ -169,7 +179,7 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
             for name in ("v0", "T")
         },
         "seconds": round(time.monotonic() - begun, 1),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

@@ -46,18 +46,51 @@ TOLERANCE = 1e-6
 LOOSE = 2.0
 
 LANE_EFFECTS = (
-    "none", "zone", "period", "relative_speed", "anticipation", "drivers", "delay", "trucks",
-)  # fmt: skip
+    "none",
+    "zone",
+    "period",
+    "relative_speed",
+    "anticipation",
+    "drivers",
+    "delay",
+    "trucks",
+)
 CROWD_EFFECTS = (
-    "none", "drift", "speed", "alignment", "obstacle", "side", "repulsion", "cohesion",
-)  # fmt: skip
-LAWS = ("lin", "log", "n2", "n4", "n10", "idm", "ovm", "fvdm", "gipps", "krauss", "helly", "newell",
-        "a2", "a4", "a10")  # fmt: skip
+    "none",
+    "drift",
+    "speed",
+    "alignment",
+    "obstacle",
+    "side",
+    "repulsion",
+    "cohesion",
+)
+LAWS = (
+    "lin",
+    "log",
+    "n2",
+    "n4",
+    "n10",
+    "idm",
+    "ovm",
+    "fvdm",
+    "gipps",
+    "krauss",
+    "helly",
+    "newell",
+    "a2",
+    "a4",
+    "a10",
+)
 CROWD_LAWS = ("sf", "nn", "esf", "cfsm", "gcfm", "ttc")
 EXTENDED = (
-    ("lin", "relative_speed", "speed_zone"), ("lin", "reaction_delay"), ("idm", "memory"),
-    ("sf", "alignment"), ("sf", "anticipation", "drift"), ("newell", "speed_zone"),
-)  # fmt: skip
+    ("lin", "relative_speed", "speed_zone"),
+    ("lin", "reaction_delay"),
+    ("idm", "memory"),
+    ("sf", "alignment"),
+    ("sf", "anticipation", "drift"),
+    ("newell", "speed_zone"),
+)
 STUDIES = ("traffic",)
 WALLS = [(-8.0, 0.0, 8.0, 0.0), (8.0, 4.5, -8.0, 4.5)]
 
@@ -177,14 +210,20 @@ def diagnosis(law: str, effect: str, seed: int) -> dict[str, Any]:
     crowd = law == "sf"
     table = people(effect, seed) if crowd else lanes(law, effect, seed)
     options = DiscoverOptions(
-        page=False, replay=False, structure=effect in ("none", "delay"),
+        page=False,
+        replay=False,
+        structure=effect in ("none", "delay"),
         compare=["lin", "log"] if law == "lin" and effect == "none" else [],
-    )  # fmt: skip
+    )
     with tempfile.TemporaryDirectory() as folder:
         found = nnode.diagnose(
-            table, "crowd" if crowd else "traffic", model=law, seed=seed, options=options,
+            table,
+            "crowd" if crowd else "traffic",
+            model=law,
+            seed=seed,
+            options=options,
             walls=_walls(folder) if crowd else None,
-        )  # fmt: skip
+        )
     plain = found.plain()
     effects = {
         f"{part} {one['name']}": {k: c["value"] for k, c in one["coefficients"].items()}
@@ -217,11 +256,19 @@ def _sequences(law: str) -> Any:
 def calibration(law: str, optimizer: str, solver: str, *effects: str) -> dict[str, Any]:
     """Costs before and after, and what was calibrated. Gauss and Newton's method goes on until it
     converges: its way there is no result."""
-    one = nnode.Calibrator(
-        law, effects=effects, optimizer=optimizer, solver=solver,
-        dt=None if solver == "fused" else 0.05, leader=None if law in CROWD_LAWS else "measured",
-        epochs=100 if optimizer == "gauss_newton" else 2,
-    ).fit(_sequences(law)).result_  # fmt: skip
+    one = (
+        nnode.Calibrator(
+            law,
+            effects=effects,
+            optimizer=optimizer,
+            solver=solver,
+            dt=None if solver == "fused" else 0.05,
+            leader=None if law in CROWD_LAWS else "measured",
+            epochs=100 if optimizer == "gauss_newton" else 2,
+        )
+        .fit(_sequences(law))
+        .result_
+    )
     found = {"start": one.cost_start, "cost": one.cost, "parameters": _parameters(one.model)}
     folder = os.environ.get(FOLDER)
     if folder and optimizer == "adadelta":

@@ -25,10 +25,24 @@ def built(folder: Path) -> Path:
         else:
             shutil.copy(ROOT / name, folder / "source")
     done = subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
-         "--no-index", "--wheel-dir", str(folder), str(folder / "source")],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "wheel",
+            "--quiet",
+            "--no-deps",
+            "--no-build-isolation",
+            "--no-index",
+            "--wheel-dir",
+            str(folder),
+            str(folder / "source"),
+        ],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     (found,) = folder.glob("nnode-*.whl")
     return found
@@ -49,10 +63,24 @@ def installed(wheel: Path, place: Path, **more: str) -> Run:
     # of a folder that is named in such a file no .pth file is read, so that no checkout is lent
     (site / "lent.pth").write_text("\n".join(lent))
     done = subprocess.run(
-        [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps",
-         "--no-index", "--ignore-installed", str(wheel)],
-        cwd=place, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "--python",
+            str(python),
+            "install",
+            "--quiet",
+            "--no-deps",
+            "--no-index",
+            "--ignore-installed",
+            str(wheel),
+        ],
+        cwd=place,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     work = place / "work"
@@ -60,9 +88,12 @@ def installed(wheel: Path, place: Path, **more: str) -> Run:
 
     def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [str(python.parent / program), *arguments], cwd=work, capture_output=True, text=True,
+            [str(python.parent / program), *arguments],
+            cwd=work,
+            capture_output=True,
+            text=True,
             env={**env, "OMP_NUM_THREADS": "1", "NNODE_DATA": "", "MPLBACKEND": "agg", **more},
             check=False,
-        )  # fmt: skip
+        )
 
     return run

@@ -19,11 +19,17 @@ def test_usual_names_stay(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "found"),
     [
-        ("../../escaped", "__.._escaped"), ("/etc/passwd", "_etc_passwd"), ("..", "_"), ("", "_"),
-        ("a\\b", "a_b"), ("C:x", "C_x"), (".hidden", "_hidden"), ("a\0b\n", "a_b_"),
+        ("../../escaped", "__.._escaped"),
+        ("/etc/passwd", "_etc_passwd"),
+        ("..", "_"),
+        ("", "_"),
+        ("a\\b", "a_b"),
+        ("C:x", "C_x"),
+        (".hidden", "_hidden"),
+        ("a\0b\n", "a_b_"),
         ("a" * 300, "a" * 100),
     ],
-)  # fmt: skip
+)
 def test_signs_of_paths_do_not(name: str, found: str) -> None:
     assert file_name(name) == found
 

@@ -8,9 +8,23 @@ import sys
 import nnode
 
 NAMES = [
-    "Calibration", "Calibrator", "Check", "Report", "Sequence", "Sequences", "Simulated",
-    "__version__", "check", "diagnose", "drive", "fit", "load", "replay", "sequences", "simulate",
-]  # fmt: skip
+    "Calibration",
+    "Calibrator",
+    "Check",
+    "Report",
+    "Sequence",
+    "Sequences",
+    "Simulated",
+    "__version__",
+    "check",
+    "diagnose",
+    "drive",
+    "fit",
+    "load",
+    "replay",
+    "sequences",
+    "simulate",
+]
 
 
 def test_completion_finds_the_public_names_without_loading_torch() -> None:

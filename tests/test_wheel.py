@@ -59,9 +59,13 @@ def test_a_command_takes_what_its_script_takes(alone: Run, name: str) -> None:
     installed = alone("nnode", name, "--help")
     assert installed.returncode == 0, installed.stderr
     script = subprocess.run(
-        [sys.executable, f"scripts/{name}.py", "--help"], cwd=ROOT, capture_output=True, text=True,
-        env={**os.environ, "NNODE_DATA": ""}, check=False,
-    )  # fmt: skip
+        [sys.executable, f"scripts/{name}.py", "--help"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "NNODE_DATA": ""},
+        check=False,
+    )
     said = re.sub(r"python scripts/(\w+)\.py", r"nnode \1", script.stdout)
     said = re.sub(r"(torchrun \S+) scripts/(\w+)\.py", r"\1 -m nnode \2", said)
     assert installed.stdout == said
@@ -76,10 +80,18 @@ def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Ru
             rows += [f"{number},{time},{number}/{i},{x}" for i, x in enumerate(places.tolist())]
     (work / "mine.csv").write_text("\n".join(rows))
     done = alone(
-        "nnode", "train", "model=lin", "model.leader=measured", "solver=fused", "optimizer=lbfgs",
-        "data=table", "data.path=mine.csv", "data.domain=traffic", "trainer.max_epochs=3",
+        "nnode",
+        "train",
+        "model=lin",
+        "model.leader=measured",
+        "solver=fused",
+        "optimizer=lbfgs",
+        "data=table",
+        "data.path=mine.csv",
+        "data.domain=traffic",
+        "trainer.max_epochs=3",
         "hydra.run.dir=run",
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads((work / "run" / "result.json").read_text())
     assert result["summary"]["cost_train"] < result["summary"]["cost_start"]
@@ -88,9 +100,12 @@ def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Ru
     metrics = json.loads((work / "e" / "metrics.json").read_text())
     assert metrics["J"] == pytest.approx(result["summary"]["cost_heldout"], rel=1e-9)
     done = alone(
-        "nnode", "train", "resume=run/checkpoints/last.pt", "trainer.max_epochs=5",
+        "nnode",
+        "train",
+        "resume=run/checkpoints/last.pt",
+        "trainer.max_epochs=5",
         "hydra.run.dir=run",
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads((work / "run" / "result.json").read_text())["history"][-1]["epoch"] == 5
 

@@ -95,6 +95,11 @@ def _cells(ax: Axes, shares: pd.DataFrame) -> None:
         if np.isfinite(value) and value >= _WRITTEN:
             colour = "black" if value >= _PALE else "white"
             ax.text(
-                j, i, f"{100 * value:.0f}", ha="center", va="center", color=colour,
+                j,
+                i,
+                f"{100 * value:.0f}",
+                ha="center",
+                va="center",
+                color=colour,
                 fontsize=SMALL_FONT,
-            )  # fmt: skip
+            )

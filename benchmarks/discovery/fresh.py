@@ -44,9 +44,12 @@ def on_fresh(
         path = Path(folder) / "fresh.csv"
         fresh.to_csv(path, index=False)
         data = TableOptions(
-            domain=domain, path=str(path), walls=None if walls is None else str(walls),
-            name="table", faults=Faults.drop,
-        )  # fmt: skip
+            domain=domain,
+            path=str(path),
+            walls=None if walls is None else str(walls),
+            name="table",
+            faults=Faults.drop,
+        )
         sequences = read_inputs(data, Path(folder)).sequences
     base = _base(report, names)
     comparing = Comparing(windows_of(base, sequences), base)

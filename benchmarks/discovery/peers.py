@@ -74,9 +74,12 @@ def peers_on_table(
     built = OmegaConf.to_container(merged, enum_to_str=True)
     system = build_model(cast(dict[str, Any], built), seed)
     data = TableOptions(
-        domain=domain, path=str(path), walls=None if walls is None else str(walls),
-        name="table", faults=Faults.drop,
-    )  # fmt: skip
+        domain=domain,
+        path=str(path),
+        walls=None if walls is None else str(walls),
+        name="table",
+        faults=Faults.drop,
+    )
     with TemporaryDirectory(prefix="nnode-peers-") as scratch:
         sequences = read_inputs(data, Path(scratch)).sequences
     division = divide(sequences, DiscoverOptions(seed=seed))

@@ -26,9 +26,10 @@ _SOURCES = (
     "nnode/app/discover.py",
     *(f"benchmarks/discovery/{n}.py" for n in ("fresh", "peers", "task")),
 )
-_FOLDERS = ("benchmarks/truths", *(
-    f"nnode/{name}" for name in ("discover", "models", "data", "calibrate", "solvers")
-))  # fmt: skip
+_FOLDERS = (
+    "benchmarks/truths",
+    *(f"nnode/{name}" for name in ("discover", "models", "data", "calibrate", "solvers")),
+)
 
 #: What of a peer's score is kept.
 _KEPT = ("named", "exact", "class_right", "found", "false_names", "closure", "worse", "right")
@@ -120,9 +121,12 @@ def task_of(
     """A case as a task that is kept; larger ones start first."""
     size = case.n_sequences * (1.0 if case.domain == "traffic" else 2.0)
     arguments = {
-        "case": case.to_dict(), "peers": peers, "seeds_of": seeds_of, "structure": structure,
+        "case": case.to_dict(),
+        "peers": peers,
+        "seeds_of": seeds_of,
+        "structure": structure,
         "fresh": fresh,
-    }  # fmt: skip
+    }
     return Task(case.key, diagnose_case, arguments, cost=size)
 
 

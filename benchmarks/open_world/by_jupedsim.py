@@ -34,9 +34,14 @@ Draw = Callable[[np.random.Generator], tuple[str, dict[str, float], dict[str, fl
 
 
 def _social(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    person = {"mass": 80.0, "radius": 0.25, "reaction_time": rng.uniform(0.4, 0.7),
-              "agent_scale": rng.uniform(80, 240), "force_distance": rng.uniform(0.2, 0.4),
-              "obstacle_scale": rng.uniform(150, 400)}  # fmt: skip
+    person = {
+        "mass": 80.0,
+        "radius": 0.25,
+        "reaction_time": rng.uniform(0.4, 0.7),
+        "agent_scale": rng.uniform(80, 240),
+        "force_distance": rng.uniform(0.2, 0.4),
+        "obstacle_scale": rng.uniform(150, 400),
+    }
     # no bodies: contacts are rare and stiff
     return "SocialForceModel", {"body_force": 0.0, "friction": 0.0}, person
 
@@ -51,14 +56,19 @@ def _centrifugal(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[
 
 
 def _free(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    model = {"strength_neighbor_repulsion": rng.uniform(4, 8),
-             "range_neighbor_repulsion": rng.uniform(0.1, 0.3)}  # fmt: skip
+    model = {
+        "strength_neighbor_repulsion": rng.uniform(4, 8),
+        "range_neighbor_repulsion": rng.uniform(0.1, 0.3),
+    }
     return "CollisionFreeSpeedModel", model, {"time_gap": rng.uniform(0.8, 1.3), "radius": 0.2}
 
 
 def _foreseeing(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    person = {"time_gap": rng.uniform(0.8, 1.2), "anticipation_time": rng.uniform(0.6, 1.4),
-              "reaction_time": rng.uniform(0.2, 0.4)}  # fmt: skip
+    person = {
+        "time_gap": rng.uniform(0.8, 1.2),
+        "anticipation_time": rng.uniform(0.6, 1.4),
+        "reaction_time": rng.uniform(0.2, 0.4),
+    }
     return "AnticipationVelocityModel", {}, person
 
 
@@ -106,7 +116,7 @@ SCENES: dict[str, Scene] = {
     # its two ends push like small obstacles; who meets nobody there does not show them
     "sf_door": Scene(_social, replace(_OTHER, allowed=(*_RANGE, "obstacle")), door=True),
     "cfsm_door": Scene(_free, replace(_SEEN, allowed=(*_VIEW, "obstacle")), door=True),
-}  # fmt: skip
+}
 
 
 def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
@@ -135,11 +145,13 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
         for number in range(SEQUENCES):
             path = Path(place) / f"{number}.sqlite"
             simulation = jupedsim.Simulation(
-                model=getattr(jupedsim, kind)(**values), geometry=room, dt=STEP,
+                model=getattr(jupedsim, kind)(**values),
+                geometry=room,
+                dt=STEP,
                 trajectory_writer=jupedsim.SqliteTrajectoryWriter(
                     output_file=path, every_nth_frame=round(SAMPLE / STEP)
                 ),
-            )  # fmt: skip
+            )
             rows.append(_moved(jupedsim, simulation, scene, f"{kind}AgentParameters", person, rng))
             rows[-1].insert(0, "sequence", f"s{number:03d}")
     table = pd.concat(rows, ignore_index=True)
@@ -155,9 +167,13 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
 
 
 def _moved(
-    jupedsim: Any, simulation: Any, scene: Scene, kind: str, person: dict[str, float],
+    jupedsim: Any,
+    simulation: Any,
+    scene: Scene,
+    kind: str,
+    person: dict[str, float],
     rng: np.random.Generator,
-) -> pd.DataFrame:  # fmt: skip
+) -> pd.DataFrame:
     """One sequence: time, agent, x, y."""
     stage = simulation.add_direct_steering_stage()
     journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
@@ -200,9 +216,13 @@ def diagnosed_people(scene: str, seed: int) -> dict[str, Any]:
             walls.to_csv(path, index=False)
         report, nearest, seconds = diagnosed(table, "crowd", seed, model=model, walls=path)
     return {
-        "program": "JuPedSim", "scene": scene, "seed": seed, "asked": "sf",
-        **SCENES[scene].answer.judge(report, nearest), "seconds": seconds,
-    }  # fmt: skip
+        "program": "JuPedSim",
+        "scene": scene,
+        "seed": seed,
+        "asked": "sf",
+        **SCENES[scene].answer.judge(report, nearest),
+        "seconds": seconds,
+    }
 
 
 def cases(first_seed: int, number: int) -> list[dict[str, Any]]:

@@ -40,9 +40,13 @@ Draw = Callable[[np.random.Generator], dict[str, float]]
 
 
 def _idm(rng: np.random.Generator) -> dict[str, float]:
-    return {"accel": rng.uniform(0.8, 2), "decel": rng.uniform(1.2, 2.5),
-            "tau": rng.uniform(0.9, 1.6), "minGap": rng.uniform(1.5, 2.5),
-            "maxSpeed": rng.uniform(24, 34)}  # fmt: skip
+    return {
+        "accel": rng.uniform(0.8, 2),
+        "decel": rng.uniform(1.2, 2.5),
+        "tau": rng.uniform(0.9, 1.6),
+        "minGap": rng.uniform(1.5, 2.5),
+        "maxSpeed": rng.uniform(24, 34),
+    }
 
 
 def _krauss(rng: np.random.Generator) -> dict[str, float]:
@@ -188,16 +192,44 @@ def _written(
     (folder / "a.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
     (folder / "a.con.xml").write_text(f"<connections>{''.join(goes_on)}</connections>")
     (folder / "a.rou.xml").write_text(f"<routes>{''.join(cars)}</routes>")
-    made = [home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-            "-x", folder / "a.con.xml", "-o", folder / "a.net.xml", "--no-internal-links",
-            "--junctions.minimal-shape"]  # fmt: skip
+    made = [
+        home / "bin" / "netconvert",
+        "-n",
+        folder / "a.nod.xml",
+        "-e",
+        folder / "a.edg.xml",
+        "-x",
+        folder / "a.con.xml",
+        "-o",
+        folder / "a.net.xml",
+        "--no-internal-links",
+        "--junctions.minimal-shape",
+    ]
     subprocess.run([str(part) for part in made], check=True, capture_output=True)
-    return [str(part) for part in (
-        home / "bin" / "sumo", "-n", folder / "a.net.xml", "-r", folder / "a.rou.xml",
-        "--step-length", STEP, "--precision", 6, "--no-step-log", "--no-warnings",
-        "--seed", int(rng.integers(1 << 30)), "--fcd-output", folder / "fcd.xml",
-        "--fcd-output.attributes", "id,type,x,y", "--collision.action", "none",
-    )]  # fmt: skip
+    return [
+        str(part)
+        for part in (
+            home / "bin" / "sumo",
+            "-n",
+            folder / "a.net.xml",
+            "-r",
+            folder / "a.rou.xml",
+            "--step-length",
+            STEP,
+            "--precision",
+            6,
+            "--no-step-log",
+            "--no-warnings",
+            "--seed",
+            int(rng.integers(1 << 30)),
+            "--fcd-output",
+            folder / "fcd.xml",
+            "--fcd-output.attributes",
+            "id,type,x,y",
+            "--collision.action",
+            "none",
+        )
+    ]
 
 
 def _simulated(command: list[str], home: Path, scene: Scene, rng: np.random.Generator) -> None:
@@ -251,8 +283,9 @@ def _read(path: Path) -> pd.DataFrame:
         if at >= WARM and round(at / STEP) % EVERY == 0:
             rows += [
                 (v.get("id"), v.get("type"), at, float(v.get("x", "nan")))
-                for v in step if not v.get("id", "").startswith("unseen")
-            ]  # fmt: skip
+                for v in step
+                if not v.get("id", "").startswith("unseen")
+            ]
         step.clear()
     table = pd.DataFrame(rows, columns=["agent", "type", "time", "x"])
     kind = table.pop("type").str.partition(".")[0]
@@ -266,9 +299,13 @@ def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]
     """One scene, diagnosed; plain JSON, see :meth:`Answer.judge`."""
     report, nearest, seconds = diagnosed(recorded(scene, seed), "traffic", seed, model=asked)
     return {
-        "program": "SUMO", "scene": scene, "seed": seed, "asked": asked,
-        **SCENES[scene].answer.judge(report, nearest), "seconds": seconds,
-    }  # fmt: skip
+        "program": "SUMO",
+        "scene": scene,
+        "seed": seed,
+        "asked": asked,
+        **SCENES[scene].answer.judge(report, nearest),
+        "seconds": seconds,
+    }
 
 
 def cases(first_seed: int, number: int) -> list[dict[str, Any]]:

@@ -49,11 +49,15 @@ def diagnosed_case(law: str, seed: int, asked: str, **size: Any) -> dict[str, An
     own = next((one for one in ranking if one["name"] == law), None)
     first = ranking[0]["name"]
     row: dict[str, Any] = {
-        "law": law, "seed": seed, "asked": asked, "parameters": parameters, "first": first,
+        "law": law,
+        "seed": seed,
+        "asked": asked,
+        "parameters": parameters,
+        "first": first,
         "behind": None if own is None else own["behind"],
         "p": None if own is None else own["p_value"],
         "seconds": seconds,
-    }  # fmt: skip
+    }
     for who, what, one in (("asked", asked, report), ("nearest", first, nearest or report)):
         names = [effect["name"] for effect in one["effects"]]
         row[f"{who}_verdict"] = one["verdict"]

@@ -39,8 +39,12 @@ def criteria(rows: list[dict[str, Any]]) -> pd.DataFrame:
     first = sum(row["first"] == row["law"] for row in rows)
     # who cannot be told from the first is no wrong answer, but no right one either
     tied = sum(row["first"] != row["law"] and (row["p"] or 0) > 0.05 for row in rows)
-    diagnoses = [(row, who) for row in rows for who in ("asked", "nearest")
-                 if who == "asked" or row["first"] != row["asked"]]  # fmt: skip
+    diagnoses = [
+        (row, who)
+        for row in rows
+        for who in ("asked", "nearest")
+        if who == "asked" or row["first"] != row["asked"]
+    ]
     false = sum(bool(row[f"{who}_false"]) for row, who in diagnoses)
     own = [row for row in rows if row["first"] == row["law"]]
     silent = sum(not row["nearest_names"] for row in own)
@@ -79,9 +83,12 @@ def scene_criteria(rows: list[dict[str, Any]]) -> pd.DataFrame:
     lines = [
         ("the written answer", "85 %", share(sum(row["right"] for row in rows), len(rows))),
         ("a false name", "5 %", share(sum(bool(row["false"]) for row in rows), len(rows))),
-        ("the law that the program has comes first", "",
-         share(sum(row["law_right"] for row in known), len(known))),
-    ]  # fmt: skip
+        (
+            "the law that the program has comes first",
+            "",
+            share(sum(row["law_right"] for row in known), len(known)),
+        ),
+    ]
     return pd.DataFrame(lines, columns=["what", "asked for", "reached"])
 
 

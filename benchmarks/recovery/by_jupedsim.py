@@ -57,9 +57,11 @@ def groups(
     every = round(SAMPLE / dt)
     writer = jupedsim.SqliteTrajectoryWriter(output_file=path, every_nth_frame=1)
     simulation = jupedsim.Simulation(
-        model=model, geometry=shapely.box(-1.5 * goal, -1.5 * goal, 1.5 * goal, 1.5 * goal), dt=dt,
+        model=model,
+        geometry=shapely.box(-1.5 * goal, -1.5 * goal, 1.5 * goal, 1.5 * goal),
+        dt=dt,
         trajectory_writer=writer,
-    )  # fmt: skip
+    )
     stage = simulation.add_direct_steering_stage()
     journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
     start, goals = places(np.random.default_rng(seed), apart, goal)
@@ -109,8 +111,11 @@ def pieces(whole: Sequence, seconds: float) -> list[Sequence]:
     assert whole.v is not None
     return [
         replace(
-            whole, name=f"{whole.name}-{k}", time=whole.time[part], x=whole.x[part],
+            whole,
+            name=f"{whole.name}-{k}",
+            time=whole.time[part],
+            x=whole.x[part],
             v=whole.v[part],
         )
         for k, part in parts
-    ]  # fmt: skip
+    ]

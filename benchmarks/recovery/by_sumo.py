@@ -18,10 +18,22 @@ FOLLOWERS, SECONDS = 7, 60.0
 #: Speed of the leader, m/s, linear between these times, s: it speeds up and slows down, stops
 #: and starts again.
 PROFILE = np.array(
-    [(0, 12), (6, 12), (11, 22), (17, 22), (19, 15), (24, 17), (30, 0), (37, 0), (45, 18), (50, 18),
-     (52, 12), (60, 20)],
+    [
+        (0, 12),
+        (6, 12),
+        (11, 22),
+        (17, 22),
+        (19, 15),
+        (24, 17),
+        (30, 0),
+        (37, 0),
+        (45, 18),
+        (50, 18),
+        (52, 12),
+        (60, 20),
+    ],
     dtype=float,
-)  # fmt: skip
+)
 #: Decimals of SUMO's output.
 DIGITS = 9
 
@@ -50,11 +62,23 @@ def platoon(
     """
     write_scene(home, folder, follow, values, speed=float(profile[0, 1]), gap=gap)
     command = [
-        home / "bin" / "sumo", "-n", folder / "a.net.xml", "-r", folder / "a.rou.xml",
-        "--step-length", STEP, "--precision", DIGITS, "--no-step-log", "--no-warnings",
-        "--fcd-output", folder / "fcd.xml.gz", "--fcd-output.attributes",
-        "id,type,speed,pos,lane", *(["--step-method.ballistic"] if ballistic else []),
-    ]  # fmt: skip
+        home / "bin" / "sumo",
+        "-n",
+        folder / "a.net.xml",
+        "-r",
+        folder / "a.rou.xml",
+        "--step-length",
+        STEP,
+        "--precision",
+        DIGITS,
+        "--no-step-log",
+        "--no-warnings",
+        "--fcd-output",
+        folder / "fcd.xml.gz",
+        "--fcd-output.attributes",
+        "id,type,speed,pos,lane",
+        *(["--step-method.ballistic"] if ballistic else []),
+    ]
     _led([str(part) for part in command], home, profile, round(seconds / STEP))
     return folder / "fcd.xml.gz"
 
@@ -94,8 +118,15 @@ def write_scene(
     (folder / "a.edg.xml").write_text(
         '<edges><edge id="e" from="a" to="b" numLanes="1" speed="60"/></edges>'
     )
-    call(home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-          "-o", folder / "a.net.xml")  # fmt: skip
+    call(
+        home / "bin" / "netconvert",
+        "-n",
+        folder / "a.nod.xml",
+        "-e",
+        folder / "a.edg.xml",
+        "-o",
+        folder / "a.net.xml",
+    )
 
 
 def _led(command: list[str], home: Path, profile: np.ndarray, steps: int) -> None:

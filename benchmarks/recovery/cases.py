@@ -23,10 +23,21 @@ _IDM = {"v0": 28.0, "T": 1.1, "s0": 2.3, "a": 1.4, "b": 2.0}
 _KRAUSS = {"v0": 21.0, "T": 1.1, "s0": 2.3, "a": 1.9, "b": 3.5}
 #: A leader that never drives at the followers' v0 and never stops.
 SLOWLY = np.array(
-    [(0, 8), (6, 8), (11, 14), (17, 14), (20, 6), (28, 5), (34, 12), (40, 12), (45, 4), (52, 13),
-     (60, 10)],
+    [
+        (0, 8),
+        (6, 8),
+        (11, 14),
+        (17, 14),
+        (20, 6),
+        (28, 5),
+        (34, 12),
+        (40, 12),
+        (45, 4),
+        (52, 13),
+        (60, 10),
+    ],
     dtype=float,
-)  # fmt: skip
+)
 #: JuPedSim's people: mass, kg, desired speed, m/s, time to reach it, s.
 _MASS, _PACE, _TAU = 80.0, 1.3, 0.5
 #: Errors of measured positions, m: of vehicles, of people.
@@ -82,16 +93,25 @@ def _social_force(program: str, name: str, typed: dict[str, float], *, own: bool
             body_force=typed["k"] * _MASS, friction=typed["kappa"] * _MASS
         )
         values = {
-            "mass": _MASS, "desired_speed": typed["v0"], "reaction_time": typed["tau"],
-            "agent_scale": typed["A"] * _MASS, "force_distance": typed["B"], "radius": 0.3,
-        }  # fmt: skip
+            "mass": _MASS,
+            "desired_speed": typed["v0"],
+            "reaction_time": typed["tau"],
+            "agent_scale": typed["A"] * _MASS,
+            "force_distance": typed["B"],
+            "radius": 0.3,
+        }
         sequences = [
             by_jupedsim.groups(
-                jupedsim, folder / f"{seed}.sqlite", model,
-                jupedsim.SocialForceModelAgentParameters, values, seed=seed, before=own,
+                jupedsim,
+                folder / f"{seed}.sqlite",
+                model,
+                jupedsim.SocialForceModelAgentParameters,
+                values,
+                seed=seed,
+                before=own,
             )
             for seed in range(2)
-        ]  # fmt: skip
+        ]
         law = laws.stepping(laws.SOCIAL_FORCE, by_jupedsim.STEP if own else 0.0)
         return recover(law, typed, sequences, dt=by_jupedsim.STEP, error=ROOM)
 
@@ -105,18 +125,31 @@ def _centrifugal() -> Case:
         jupedsim = import_module("jupedsim")
         model = jupedsim.GeneralizedCentrifugalForceModel(strength_neighbor_repulsion=typed["eta"])
         values = {
-            "mass": 1.0, "desired_speed": typed["v0"], "tau": typed["tau"], "a_v": typed["a_v"],
-            "a_min": 0.2, "b_min": 0.2, "b_max": 0.4,
-        }  # fmt: skip
+            "mass": 1.0,
+            "desired_speed": typed["v0"],
+            "tau": typed["tau"],
+            "a_v": typed["a_v"],
+            "a_min": 0.2,
+            "b_min": 0.2,
+            "b_max": 0.4,
+        }
         # JuPedSim turns desired directions slowly: goals so far away that they do not turn
         sequences = [
             by_jupedsim.groups(
-                jupedsim, folder / f"{seed}.sqlite", model,
-                jupedsim.GeneralizedCentrifugalForceModelAgentParameters, values, seed=seed,
-                before=True, apart=1.2, speed=1.0, oriented=True, goal=9000.0,
+                jupedsim,
+                folder / f"{seed}.sqlite",
+                model,
+                jupedsim.GeneralizedCentrifugalForceModelAgentParameters,
+                values,
+                seed=seed,
+                before=True,
+                apart=1.2,
+                speed=1.0,
+                oriented=True,
+                goal=9000.0,
             )
             for seed in range(2)
-        ]  # fmt: skip
+        ]
         law = laws.stepping(laws.CENTRIFUGAL, by_jupedsim.STEP)
         # who passes on which side is a matter of yes and no: long paths have many local minima
         parts = [part for whole in sequences for part in by_jupedsim.pieces(whole, seconds=1.0)]
@@ -138,9 +171,13 @@ def _collision_free() -> Case:
         pieces: list[Sequence] = []
         for seed in range(2):
             found = by_jupedsim.groups(
-                jupedsim, folder / f"{seed}.sqlite", model,
-                jupedsim.CollisionFreeSpeedModelAgentParameters, values, seed=seed,
-            )  # fmt: skip
+                jupedsim,
+                folder / f"{seed}.sqlite",
+                model,
+                jupedsim.CollisionFreeSpeedModelAgentParameters,
+                values,
+                seed=seed,
+            )
             assert found.destination is not None
             # whose way is free is a matter of yes and no: long paths have many local minima
             way = np.sign(found.destination[:, :1]) * np.array([[_PACE, 0.0]])
@@ -161,35 +198,53 @@ CASES: dict[str, Case] = {
         "IDM, ballistic", "IDM", "`idm`, a ≥ −v/dt", laws.IDM, _IDM, ballistic=True
     ),
     "krauss_moving": _sumo(
-        "KraussOrig1, Euler, never at rest nor at v0", "KraussOrig1", "`krauss`",
-        CAR_FOLLOWING_LAWS["krauss"], _KRAUSS, profile=SLOWLY,
+        "KraussOrig1, Euler, never at rest nor at v0",
+        "KraussOrig1",
+        "`krauss`",
+        CAR_FOLLOWING_LAWS["krauss"],
+        _KRAUSS,
+        profile=SLOWLY,
     ),
     "krauss_stopping": _sumo(
         "KraussOrig1, Euler", "KraussOrig1", "`krauss`", CAR_FOLLOWING_LAWS["krauss"], _KRAUSS
     ),
     "krauss_crawl": _sumo(
-        "KraussOrig1, Euler", "KraussOrig1", "`krauss`, last b dt at b dt", laws.KRAUSS_ORIG,
+        "KraussOrig1, Euler",
+        "KraussOrig1",
+        "`krauss`, last b dt at b dt",
+        laws.KRAUSS_ORIG,
         _KRAUSS,
     ),
     "krauss_ballistic": _sumo(
-        "Krauss, ballistic, emergencyDecel = decel", "Krauss", "its formula",
-        laws.KRAUSS_BALLISTIC, _KRAUSS, ballistic=True, emergency=_KRAUSS["b"],
+        "Krauss, ballistic, emergencyDecel = decel",
+        "Krauss",
+        "its formula",
+        laws.KRAUSS_BALLISTIC,
+        _KRAUSS,
+        ballistic=True,
+        emergency=_KRAUSS["b"],
     ),
     "krauss_default": _sumo(
         "Krauss, Euler: SUMO's default", "Krauss", "`krauss`", CAR_FOLLOWING_LAWS["krauss"], _KRAUSS
     ),
     "force_contact": _social_force(
-        "social force, people touch", "its formula, its steps",
-        {"A": 2.0, "B": 0.3, "k": 150.0, "kappa": 50.0, "v0": _PACE, "tau": _TAU}, own=True,
+        "social force, people touch",
+        "its formula, its steps",
+        {"A": 2.0, "B": 0.3, "k": 150.0, "kappa": 50.0, "v0": _PACE, "tau": _TAU},
+        own=True,
     ),
     "force_euler": _social_force(
-        "social force, people touch", "its formula, Euler's steps",
-        {"A": 2.0, "B": 0.3, "k": 150.0, "kappa": 50.0, "v0": _PACE, "tau": _TAU}, own=False,
+        "social force, people touch",
+        "its formula, Euler's steps",
+        {"A": 2.0, "B": 0.3, "k": 150.0, "kappa": 50.0, "v0": _PACE, "tau": _TAU},
+        own=False,
     ),
     "force_default": _social_force(
-        "social force, its defaults: nobody touches", "its formula, its steps",
-        {"A": 25.0, "B": 0.08, "k": 1500.0, "kappa": 3000.0, "v0": _PACE, "tau": _TAU}, own=True,
+        "social force, its defaults: nobody touches",
+        "its formula, its steps",
+        {"A": 25.0, "B": 0.08, "k": 1500.0, "kappa": 3000.0, "v0": _PACE, "tau": _TAU},
+        own=True,
     ),
     "centrifugal": _centrifugal(),
     "collision_free": _collision_free(),
-}  # fmt: skip
+}

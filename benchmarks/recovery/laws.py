@@ -115,8 +115,15 @@ CENTRIFUGAL: dict[str, Any] = {
         "v0": {"value": "1.3 m/s", "low": "0.1 m/s", "high": "3 m/s"},
         "tau": {"value": "0.5 s", "low": "0.05 s", "high": "5 s"},
         "a_v": {"value": "0.5 s", "low": "0 s", "high": "2 s"},
-        "a_min": "0.2 m", "b_min": "0.2 m", "b_max": "0.4 m", "near": "0.6 m", "closest": "0.4 m",
-        "far": "1.9 m", "reach": "2 m", "most": "9", "lookahead": "0 s",
+        "a_min": "0.2 m",
+        "b_min": "0.2 m",
+        "b_max": "0.4 m",
+        "near": "0.6 m",
+        "closest": "0.4 m",
+        "far": "1.9 m",
+        "reach": "2 m",
+        "most": "9",
+        "lookahead": "0 s",
     },
     "where": {
         "to_x": "goal_x - x - lookahead*vx",
@@ -154,4 +161,4 @@ CENTRIFUGAL: dict[str, Any] = {
         "vy": "(v0*to_y/way - vy)/tau + push_y",
     },
     "source": "JuPedSim's GeneralizedCentrifugalForceModel",
-}  # fmt: skip
+}

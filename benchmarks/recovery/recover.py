@@ -114,8 +114,9 @@ def recover(
     ends = [_best(problem, start) for start in starts]
     paths = [np.sqrt((_metres(problem, end.row)[0] ** 2).sum() / moves.sum()) for end in ends]
     best = ends[int(np.argmin(paths))]
-    alike = np.array([end.row for end, path in zip(ends, paths, strict=True)
-                      if path < min(paths) + ROUNDED])  # fmt: skip
+    alike = np.array(
+        [end.row for end, path in zip(ends, paths, strict=True) if path < min(paths) + ROUNDED]
+    )
     agreed = np.ptp(alike, axis=0) < WIDE * np.abs(truth)
     noise, later = np.zeros(batch.x.shape), batch.valid.numpy().copy()
     later[0] = False
@@ -184,9 +185,11 @@ def _best(problem: ResidualProblem, start: np.ndarray) -> Minimum:
         bounds=list(zip(problem.low / first.row, problem.high / first.row, strict=True)),
         options={
             "initial_simplex": 1 + WIDE / 5 * np.eye(len(start) + 1, len(start)),
-            "xatol": 1e-12, "fatol": 0.0, "maxfev": 1000,
+            "xatol": 1e-12,
+            "fatol": 0.0,
+            "maxfev": 1000,
         },
-    )  # fmt: skip
+    )
     second = pooled(problem, first.row * by_simplex.x, steps=10, tolerance=1e-9)
     return replace(second, steps=first.steps + second.steps)
 

@@ -61,9 +61,13 @@ class Worker:
     def __init__(self, checkout: Path, case: str) -> None:
         environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _SCRIPT, *CASES[case]], cwd=checkout, env=environment,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [sys.executable, "-c", _SCRIPT, *CASES[case]],
+            cwd=checkout,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         self.found = [float(number) for number in self._read().split()]
 
     def _read(self) -> str:

@@ -83,9 +83,12 @@ def performance_figure(results: dict[str, Any]) -> Figure | None:
     handles.append(Line2D([], [], color=GREY, linewidth=0.7, label="slope 1"))
     if panels:
         figure.legend(
-            handles=handles, loc="outside right center", fontsize=SMALL_FONT, frameon=False,
+            handles=handles,
+            loc="outside right center",
+            fontsize=SMALL_FONT,
+            frameon=False,
             handlelength=3.2,
-        )  # fmt: skip
+        )
     machine = results["machine"]
     figure.suptitle(f"{machine['processor']}, {results['dtype']}", fontsize=FONT)
     return figure

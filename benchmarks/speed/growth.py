@@ -41,14 +41,22 @@ def print_growth(rows: list[dict[str, Any]]) -> None:
         table.add_column(head, justify="right")
     before: dict[str, Any] | None = None
     for row in rows:
-        grown = "" if before is None else " and ".join(
-            f"{row[key] / before[key]:.2g}" for key in ("wall_s", "peak_memory_MB")
-        ) + f" (sequences {row['sequences'] / before['sequences']:.2g})"  # fmt: skip
+        grown = (
+            ""
+            if before is None
+            else " and ".join(
+                f"{row[key] / before[key]:.2g}" for key in ("wall_s", "peak_memory_MB")
+            )
+            + f" (sequences {row['sequences'] / before['sequences']:.2g})"
+        )
         table.add_row(
-            f"{row['sequences']:,}", f"{row['wall_s']:.1f}", f"{row['cpu_s']:.1f}",
-            f"{row['peak_memory_MB']:,.0f}", grown,
+            f"{row['sequences']:,}",
+            f"{row['wall_s']:.1f}",
+            f"{row['cpu_s']:.1f}",
+            f"{row['peak_memory_MB']:,.0f}",
+            grown,
             f"{row['verdict']}: {', '.join(row['effects'])}",
-        )  # fmt: skip
+        )
         before = row
     Console(width=120).print(table)
 

@@ -15,9 +15,13 @@ def print_problem(row: dict[str, Any]) -> None:
     table = Table(title=f"{row['shape']}, {row['problem']}")
     engines = row["engines"]
     heads = (
-        "engine", "median (ms)", "min … max (ms)", "first call (s)", "memory (MB)",
+        "engine",
+        "median (ms)",
+        "min … max (ms)",
+        "first call (s)",
+        "memory (MB)",
         "gradient error",
-    )  # fmt: skip
+    )
     fused = engines.get("fused_1")
     for head in (*heads, *(("times fused_1",) if fused else ())):
         table.add_column(head, justify="left" if head == "engine" else "right")

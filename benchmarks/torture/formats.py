@@ -36,12 +36,48 @@ ROOM = "POLYGON ((0 0, 20 0, 20 4, 0 4, 0 0), (4 1, 5 1, 5 2, 4 2, 4 1))"
 
 #: Cells of data frames that no file of text holds.
 CELLS: tuple[Any, ...] = (
-    None, pd.NA, pd.NaT, b"a\xff", b"1", 10**400, -(10**30), 1j, [1], {}, (), object, True, np.inf,
-    np.array([1, 2]), pd.Timestamp("2000-01-01"), pd.Timedelta("1s"), float("nan"), "",
-    "1", 2**63, "\x1b[31m", "x" * 5000, frozenset({1}), 1e308, -1e308,
-)  # fmt: skip
-_KINDS = ("object", "float32", "int8", "uint64", "string", "category", "complex", "bool", "Int64",
-          "datetime64[ns]", "timedelta64[s]", "Sparse[float]", "period[D]")  # fmt: skip
+    None,
+    pd.NA,
+    pd.NaT,
+    b"a\xff",
+    b"1",
+    10**400,
+    -(10**30),
+    1j,
+    [1],
+    {},
+    (),
+    object,
+    True,
+    np.inf,
+    np.array([1, 2]),
+    pd.Timestamp("2000-01-01"),
+    pd.Timedelta("1s"),
+    float("nan"),
+    "",
+    "1",
+    2**63,
+    "\x1b[31m",
+    "x" * 5000,
+    frozenset({1}),
+    1e308,
+    -1e308,
+)
+_KINDS = (
+    "object",
+    "float32",
+    "int8",
+    "uint64",
+    "string",
+    "category",
+    "complex",
+    "bool",
+    "Int64",
+    "datetime64[ns]",
+    "timedelta64[s]",
+    "Sparse[float]",
+    "period[D]",
+)
 
 
 def read_all(options: DataOptions, files: dict[str, Any]) -> None:
@@ -58,13 +94,30 @@ def read_all(options: DataOptions, files: dict[str, Any]) -> None:
 def ngsim() -> bytes:
     """Two lanes of three vehicles in feet, as the portal writes them."""
     rows = [
-        {"Vehicle_ID": n, "Frame_ID": k, "Total_Frames": 9, "Global_Time": 1113433135000 + 100 * k,
-         "Local_X": 5.0, "Local_Y": 60.0 * n + 4 * k, "Global_X": 0.0, "Global_Y": 0.0,
-         "v_Length": 15.0, "v_Width": 6.0, "v_Class": 2, "v_Vel": 40.0, "v_Acc": 0.0,
-         "Lane_ID": 1 + n % 2, "Preceding": 0, "Following": 0, "Space_Headway": 0.0,
-         "Time_Headway": 0.0, "Location": "i-80"}
-        for n in range(6) for k in range(1, 9)
-    ]  # fmt: skip
+        {
+            "Vehicle_ID": n,
+            "Frame_ID": k,
+            "Total_Frames": 9,
+            "Global_Time": 1113433135000 + 100 * k,
+            "Local_X": 5.0,
+            "Local_Y": 60.0 * n + 4 * k,
+            "Global_X": 0.0,
+            "Global_Y": 0.0,
+            "v_Length": 15.0,
+            "v_Width": 6.0,
+            "v_Class": 2,
+            "v_Vel": 40.0,
+            "v_Acc": 0.0,
+            "Lane_ID": 1 + n % 2,
+            "Preceding": 0,
+            "Following": 0,
+            "Space_Headway": 0.0,
+            "Time_Headway": 0.0,
+            "Location": "i-80",
+        }
+        for n in range(6)
+        for k in range(1, 9)
+    ]
     return str(pd.DataFrame(rows).to_csv(index=False)).encode()
 
 
@@ -78,10 +131,18 @@ def read_ngsim(path: Path) -> None:
 def highd(folder: Path) -> bytes:
     """Tracks; what is known of them is written to the folder."""
     rows = [
-        {"frame": k, "id": n, "x": 30.0 * n + k, "width": 4.5, "height": 2.0, "xVelocity": 25.0,
-         "laneId": 2}
-        for n in range(3) for k in range(1, 30)
-    ]  # fmt: skip
+        {
+            "frame": k,
+            "id": n,
+            "x": 30.0 * n + k,
+            "width": 4.5,
+            "height": 2.0,
+            "xVelocity": 25.0,
+            "laneId": 2,
+        }
+        for n in range(3)
+        for k in range(1, 30)
+    ]
     meta = pd.DataFrame({"id": range(3), "class": "Car", "drivingDirection": 2})
     folder.mkdir()
     (folder / f"01{RECORDING_META}").write_text("id,frameRate,speedLimit\n1,25,-1\n")
@@ -154,8 +215,9 @@ def flat_platoons() -> bytes:
     """Platoons as one row per vehicle and time."""
     rows = [
         {"run": "r", "position": p, "t": round(0.1 * k, 1), "v": 10, "gap": 15, "make": f"m{p}"}
-        for p in (1, 2, 3) for k in range(60)
-    ]  # fmt: skip
+        for p in (1, 2, 3)
+        for k in range(60)
+    ]
     return str(pd.DataFrame(rows).to_csv(index=False)).encode()
 
 
@@ -198,10 +260,16 @@ def _changed(frame: pd.DataFrame, rng: random.Random) -> pd.DataFrame:
             names[place] = rng.choice((None, 1, ("x", "y"), b"x", "\x1b", "x" * 5000, "x"))
             frame.columns = pd.Index(names, dtype=object)
         case _:
-            frame = rng.choice((
-                frame.iloc[:0], frame.iloc[:, :0], frame.T, frame.sample(frac=1.0, random_state=1),
-                pd.concat([frame, frame]), frame.set_index(frame.columns[place]),
-            ))  # fmt: skip
+            frame = rng.choice(
+                (
+                    frame.iloc[:0],
+                    frame.iloc[:, :0],
+                    frame.T,
+                    frame.sample(frac=1.0, random_state=1),
+                    pd.concat([frame, frame]),
+                    frame.set_index(frame.columns[place]),
+                )
+            )
     return frame
 
 

@@ -42,10 +42,32 @@ _HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 #: So many losses of a target are told in full.
 _TOLD = 20
 
-_STARTS = frozenset({"os.system", "os.exec", "os.posix_spawn", "os.spawn", "subprocess.Popen",
-                     "os.fork", "os.forkpty", "socket.connect", "pty.spawn"})  # fmt: skip
-_WRITES = frozenset({"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink",
-                     "os.truncate", "shutil.move", "shutil.rmtree"})  # fmt: skip
+_STARTS = frozenset(
+    {
+        "os.system",
+        "os.exec",
+        "os.posix_spawn",
+        "os.spawn",
+        "subprocess.Popen",
+        "os.fork",
+        "os.forkpty",
+        "socket.connect",
+        "pty.spawn",
+    }
+)
+_WRITES = frozenset(
+    {
+        "os.mkdir",
+        "os.rename",
+        "os.remove",
+        "os.rmdir",
+        "os.link",
+        "os.symlink",
+        "os.truncate",
+        "shutil.move",
+        "shutil.rmtree",
+    }
+)
 
 
 @dataclass
@@ -228,7 +250,13 @@ def rows(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -
     import pedpy  # noqa: F401  the children share it: loading takes longer than a thousand inputs
 
     return [
-        Row("fuzz", f.target, f.tried, f.losses, f.seconds,
-            {"read": f.read, "refused": f.refused, "MB": round(f.megabytes)})
+        Row(
+            "fuzz",
+            f.target,
+            f.tried,
+            f.losses,
+            f.seconds,
+            {"read": f.read, "refused": f.refused, "MB": round(f.megabytes)},
+        )
         for f in fuzz(folder, inputs, seed, names)
-    ]  # fmt: skip
+    ]

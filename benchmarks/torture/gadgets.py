@@ -81,8 +81,13 @@ def evil_checkpoint(content: bytes, rng: random.Random, outside: Path) -> bytes:
             return repacked(content, rng, lambda name, data: (f"{up}/{name}", data), stored)
         case _:
             made = io.BytesIO()
-            torch.save({**torch.load(io.BytesIO(content), weights_only=True),
-                        "config": gadget(rng, outside)}, made)  # fmt: skip
+            torch.save(
+                {
+                    **torch.load(io.BytesIO(content), weights_only=True),
+                    "config": gadget(rng, outside),
+                },
+                made,
+            )
             return made.getvalue()
 
 
@@ -103,10 +108,26 @@ def strange_checkpoint(content: bytes, rng: random.Random) -> bytes:
                 del place[key]
             else:
                 place[key] = rng.choice(
-                    [*NASTY, None, 0, -1, 10**18, float("nan"), float("inf"), [], {}, True, b"x",
-                     torch.zeros(0), torch.full((2, 2), float("nan")), torch.zeros(1).expand(10**6),
-                     torch.tensor(1j), {"a": 1}, [None]]
-                )  # fmt: skip
+                    [
+                        *NASTY,
+                        None,
+                        0,
+                        -1,
+                        10**18,
+                        float("nan"),
+                        float("inf"),
+                        [],
+                        {},
+                        True,
+                        b"x",
+                        torch.zeros(0),
+                        torch.full((2, 2), float("nan")),
+                        torch.zeros(1).expand(10**6),
+                        torch.tensor(1j),
+                        {"a": 1},
+                        [None],
+                    ]
+                )
             break
     made = io.BytesIO()
     torch.save(whole, made)

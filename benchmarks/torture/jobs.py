@@ -50,9 +50,13 @@ class Job:
     before: Callable[[], None] = field(default=lambda: None)
 
     def child(
-        self, root: Path, given: list[str], folder: Path, output: Path,
+        self,
+        root: Path,
+        given: list[str],
+        folder: Path,
+        output: Path,
         prelude: Callable[[], object] = lambda: None,
-    ) -> Child:  # fmt: skip
+    ) -> Child:
         """Start it in a process of its own, in a run's folder.
 
         Args:
@@ -150,11 +154,19 @@ class Small:
         prepare(data, folder / "data")
         where = {"folder": str(folder / "data"), "recording_name": "demo"}
         short = {"restarts": 1, "dt": 0.1, "iterations": 4, "bootstrap": 0, "steps": []}
-        tasks = [Task(f"fit-{model}-{seed}", fit,
-                      {**where, "model": model, "box": None, "seed": seed, **short})
-                 for model in ("lin", "log") for seed in (0, 1)]  # fmt: skip
-        tasks += [Task(f"scan-{model}", scan, {**where, "model": model, "points": 5, "dt": 0.1})
-                  for model in ("lin", "log")]  # fmt: skip
+        tasks = [
+            Task(
+                f"fit-{model}-{seed}",
+                fit,
+                {**where, "model": model, "box": None, "seed": seed, **short},
+            )
+            for model in ("lin", "log")
+            for seed in (0, 1)
+        ]
+        tasks += [
+            Task(f"scan-{model}", scan, {**where, "model": model, "points": 5, "dt": 0.1})
+            for model in ("lin", "log")
+        ]
         found = run_tasks(tasks, folder, workers=options.workers, fingerprint="demo")
         frame = pd.DataFrame({"task": list(found), "cost": [one["cost"] for one in found.values()]})
         return [TableBlock("costs", frame.set_index("task"), "Costs.")]
@@ -166,28 +178,77 @@ def jobs(raw: Path) -> list[Job]:
     source, table = f"data.source={raw}", raw / "lane.csv"
     _lane(recorded, table)
     return [
-        Job("prepare_data", ["data=demo_traffic", source], _prepared,
+        Job(
+            "prepare_data",
+            ["data=demo_traffic", source],
+            _prepared,
             lambda folder: 1.0 if (folder / MANIFEST).exists() and len(Store(folder)) else 0.0,
-            share=60),
-        Job("train",
-            ["experiment=demo_traffic", "model=n2", "optimizer=adadelta", "solver=fused",
-             "solver.dt=0.1", "trainer.max_epochs=6", "trainer.save_every=0.02", source],
-            _trained, _steps, 50, _resumed(source)),
-        Job("study", ["study=traffic", "study.workers=1"], _tasks, _names, 55,
-            before=lambda: _small_study(raw)),
-        Job("discover",
-            ["model=lin", "model.leader=measured", "data=table", f"data.path={table}",
-             "data.domain=traffic", "discover.effects=[relative_speed]",
-             "discover.max_effects=1", "discover.step=0.2", "discover.replay=false",
-             "discover.page=false"],
-            _reported, lambda folder: 0.0, 23),
-        Job("benchmark_discovery",
-            [f"benchmark_discovery.{option}" for option in (
-                "domains=[traffic]", "arms=[nothing]", "nothing_seeds=1", "sizes=[4]",
-                "variants=[white,autocorrelated,heterogeneous]", "noises=[0.05]",
-                "peer_seeds=0", "workers=1")],
-            _tasks, _names, 12, before=_small_diagnosis),
-    ]  # fmt: skip
+            share=60,
+        ),
+        Job(
+            "train",
+            [
+                "experiment=demo_traffic",
+                "model=n2",
+                "optimizer=adadelta",
+                "solver=fused",
+                "solver.dt=0.1",
+                "trainer.max_epochs=6",
+                "trainer.save_every=0.02",
+                source,
+            ],
+            _trained,
+            _steps,
+            50,
+            _resumed(source),
+        ),
+        Job(
+            "study",
+            ["study=traffic", "study.workers=1"],
+            _tasks,
+            _names,
+            55,
+            before=lambda: _small_study(raw),
+        ),
+        Job(
+            "discover",
+            [
+                "model=lin",
+                "model.leader=measured",
+                "data=table",
+                f"data.path={table}",
+                "data.domain=traffic",
+                "discover.effects=[relative_speed]",
+                "discover.max_effects=1",
+                "discover.step=0.2",
+                "discover.replay=false",
+                "discover.page=false",
+            ],
+            _reported,
+            lambda folder: 0.0,
+            23,
+        ),
+        Job(
+            "benchmark_discovery",
+            [
+                f"benchmark_discovery.{option}"
+                for option in (
+                    "domains=[traffic]",
+                    "arms=[nothing]",
+                    "nothing_seeds=1",
+                    "sizes=[4]",
+                    "variants=[white,autocorrelated,heterogeneous]",
+                    "noises=[0.05]",
+                    "peer_seeds=0",
+                    "workers=1",
+                )
+            ],
+            _tasks,
+            _names,
+            12,
+            before=_small_diagnosis,
+        ),
+    ]
 
 
 def _resumed(source: str) -> Callable[[Path], list[str] | None]:
@@ -226,10 +287,16 @@ def _lane(recorded: Path, table: Path) -> None:
 
     found = read_esimas(recorded)[:12]
     rows = [
-        {"sequence": s.name.replace("/", "-"), "time": t, "agent": f"{s.name}-{n}",
-         "x": s.x[k, n, 0]}
-        for s in found for k, t in enumerate(s.time) for n in range(s.n_agents)
-    ]  # fmt: skip
+        {
+            "sequence": s.name.replace("/", "-"),
+            "time": t,
+            "agent": f"{s.name}-{n}",
+            "x": s.x[k, n, 0],
+        }
+        for s in found
+        for k, t in enumerate(s.time)
+        for n in range(s.n_agents)
+    ]
     pd.DataFrame(rows).to_csv(table, index=False)
 
 

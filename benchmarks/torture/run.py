@@ -51,8 +51,11 @@ def torture(config: DictConfig, folder: Path) -> None:
         found = campaigns[name]()
         rows = keep(folder, name, found, how_made(("torch", "numpy", "pandas", "pyarrow")))
         lost = sum(len(row.losses) for row in found)
-        print(f"{name}: {sum(row.tried for row in found)} tried, {lost} lost, "
-              f"{time.monotonic() - start:.0f} s", flush=True)  # fmt: skip
+        print(
+            f"{name}: {sum(row.tried for row in found)} tried, {lost} lost, "
+            f"{time.monotonic() - start:.0f} s",
+            flush=True,
+        )
     show(rows)
     print(f"report: {folder / REPORT}")
     if any(row.losses for row in rows):

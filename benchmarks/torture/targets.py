@@ -74,35 +74,72 @@ class Target:
 
 def _trajectories() -> pd.DataFrame:
     rows = [
-        {"sequence": s, "time": 0.2 * k, "agent": f"a{n}", "x": 20.0 * n + 3.0 * k, "y": 1.0 * n,
-         "length": 4.5, "kind": "car", "group": "", "dest_x": 90.0, "dest_y": 1.0 * n}
-        for s in ("one", "two") for k in range(4) for n in range(3)
-    ]  # fmt: skip
+        {
+            "sequence": s,
+            "time": 0.2 * k,
+            "agent": f"a{n}",
+            "x": 20.0 * n + 3.0 * k,
+            "y": 1.0 * n,
+            "length": 4.5,
+            "kind": "car",
+            "group": "",
+            "dest_x": 90.0,
+            "dest_y": 1.0 * n,
+        }
+        for s in ("one", "two")
+        for k in range(4)
+        for n in range(3)
+    ]
     return pd.DataFrame(rows)
 
 
 def _vehicles() -> pd.DataFrame:
     rows = [
-        {"vehicle": n, "time": 0.2 * k, "x": 20.0 * n + 3.0 * k, "lane": 1, "speed": 15.0,
-         "length": 4.5, "kind": 2}
-        for n in range(4) for k in range(5)
-    ]  # fmt: skip
+        {
+            "vehicle": n,
+            "time": 0.2 * k,
+            "x": 20.0 * n + 3.0 * k,
+            "lane": 1,
+            "speed": 15.0,
+            "length": 4.5,
+            "kind": 2,
+        }
+        for n in range(4)
+        for k in range(5)
+    ]
     return pd.DataFrame(rows)
 
 
 def _pairs() -> pd.DataFrame:
     rows = [
-        {"pair": n, "time": 0.2 * k, "x_follower": 3.0 * k, "v_follower": 15.0,
-         "x_leader": 20.0 + 3.0 * k, "v_leader": 15.0, "spacing": 15.5, "follower": n, "leader": 9,
-         "run": "a", "split": "train"}
-        for n in range(2) for k in range(6)
-    ]  # fmt: skip
+        {
+            "pair": n,
+            "time": 0.2 * k,
+            "x_follower": 3.0 * k,
+            "v_follower": 15.0,
+            "x_leader": 20.0 + 3.0 * k,
+            "v_leader": 15.0,
+            "spacing": 15.5,
+            "follower": n,
+            "leader": 9,
+            "run": "a",
+            "split": "train",
+        }
+        for n in range(2)
+        for k in range(6)
+    ]
     return pd.DataFrame(rows)
 
 
 def _platoon() -> bytes:
-    head = ["Date,8,10,2019", "Vehicle_order,A,B", "Number_of_vehicles,2", "ACC,1",
-            "Distance_setting,S", "Time,Speed1,E1,N1,Speed2,E2,N2,IVS1"]  # fmt: skip
+    head = [
+        "Date,8,10,2019",
+        "Vehicle_order,A,B",
+        "Number_of_vehicles,2",
+        "ACC,1",
+        "Distance_setting,S",
+        "Time,Speed1,E1,N1,Speed2,E2,N2,IVS1",
+    ]
     rows = [f"{5 + 0.1 * k:.1f},10,{k},0,10.1,{k - 20},0,{15 - 0.01 * k:.2f}" for k in range(9)]
     return ("\n".join([*head, *rows]) + "\n").encode()
 
@@ -134,8 +171,14 @@ def _corridor() -> bytes:
 
 
 def _checkpoint(scratch: Path) -> bytes:
-    options = {"term": "lin", "name": "lin", "v0": 30.0, "L": 5.0, "L_min": 2.0, "leader":
-               "constant"}  # fmt: skip
+    options = {
+        "term": "lin",
+        "name": "lin",
+        "v0": 30.0,
+        "L": 5.0,
+        "L_min": 2.0,
+        "leader": "constant",
+    }
     model = build_model(options)
     groups = {"model": "lin", "data": "esimas", "solver": "torchdiffeq", "optimizer": "adadelta"}
     checkpoint = Checkpoint(
@@ -160,11 +203,15 @@ def _open_checkpoint(path: Path) -> None:
 def _store(scratch: Path) -> tuple[bytes, bytes]:
     items = [
         Sequence(
-            name=f"r/{i}", recording="r", time=0.1 * np.arange(4), agents=("a", "b"),
-            x=np.random.default_rng(i).normal(size=(4, 2, 2)), walls=np.array([[0.0, 0, 5, 0]]),
+            name=f"r/{i}",
+            recording="r",
+            time=0.1 * np.arange(4),
+            agents=("a", "b"),
+            x=np.random.default_rng(i).normal(size=(4, 2, 2)),
+            walls=np.array([[0.0, 0, 5, 0]]),
         )
         for i in range(2)
-    ]  # fmt: skip
+    ]
     write_store(scratch, items, {"domain": "crowd", "dt": 0.1})
     return (scratch / MANIFEST).read_bytes(), (scratch / TABLE).read_bytes()
 
@@ -231,42 +278,98 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
             read_all(options, {path.name: path})
 
     return [
-        Target("esimas", "sequence_datademo.mat", [_mat(packed=False), _mat(packed=True)],
-               damaged_bytes, lambda path: read_all(EsimasOptions(), {"demo": path})),
-        Target("juelich", "corridor.txt", [_corridor()], damaged_text,
-               lambda path: read_all(pandas_only, {"corridor": path})),
-        Target("table CSV", "table.csv", [_csv(traffic)], damaged_text,
-               lambda path: read_all(of_traffic, {TIDY: path})),
-        Target("table CSV, crowd", "people.csv", [_csv(crowd)], damaged_text,
-               lambda path: read_all(of_crowd, {TIDY: path})),
-        Target("table Parquet", "table.parquet", [_parquet(traffic)], damaged_bytes,
-               lambda path: read_all(of_traffic, {TIDY: path})),
+        Target(
+            "esimas",
+            "sequence_datademo.mat",
+            [_mat(packed=False), _mat(packed=True)],
+            damaged_bytes,
+            lambda path: read_all(EsimasOptions(), {"demo": path}),
+        ),
+        Target(
+            "juelich",
+            "corridor.txt",
+            [_corridor()],
+            damaged_text,
+            lambda path: read_all(pandas_only, {"corridor": path}),
+        ),
+        Target(
+            "table CSV",
+            "table.csv",
+            [_csv(traffic)],
+            damaged_text,
+            lambda path: read_all(of_traffic, {TIDY: path}),
+        ),
+        Target(
+            "table CSV, crowd",
+            "people.csv",
+            [_csv(crowd)],
+            damaged_text,
+            lambda path: read_all(of_crowd, {TIDY: path}),
+        ),
+        Target(
+            "table Parquet",
+            "table.parquet",
+            [_parquet(traffic)],
+            damaged_bytes,
+            lambda path: read_all(of_traffic, {TIDY: path}),
+        ),
         Target("vehicles CSV", "cars.csv", [_csv(_vehicles())], damaged_text, vehicles),
         Target("pairs CSV", "pairs.csv", [_csv(_pairs())], damaged_text, pairs),
-        Target("OpenACC", "platoon.csv", [_platoon(), formats.flat_platoons()], damaged_text,
-               formats.read_platoons),
+        Target(
+            "OpenACC",
+            "platoon.csv",
+            [_platoon(), formats.flat_platoons()],
+            damaged_text,
+            formats.read_platoons,
+        ),
         Target("NGSIM", "ngsim.csv", [formats.ngsim()], damaged_text, formats.read_ngsim),
         Target("highD, tracks", f"highd/01{TRACKS}", [tracks], damaged_text, formats.read_highd),
         Target("SUMO", "fcd.xml", formats.sumo(), damaged_text, formats.read_sumo),
-        Target("JuPedSim", "walk.sqlite", [formats.walkway(scratch)], damaged_bytes,
-               formats.read_walkway),
-        Target("walkable area", "area.wkt", [formats.ROOM.encode()], damaged_text,
-               formats.read_geometry(scratch / "room.txt")),
+        Target(
+            "JuPedSim",
+            "walk.sqlite",
+            [formats.walkway(scratch)],
+            damaged_bytes,
+            formats.read_walkway,
+        ),
+        Target(
+            "walkable area",
+            "area.wkt",
+            [formats.ROOM.encode()],
+            damaged_text,
+            formats.read_geometry(scratch / "room.txt"),
+        ),
         Target("data frame", "frame.pickle", pickled, formats.strange_frame, formats.read_frame),
         Target("check", "checked.csv", texts, damaged_text, formats.check),
-        Target("walls CSV", "walls.csv", [walls], damaged_text,
-               lambda path: read_all(of_crowd, {TIDY: scratch / "crowd.csv", WALLS: path})),
+        Target(
+            "walls CSV",
+            "walls.csv",
+            [walls],
+            damaged_text,
+            lambda path: read_all(of_crowd, {TIDY: scratch / "crowd.csv", WALLS: path}),
+        ),
         Target("checkpoint, bytes", "bytes.pt", [checkpoint], damaged_bytes, _open_checkpoint),
-        Target("checkpoint, evil", "evil.pt", [checkpoint],
-               lambda data, rng: evil_checkpoint(data, rng, outside), _open_checkpoint),
-        Target("checkpoint, values", "values.pt", [checkpoint], strange_checkpoint,
-               _open_checkpoint),
-        Target("formula", "law.txt", [text.encode() for text in _FORMULAS], damaged_formula,
-               _read_formula),
+        Target(
+            "checkpoint, evil",
+            "evil.pt",
+            [checkpoint],
+            lambda data, rng: evil_checkpoint(data, rng, outside),
+            _open_checkpoint,
+        ),
+        Target(
+            "checkpoint, values", "values.pt", [checkpoint], strange_checkpoint, _open_checkpoint
+        ),
+        Target(
+            "formula",
+            "law.txt",
+            [text.encode() for text in _FORMULAS],
+            damaged_formula,
+            _read_formula,
+        ),
         Target("store, manifest", f"manifest/{MANIFEST}", [manifest], damaged_text, _read_store),
         Target("store, table", f"table/{TABLE}", [table], damaged_bytes, _read_store),
         Target("kept result", f"kept/{KEPT}/one.json", [kept], damaged_text, _read_kept),
-    ]  # fmt: skip
+    ]
 
 
 def quiet() -> None:

@@ -364,8 +364,9 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
         if rmse <= EXACT:
             log.info(
                 "all drivers share their parameters, which explain the paths to %.2g m "
-                "(root mean square)", rmse,
-            )  # fmt: skip
+                "(root mean square)",
+                rmse,
+            )
             return None
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in names]
@@ -374,9 +375,13 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     known = {name: row.get(f"parameters/{name}") for name in trainer.model.physical()}
     first = {name: value for name, value in known.items() if value is not None}
     return calibrated_drivers(
-        copy.deepcopy(trainer.model).cpu(), first, [store[i] for i in indices], drivers,
-        clusters(store.index)[indices], seed,
-    )  # fmt: skip
+        copy.deepcopy(trainer.model).cpu(),
+        first,
+        [store[i] for i in indices],
+        drivers,
+        clusters(store.index)[indices],
+        seed,
+    )
 
 
 def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
@@ -436,9 +441,11 @@ def _by_tangents(
 
     assert isinstance(trainer.solver, FusedSolver)
     make = partial(
-        ResidualProblem, solver=trainer.solver, convention=options.cost,
+        ResidualProblem,
+        solver=trainer.solver,
+        convention=options.cost,
         start_speeds=options.start_speeds,
-    )  # fmt: skip
+    )
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
     indices = [places[name] for name in trainer.provenance.split["train"]]
     (batch,) = stream(straight_loader(store, indices, 0))

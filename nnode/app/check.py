@@ -62,10 +62,12 @@ class Check:
     def write(self, folder: str | Path) -> Path:
         """Write the page ``check.html`` with its tables; returns its path."""
         return write_page(
-            [*blocks(self.examination, self.options), _made()], Path(folder),
-            title=f"Check of {self.examination.path.name}", subtitle=sentence(self.examination),
+            [*blocks(self.examination, self.options), _made()],
+            Path(folder),
+            title=f"Check of {self.examination.path.name}",
+            subtitle=sentence(self.examination),
             stem="check",
-        )[0]  # fmt: skip
+        )[0]
 
 
 def check_file(
@@ -251,9 +253,10 @@ def _columns(found: Examination) -> list[Block]:
         return []
     frame = found.raw.table.frame
     how = {
-        "named": "has the name of its meaning", "like": "by its name",
+        "named": "has the name of its meaning",
+        "like": "by its name",
         "holds": "by what it holds",
-    }  # fmt: skip
+    }
     by = {one.column: (meaning, one) for meaning, one in found.meanings.items()}
     rows = {}
     for column in map(str, frame.columns):
@@ -283,9 +286,10 @@ def _units_blocks(found: Examination) -> list[Block]:
         "sway (1/s)": (known.sway / scale.seconds, "sway"),
         "sampling interval (s)": (known.dt * scale.seconds, INTERVAL),
         "speed by positions over speed in the file": (
-            known.ratio * scale.metres / (scale.per_second * scale.seconds), AGREE,
+            known.ratio * scale.metres / (scale.per_second * scale.seconds),
+            AGREE,
         ),
-    }  # fmt: skip
+    }
     rows = {}
     for name, (value, where) in values.items():
         range_ = usual.get(where) if isinstance(where, str) else where
@@ -303,18 +307,27 @@ def _units_blocks(found: Examination) -> list[Block]:
     if len(found.scales) > 1:
         table = pd.DataFrame(
             [
-                {"of": s.domain, "positions": s.position, "times": s.time, "frames/s": s.rate,
-                 "speeds": s.speed, "probability": s.probability}
+                {
+                    "of": s.domain,
+                    "positions": s.position,
+                    "times": s.time,
+                    "frames/s": s.rate,
+                    "speeds": s.speed,
+                    "probability": s.probability,
+                }
                 for s in found.scales
             ]
-        )  # fmt: skip
+        )
         blocks.append(
             TableBlock(
-                "units", table.head(6),
+                "units",
+                table.head(6),
                 "Combinations of units by how well these medians agree with what is usual; all of "
-                "them in the CSV.", digits={"probability": 3}, full=table,
+                "them in the CSV.",
+                digits={"probability": 3},
+                full=table,
             )
-        )  # fmt: skip
+        )
     return blocks
 
 

@@ -138,9 +138,16 @@ def diagnose_table(
     """
     with python_words():
         return _diagnosed_table(
-            data, domain, model, walls, leader, None if folder is None else Path(folder), seed,
-            options, reading,
-        )  # fmt: skip
+            data,
+            domain,
+            model,
+            walls,
+            leader,
+            None if folder is None else Path(folder),
+            seed,
+            options,
+            reading,
+        )
 
 
 def _diagnosed_table(

@@ -29,11 +29,19 @@ _PLACED = {1: ("euler",), 2: ("semi_implicit", "ballistic")}
 
 
 def drive_run(
-    run: str | Path, *, sumo: str | Path, vehicles: str | Sequence[str],
-    folder: str | Path | None = None, program: str = "libsumo", steps: str = "match",
-    end: float | None = None, far: float | None = None, lengths: bool | None = None,
-    lane_changes: bool = False, seed: int = 0,
-) -> Drive:  # fmt: skip
+    run: str | Path,
+    *,
+    sumo: str | Path,
+    vehicles: str | Sequence[str],
+    folder: str | Path | None = None,
+    program: str = "libsumo",
+    steps: str = "match",
+    end: float | None = None,
+    far: float | None = None,
+    lengths: bool | None = None,
+    lane_changes: bool = False,
+    seed: int = 0,
+) -> Drive:
     """Let a run's calibrated law, with its effects, drive vehicles in SUMO.
 
     Every step SUMO says who is ahead and how far, the law says a speed, and SUMO places the
@@ -74,14 +82,27 @@ def drive_run(
             f"{' or '.join(_PLACED[order])} steps; take steps=scenario"
         )
     found = drive(
-        model, Path(sumo).expanduser(), [vehicles] if isinstance(vehicles, str) else list(vehicles),
-        place, program=program, expected=own if steps == "match" else None,
-        told=own if steps == "run" else None, end=end, far=far,
+        model,
+        Path(sumo).expanduser(),
+        [vehicles] if isinstance(vehicles, str) else list(vehicles),
+        place,
+        program=program,
+        expected=own if steps == "match" else None,
+        told=own if steps == "run" else None,
+        end=end,
+        far=far,
         lengths=_has_lengths(checkpoint, str(run), model) if lengths is None else lengths,
-        lane_changes=lane_changes, seed=seed,
-    )  # fmt: skip
-    account = {**asdict(found), "trajectories": str(found.trajectories), "run": str(run),
-               "sumo": str(sumo), "vehicles": vehicles, "program": program}  # fmt: skip
+        lane_changes=lane_changes,
+        seed=seed,
+    )
+    account = {
+        **asdict(found),
+        "trajectories": str(found.trajectories),
+        "run": str(run),
+        "sumo": str(sumo),
+        "vehicles": vehicles,
+        "program": program,
+    }
     write_json(place / "drive.json", account)
     return found
 

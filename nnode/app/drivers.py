@@ -144,9 +144,13 @@ def _estimate(row: pd.Series) -> str:
 
 
 def calibrated_drivers(
-    model: System, first: dict[str, float], sequences: list[Sequence], drivers: str | list[str],
-    cluster: np.ndarray, seed: int,
-) -> Drivers:  # fmt: skip
+    model: System,
+    first: dict[str, float],
+    sequences: list[Sequence],
+    drivers: str | list[str],
+    cluster: np.ndarray,
+    seed: int,
+) -> Drivers:
     """Calibrate to drivers who differ.
 
     Args:
@@ -172,8 +176,9 @@ def calibrated_drivers(
     if paths.error <= FLOOR:
         log.info(
             "positions show no errors that are new at every sample, so that they were smoothed: "
-            "errors of %g m are assumed", SMOOTHED,
-        )  # fmt: skip
+            "errors of %g m are assumed",
+            SMOOTHED,
+        )
         paths = replace(paths, error=SMOOTHED)
     found = fit_drivers(double, paths, drivers, first, seed=seed)
     if not found.estimate.converged:

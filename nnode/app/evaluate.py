@@ -159,9 +159,15 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
         with Stages("drawing", {"drawing": 1.0}) as stages:
             stages.begin("drawing")
             path = write_replay(
-                folder / "replay.html", store, indices, lambda batch: solver(model, batch), model,
-                name, dtype=dtype, device=device,
-            )  # fmt: skip
+                folder / "replay.html",
+                store,
+                indices,
+                lambda batch: solver(model, batch),
+                model,
+                name,
+                dtype=dtype,
+                device=device,
+            )
         print(f"replay: {path}")
 
 

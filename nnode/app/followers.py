@@ -24,10 +24,12 @@ from nnode.plots.style import save
 SHOWN = 10
 #: Columns of both tables, with their units.
 COLUMNS = {
-    "spacing_rmse": "spacing RMSE (m)", "spacing_bias": "spacing bias (m)",
-    "speed_rmse": "speed RMSE (m/s)", "speed_bias": "speed bias (m/s)",
+    "spacing_rmse": "spacing RMSE (m)",
+    "spacing_bias": "spacing bias (m)",
+    "speed_rmse": "speed RMSE (m/s)",
+    "speed_bias": "speed bias (m/s)",
     "final_error": "final error (m)",
-}  # fmt: skip
+}
 
 
 @torch.no_grad()
@@ -74,7 +76,7 @@ def follower_errors(simulate: Simulate, batches: Iterable[Batch], index: Index) 
                         "speed_bias": float(slip.mean()),
                         "final_error": float(abs(error[k[-1], b, n])),
                     }
-                )  # fmt: skip
+                )
     return pd.DataFrame(rows)
 
 
@@ -86,14 +88,18 @@ def _slopes(x: torch.Tensor, dt: float) -> torch.Tensor:
 def by_driver(rows: pd.DataFrame) -> pd.DataFrame:
     """One row per driver: all samples of all his sequences together."""
     weight = rows["samples"]
-    sums = pd.DataFrame(
-        {
-            **{key: rows[key] for key in ("recording", "driver", "samples", "final_error")},
-            "sequences": 1,
-            **{key: rows[key] ** 2 * weight for key in ("spacing_rmse", "speed_rmse")},
-            **{key: rows[key] * weight for key in ("spacing_bias", "speed_bias")},
-        }
-    ).groupby(["recording", "driver"], sort=False).sum()  # fmt: skip
+    sums = (
+        pd.DataFrame(
+            {
+                **{key: rows[key] for key in ("recording", "driver", "samples", "final_error")},
+                "sequences": 1,
+                **{key: rows[key] ** 2 * weight for key in ("spacing_rmse", "speed_rmse")},
+                **{key: rows[key] * weight for key in ("spacing_bias", "speed_bias")},
+            }
+        )
+        .groupby(["recording", "driver"], sort=False)
+        .sum()
+    )
     for key in ("spacing_rmse", "speed_rmse"):
         sums[key] = np.sqrt(sums[key] / sums["samples"])
     for key in ("spacing_bias", "speed_bias"):

@@ -98,9 +98,12 @@ def _at(found: Sequence, measured: Sequence) -> np.ndarray:
         if agent in place:
             for d in range(x.shape[2]):
                 x[:, n, d] = np.interp(
-                    measured.time, found.time, found.x[:, place[agent], d],
-                    left=np.nan, right=np.nan,
-                )  # fmt: skip
+                    measured.time,
+                    found.time,
+                    found.x[:, place[agent], d],
+                    left=np.nan,
+                    right=np.nan,
+                )
     return x
 
 

@@ -68,9 +68,15 @@ def simulate_run(
     store = data_used(checkpoint) if data is None else Sequences.of(data)
     with threads_given_back():
         return _simulated(
-            checkpoint, store, checkpoint.config["solver"], run=where, samples=samples, part=part,
-            seed=seed, data=str(checkpoint.config["data"]["name"]),
-        )  # fmt: skip
+            checkpoint,
+            store,
+            checkpoint.config["solver"],
+            run=where,
+            samples=samples,
+            part=part,
+            seed=seed,
+            data=str(checkpoint.config["data"]["name"]),
+        )
 
 
 def simulate(config: DictConfig, folder: Path) -> None:
@@ -86,9 +92,15 @@ def simulate(config: DictConfig, folder: Path) -> None:
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
     data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     found = _simulated(
-        checkpoint, open_data(data, folder / "data"), config.solver, run=str(config.run),
-        samples=int(config.samples), part=config.part, seed=int(config.seed), data=data.name,
-    )  # fmt: skip
+        checkpoint,
+        open_data(data, folder / "data"),
+        config.solver,
+        run=str(config.run),
+        samples=int(config.samples),
+        part=config.part,
+        seed=int(config.seed),
+        data=data.name,
+    )
     print(found)
     files = found.write(folder, format=config.format)
     for path in dict.fromkeys(p.parent if p.suffix == ".txt" else p for p in reversed(files)):
@@ -103,9 +115,16 @@ def _check(samples: int) -> None:
 
 
 def _simulated(
-    checkpoint: Checkpoint, store: Source, solver: Any, *, run: str, data: str, samples: int,
-    part: str, seed: int,
-) -> Simulated:  # fmt: skip
+    checkpoint: Checkpoint,
+    store: Source,
+    solver: Any,
+    *,
+    run: str,
+    data: str,
+    samples: int,
+    part: str,
+    seed: int,
+) -> Simulated:
     model, name = free(checkpoint.build()), str(checkpoint.config["model"]["name"])
     set_threads(checkpoint.config["trainer"]["threads"], model.domain)
     store = started(checkpoint, store)
@@ -129,15 +148,22 @@ def _simulated(
     _, numbers = np.unique(label[indices], return_inverse=True)
     first = scores[name].sequence_means()
     return Simulated(
-        run=run, model=name, data=data, part=part, trained_on=trained,
-        clusters=int(numbers.max()) + 1, noise=noise,
+        run=run,
+        model=name,
+        data=data,
+        part=part,
+        trained_on=trained,
+        clusters=int(numbers.max()) + 1,
+        noise=noise,
         means={key: score.means(label[indices]) for key, score in scores.items()},
         minus={
             key: paired(first, score.sequence_means(), numbers, 0)
-            for key, score in scores.items() if key != name
+            for key, score in scores.items()
+            if key != name
         },
-        sampling=job, way=ways[name],
-    )  # fmt: skip
+        sampling=job,
+        way=ways[name],
+    )
 
 
 def _some(indices: list[int], seed: int) -> list[int]:

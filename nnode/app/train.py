@@ -75,9 +75,15 @@ def train(config: DictConfig, folder: Path) -> None:
     with world.together():
         store = Store(place) if store is None else store
         trainer = trainer_of(
-            config, model.to(device), solver, store,
-            plain=plain_config(config), folder=folder, checkpoint=checkpoint, world=world,
-        )  # fmt: skip
+            config,
+            model.to(device),
+            solver,
+            store,
+            plain=plain_config(config),
+            folder=folder,
+            checkpoint=checkpoint,
+            world=world,
+        )
         if checkpoint is not None:
             trainer.restore(Path(config.resume))
             told = config.resume, trainer.epoch, trainer.step
@@ -128,8 +134,9 @@ def _result(trainer: Trainer, store: Store, start: float) -> Calibration:
             number = guard.requested or signal.SIGINT
             raise Interrupted(
                 f"stopped by {signal.Signals(number).name} while results were computed; the "
-                f"training is in {trainer.last_path}", number,
-            ) from None  # fmt: skip
+                f"training is in {trainer.last_path}",
+                number,
+            ) from None
 
 
 def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:

@@ -201,8 +201,12 @@ def trainer_of(
     n = substeps(store[0].dt, config.solver.dt, model)
     log.info(
         "%s: %d sequences train, %d held out, %d dropped between; %d steps per sample",
-        data.name, len(parts.train), len(parts.heldout), len(parts.dropped), n,
-    )  # fmt: skip
+        data.name,
+        len(parts.train),
+        len(parts.heldout),
+        len(parts.dropped),
+        n,
+    )
     free_speed = None
     if model.domain == "traffic" and world.first:
         free_speed = best_common_speed(

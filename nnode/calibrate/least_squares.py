@@ -152,9 +152,13 @@ def least_squares(
 
 
 def box_step(
-    row: np.ndarray, gradient: np.ndarray, curvature: np.ndarray, damping: float,
-    low: np.ndarray, high: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+    row: np.ndarray,
+    gradient: np.ndarray,
+    curvature: np.ndarray,
+    damping: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
     """The damped step from ``row``, bounds that it meets held one after the other."""
     scale = np.diag(curvature)
     scale = np.maximum(scale, 1e-12 * max(scale.max(), 1e-300))

@@ -95,9 +95,13 @@ class Halves:
 
 
 def halves(
-    first: ResidualProblem, second: ResidualProblem, row: np.ndarray, others: Iterable[np.ndarray],
-    fold: np.ndarray, strengths: ListLike[float] = STRENGTHS,
-) -> Halves:  # fmt: skip
+    first: ResidualProblem,
+    second: ResidualProblem,
+    row: np.ndarray,
+    others: Iterable[np.ndarray],
+    fold: np.ndarray,
+    strengths: ListLike[float] = STRENGTHS,
+) -> Halves:
     """Pooled, alone and in between: calibrated on first halves, judged on second ones.
 
     Args:
@@ -162,9 +166,12 @@ class Own:
 
 
 def own_parameters(
-    kind: Pooling, system: System, sequences: list[Sequence],
-    cost: Callable[[System, Batch], ResidualProblem], seed: int,
-) -> Own:  # fmt: skip
+    kind: Pooling,
+    system: System,
+    sequences: list[Sequence],
+    cost: Callable[[System, Batch], ResidualProblem],
+    seed: int,
+) -> Own:
     """Parameters of every sequence's own, of a model with the pool's.
 
     Args:

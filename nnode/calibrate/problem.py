@@ -262,9 +262,16 @@ class ResidualProblem:
         near, origin = simulated_batch(system, batch)
         symbols = tuple(name.replace(".", "__", 1) for name in self.names)
         y, dy = lanes.tangents(
-            system, self.lane, near, n, symbols if slopes else (), solver.threads,
-            torch.from_numpy(np.atleast_2d(rows)), solver.method, given=symbols,
-        )  # fmt: skip
+            system,
+            self.lane,
+            near,
+            n,
+            symbols if slopes else (),
+            solver.threads,
+            torch.from_numpy(np.atleast_2d(rows)),
+            solver.method,
+            given=symbols,
+        )
         x = y[..., 0] if origin is None else y[..., 0].double() + origin
         given = system.given(batch)
         if given is not None:
@@ -361,9 +368,11 @@ def _lane(system: System, batch: Batch) -> Any:
 
 
 def pooled(
-    problem: ResidualProblem, start: np.ndarray | None = None, weights: np.ndarray | None = None,
+    problem: ResidualProblem,
+    start: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
     **options: Any,
-) -> Minimum:  # fmt: skip
+) -> Minimum:
     """The parameters ``(P,)`` that are best for all sequences together.
 
     Args:

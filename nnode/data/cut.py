@@ -185,10 +185,17 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
                 kinds = tuple(names_of_kinds.get(code, code) for code in codes)
             found.append(
                 sequence_of(
-                    f"{name}/{number:03d}", rows, of, first, last, grid,
-                    recording=name, site=stem, kind=kinds,
+                    f"{name}/{number:03d}",
+                    rows,
+                    of,
+                    first,
+                    last,
+                    grid,
+                    recording=name,
+                    site=stem,
+                    kind=kinds,
                 )
-            )  # fmt: skip
+            )
     if not found:
         vehicles = {record.agent for _, _, own in lanes.values() for record in own}
         raise DataError(

@@ -290,8 +290,11 @@ def _numbers(
             "%s: %d identifiers are used again for another vehicle, after a time or over a "
             "distance that are none of one vehicle (such as %s, another one from %g s on); "
             "data.agents=global takes them as they stand",
-            name, len(set(ids[1:][new])), ids[row], time[row],
-        )  # fmt: skip
+            name,
+            len(set(ids[1:][new])),
+            ids[row],
+            time[row],
+        )
     so_far = np.concatenate([[0], np.cumsum(new)])
     start = np.concatenate([[0], np.where(other, np.arange(1, len(ids)), 0)])
     return np.asarray(1 + so_far - so_far[np.maximum.accumulate(start)])

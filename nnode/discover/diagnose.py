@@ -161,10 +161,14 @@ def _diagnosed(
     enough = numbers.open >= numbers.least
     stages.begin("comparing on sealed sequences")
     sealed = Sealed(
-        engine, base_system, [sequences[i] for i in division.open],
-        [sequences[i] for i in division.sealed], division.label[division.sealed],
-        numbers.sealed, options.seed,
-    )  # fmt: skip
+        engine,
+        base_system,
+        [sequences[i] for i in division.open],
+        [sequences[i] for i in division.sealed],
+        division.label[division.sealed],
+        numbers.sealed,
+        options.seed,
+    )
     kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
     beside = [individuals(engine, found.fit, kind) for kind in kinds]
     found, leads = sealed.confirmed(engine, found)
@@ -326,16 +330,21 @@ def _looked_for(
     stages.begin("naming")
     enough = int(engine.cluster.max()) + 1 >= _least(options, len(effects))
     found = search(
-        engine, base, effects, alpha=options.alpha, most=options.max_effects if enough else 0,
-        seed=options.seed, variables=variables, levels=_levels(engine, effects),
-        within=stages.within, hint=hint,
-    )  # fmt: skip
+        engine,
+        base,
+        effects,
+        alpha=options.alpha,
+        most=options.max_effects if enough else 0,
+        seed=options.seed,
+        variables=variables,
+        levels=_levels(engine, effects),
+        within=stages.within,
+        hint=hint,
+    )
     # what a missing effect leaves is common to all clusters: only what the search leaves tells
     tested = simultaneous(engine, found.fit, options.seed)
     clock.lap("name")
-    return _Look(
-        division, engine, base, base_system, variables, first, located, found, tested
-    )  # fmt: skip
+    return _Look(division, engine, base, base_system, variables, first, located, found, tested)
 
 
 def _least(options: DiscoverOptions, effects: int) -> int:
@@ -348,9 +357,10 @@ def _clusters(look: _Look, options: DiscoverOptions, effects: int) -> Clusters:
     division, least = look.division, _least(options, effects)
     least_sealed = least_number(rules().level, sided=1)
     enough = next(
-        number for number in count(2)
+        number
+        for number in count(2)
         if least_sealed <= round(options.sealed * number) <= number - least
-    )  # fmt: skip
+    )
     return Clusters(
         open=int(look.engine.cluster.max()) + 1,
         sealed=0 if division.note else division.number(division.sealed),

@@ -50,11 +50,21 @@ class Drive:
 
 
 def drive(
-    system: System, scenario: Path, types: Sequence[str], folder: Path, *,
-    program: str = "libsumo", expected: Steps | None = None, told: Steps | None = None,
-    end: float | None = None, far: float | None = None, lengths: bool = True,
-    lane_changes: bool = False, seed: int = 0, steer: Callable[[RunningSumo], None] | None = None,
-) -> Drive:  # fmt: skip
+    system: System,
+    scenario: Path,
+    types: Sequence[str],
+    folder: Path,
+    *,
+    program: str = "libsumo",
+    expected: Steps | None = None,
+    told: Steps | None = None,
+    end: float | None = None,
+    far: float | None = None,
+    lengths: bool = True,
+    lane_changes: bool = False,
+    seed: int = 0,
+    steer: Callable[[RunningSumo], None] | None = None,
+) -> Drive:
     """Let a lane's model drive vehicles in SUMO.
 
     Args:

@@ -77,9 +77,15 @@ class Drivers:
     """
 
     def __init__(
-        self, system: System, dt: float, method: str, *, far: float | None = None,
-        lengths: bool = True, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        system: System,
+        dt: float,
+        method: str,
+        *,
+        far: float | None = None,
+        lengths: bool = True,
+        seed: int = 0,
+    ) -> None:
         if far is not None and not 0 < far < EMPTY[0]:
             raise ConfigError(f"far={far} must be a distance in m, below {EMPTY[0]:g}, or null")
         lane = drivable(system)
@@ -202,13 +208,24 @@ class Drivers:
         own_length = seen.length_1 if self._lengths else np.zeros(n)
         start = np.where(self._fresh, time, self._begun)
         return {
-            **self._fixed, **self._states, **self._inputs,
-            "x": seen.x, "x_1": seen.x + gap, "x_2": seen.x + gap + gap_1,
-            "v": seen.v, "v_1": v_1, "v_2": np.where(second, seen.v_2, v_1), "dx_1": v_1,
-            "length_1": np.where(follows, own_length, 0.0), "second": second.astype(float),
-            "t": time - start, "start": start, "dt": np.full(n, self.dt), "gaps": (gap, gap_1),
+            **self._fixed,
+            **self._states,
+            **self._inputs,
+            "x": seen.x,
+            "x_1": seen.x + gap,
+            "x_2": seen.x + gap + gap_1,
+            "v": seen.v,
+            "v_1": v_1,
+            "v_2": np.where(second, seen.v_2, v_1),
+            "dx_1": v_1,
+            "length_1": np.where(follows, own_length, 0.0),
+            "second": second.astype(float),
+            "t": time - start,
+            "start": start,
+            "dt": np.full(n, self.dt),
+            "gaps": (gap, gap_1),
             "lead": np.where(follows, seen.lead, -1),
-        }  # fmt: skip
+        }
 
     def _begin(self, time: float, seen: Seen, given: dict[str, Any]) -> None:
         """The states of those that have just been added."""
@@ -229,8 +246,9 @@ class Drivers:
         """
         v = np.array(_SPEEDS)
         inf, zero = np.full_like(v, np.inf), np.zeros_like(v)
-        seen = Seen(v=v, gap=inf, v_1=v, length_1=zero, lead=zero.astype(int) - 1, gap_1=inf,
-                    v_2=v, x=zero)  # fmt: skip
+        seen = Seen(
+            v=v, gap=inf, v_1=v, length_1=zero, lead=zero.astype(int) - 1, gap_1=inf, v_2=v, x=zero
+        )
         said = []
         for far in EMPTY:
             trial = copy.copy(self)

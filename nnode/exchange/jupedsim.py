@@ -124,8 +124,12 @@ def jupedsim_parameters(
 
 def _content(model: str, arguments: dict[str, Any], agent: dict[str, Any]) -> dict[str, Any]:
     classes = {"model": model, "agent": f"{model}AgentParameters"}
-    return {"program": f"JuPedSim >= 1.4, {model}", "classes": classes, "model": arguments,
-            "agent": agent}  # fmt: skip
+    return {
+        "program": f"JuPedSim >= 1.4, {model}",
+        "classes": classes,
+        "model": arguments,
+        "agent": agent,
+    }
 
 
 def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
@@ -146,9 +150,11 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
         found.notes.append("radius: l/2")
     else:
         agent |= {
-            "mass": 1.0, "tau": own["tau"], "a_v": fixed["tau_a"],
+            "mass": 1.0,
+            "tau": own["tau"],
+            "a_v": fixed["tau_a"],
             **{p: fixed[p] for p in ("a_min", "b_min", "b_max")},
-        }  # fmt: skip
+        }
         model = {
             "strength_neighbor_repulsion": own["eta"],
             "max_neighbor_interaction_distance": fixed["r_c"],

@@ -66,11 +66,22 @@ class RunningSumo:
             raise ConfigError(f"sumo={scenario} is not there; name a SUMO configuration, *.sumocfg")
         self.api, binary = _loaded(program)
         options = [
-            "-c", str(scenario), "--fcd-output", str(output), "--fcd-output.attributes",
-            "id,type,speed,pos,lane", "--precision", str(DIGITS), "--no-step-log", "true",
+            "-c",
+            str(scenario),
+            "--fcd-output",
+            str(output),
+            "--fcd-output.attributes",
+            "id,type,speed,pos,lane",
+            "--precision",
+            str(DIGITS),
+            "--no-step-log",
+            "true",
             # a law may stop closer than the type's minGap: a collision is where bodies touch
-            "--collision.mingap-factor", "0", "--aggregate-warnings", "3",
-        ]  # fmt: skip
+            "--collision.mingap-factor",
+            "0",
+            "--aggregate-warnings",
+            "3",
+        ]
         if steps is not None:
             ballistic = str(steps.method == "ballistic").lower()
             options += ["--step-length", repr(steps.seconds), "--step-method.ballistic", ballistic]
@@ -198,8 +209,9 @@ class RunningSumo:
                 v_2[i] = max(float(every.getSpeed(after[0])), 0.0)
         led = np.flatnonzero(lead >= 0)
         gap_1[led], v_2[led] = gap[lead[led]], v_1[lead[led]]
-        return Seen(v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2,
-                    x=np.zeros(n))  # fmt: skip
+        return Seen(
+            v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2, x=np.zeros(n)
+        )
 
     def places(self, vehicles: Sequence[str], told: Told) -> tuple[np.ndarray, np.ndarray]:
         """``(n,)`` each: m along the lane, and m driven since the departure."""

@@ -69,9 +69,12 @@ def has_type(system: System) -> bool:
 
 
 def sumo_type(
-    system: System, name: str, speed: float, length: float | None,
+    system: System,
+    name: str,
+    speed: float,
+    length: float | None,
     intervals: Intervals | None = None,
-) -> Counterpart:  # fmt: skip
+) -> Counterpart:
     """An additional file with one ``vType``.
 
     Args:
@@ -101,10 +104,15 @@ def _same(system: System, law: str, name: str, length: float | None) -> Counterp
     s0 = _value(own, "s0")
     size, room = (length, s0) if length is not None else _parted(s0, DEFAULT_LENGTH)
     found.values = {
-        "id": name, "carFollowModel": SAME[law], "sigma": "0", "speedFactor": "1", "speedDev": "0",
-        "length": _exactly(size), "minGap": _exactly(room),
+        "id": name,
+        "carFollowModel": SAME[law],
+        "sigma": "0",
+        "speedFactor": "1",
+        "speedDev": "0",
+        "length": _exactly(size),
+        "minGap": _exactly(room),
         **{_SAME[p]: _exactly(_value(own, p)) for p in _SAME},
-    }  # fmt: skip
+    }
     if law == "idm":
         del found.values["sigma"]
     if length is None:

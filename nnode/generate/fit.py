@@ -113,8 +113,11 @@ def fit_noise(
     number = int(label.max()) + 1
     measured = _sums(
         [batch.x - x for batch, x in zip(batches, plain, strict=True)],
-        batches, groups, lags, number,
-    )  # fmt: skip
+        batches,
+        groups,
+        lags,
+        number,
+    )
     if not (measured.number.sum(0) > 0).all():
         least = 3 * _SHORTEST[system.domain]
         raise DataError(
@@ -137,14 +140,22 @@ def fit_noise(
             measured,
             [sampled(Noise(sigma, tau)) for tau in TIMES],
             sampled(Noise(0.0, 1.0, 0.0, spread)) if spread else None,
-            sigma, spread, _white(len(lags), error),
-        )  # fmt: skip
+            sigma,
+            spread,
+            _white(len(lags), error),
+        )
         sigma, tau, drivers, modelled = search(every, starts)
         spread = float(np.clip(drivers, *_SPREADS)) if spread else 0.0
     fitted = FittedNoise(
-        Noise(sigma, tau, error, drivers), None, None, None, number,
-        [lag * sampling for lag in lags], measured.mean(every).tolist(), modelled.tolist(),
-    )  # fmt: skip
+        Noise(sigma, tau, error, drivers),
+        None,
+        None,
+        None,
+        number,
+        [lag * sampling for lag in lags],
+        measured.mean(every).tolist(),
+        modelled.tolist(),
+    )
     if number < 2:
         return fitted
     weights = number * group_weights(np.arange(number), DRAWS, np.random.default_rng(seed))
@@ -186,9 +197,12 @@ def _measurement(batches: list[Batch]) -> float:
 
 
 def _sums(
-    residuals: list[Tensor], batches: list[Batch], groups: list[np.ndarray], lags: list[int],
+    residuals: list[Tensor],
+    batches: list[Batch],
+    groups: list[np.ndarray],
+    lags: list[int],
     number: int,
-) -> _Sums:  # fmt: skip
+) -> _Sums:
     """Squares of residuals ``(K, S * B, N, D)`` and of their changes, by cluster."""
     short = lags[:_SHORT]
     squares, count = np.zeros((2, number, len(lags) + len(short) + 1))
@@ -263,9 +277,11 @@ class _Search:
         for start in np.clip(np.log(starts), low + 1e-6, high - 1e-6):
             size = 0.5 * float(np.mean(goal - at(start)))
             found = least_squares(
-                lambda p: np.log(moments(p)) - goal, [size, start, np.log(0.05)], x_scale="jac",
+                lambda p: np.log(moments(p)) - goal,
+                [size, start, np.log(0.05)],
+                x_scale="jac",
                 bounds=([-20.0, low, -20.0], [20.0, high, 0.0]),
-            )  # fmt: skip
+            )
             best = found if best is None or found.cost < best.cost else best
         assert best is not None
         sigma, tau, drivers = np.exp(best.x).tolist()

@@ -29,9 +29,12 @@ def takes_paces(system: Crowd, batch: Batch) -> bool:
 
 
 def sample_people(
-    system: Crowd, batch: Batch, noise: tuple[float, float, float], rng: np.random.Generator,
+    system: Crowd,
+    batch: Batch,
+    noise: tuple[float, float, float],
+    rng: np.random.Generator,
     dt: float | None,
-) -> Trajectory:  # fmt: skip
+) -> Trajectory:
     """Sampled motion of people in Euler's steps, see :func:`nnode.generate.noise.sample`.
 
     Args:

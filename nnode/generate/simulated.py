@@ -178,13 +178,19 @@ class Simulated:
         """The content of ``scores.json``."""
         job = self.sampling
         return {
-            "run": self.run, "model": self.model, "data": self.data, "part": self.part,
-            "trained_on": self.trained_on, "sequences": len(job.indices),
-            "clusters": self.clusters, "samples": job.samples, "seed": job.seed,
+            "run": self.run,
+            "model": self.model,
+            "data": self.data,
+            "part": self.part,
+            "trained_on": self.trained_on,
+            "sequences": len(job.indices),
+            "clusters": self.clusters,
+            "samples": job.samples,
+            "seed": job.seed,
             "noise": {key: asdict(one) for key, one in self.noise.items()},
             "scores": {k: {n: asdict(m) for n, m in own.items()} for k, own in self.means.items()},
             "crps_position_minus": {key: asdict(one) for key, one in self.minus.items()},
-        }  # fmt: skip
+        }
 
     def write(self, folder: str | Path, *, format: str | None = "parquet") -> list[Path]:
         """Write ``scores.json``, ``bands.png`` and the samples, see ``docs/sampling.md``.

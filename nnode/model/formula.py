@@ -118,9 +118,15 @@ def symbols_of(
 
 
 def rates_of(
-    terms: Sequence[Term], lane: LaneDynamics, y: Tensor, t: Tensor, scene: Scene, measured: bool,
-    more: Mapping[str, Tensor] | None = None, parameters: Mapping[str, Tensor] | None = None,
-) -> Tensor:  # fmt: skip
+    terms: Sequence[Term],
+    lane: LaneDynamics,
+    y: Tensor,
+    t: Tensor,
+    scene: Scene,
+    measured: bool,
+    more: Mapping[str, Tensor] | None = None,
+    parameters: Mapping[str, Tensor] | None = None,
+) -> Tensor:
     """``(B, N, M)`` rates of a lane's states, by PyTorch.
 
     Args:
@@ -206,9 +212,13 @@ def contribution(term: Term, state: State) -> Tensor:
 
 
 def starts_of(
-    terms: Sequence[Term], lane: LaneDynamics, x: Tensor, v: Tensor, scene: Scene,
+    terms: Sequence[Term],
+    lane: LaneDynamics,
+    x: Tensor,
+    v: Tensor,
+    scene: Scene,
     parameters: Mapping[str, Tensor] | None = None,
-) -> dict[str, Tensor]:  # fmt: skip
+) -> dict[str, Tensor]:
     """``(B, N)`` values at the start of a lane's added states.
 
     Args:

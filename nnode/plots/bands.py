@@ -38,9 +38,14 @@ def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
     for ax, one in zip(panels, vehicles, strict=False):
         for level, (low, high) in sorted(one.bands.items(), reverse=True):
             ax.fill_between(
-                one.time, low, high, color=blue, alpha=0.4 if level < 0.9 else 0.18,
-                linewidth=0, label=f"{100 * level:g} % of samples",
-            )  # fmt: skip
+                one.time,
+                low,
+                high,
+                color=blue,
+                alpha=0.4 if level < 0.9 else 0.18,
+                linewidth=0,
+                label=f"{100 * level:g} % of samples",
+            )
         ax.plot(one.time, one.median, color=blue, linewidth=1.0, label="median of samples")
         ax.plot(one.time, one.measured, color="black", linewidth=1.2, label="measured")
         dress(ax, x="time (s)", y=what, title=one.name)

@@ -155,16 +155,28 @@ def _arrow(
 ) -> None:
     # a length in inches reads the same in every panel, whatever space the panel shows
     ax.quiver(
-        *where, *vector, scale=scale[kind], gid=kind, angles="uv", scale_units="inches",
-        units="inches", minlength=0, **(_ARROW[kind] | style),
-    )  # fmt: skip
+        *where,
+        *vector,
+        scale=scale[kind],
+        gid=kind,
+        angles="uv",
+        scale_units="inches",
+        units="inches",
+        minlength=0,
+        **(_ARROW[kind] | style),
+    )
 
 
 def _person(ax: Axes, person: str, where: Vector) -> None:
     ax.plot(
-        *where, markersize=7, markeredgecolor="white", markeredgewidth=0.7, zorder=3, gid=person,
+        *where,
+        markersize=7,
+        markeredgecolor="white",
+        markeredgewidth=0.7,
+        zorder=3,
+        gid=person,
         **_PERSON[person],
-    )  # fmt: skip
+    )
 
 
 def _key(ax: Axes, longest: dict[str, float], scale: dict[str, float]) -> None:

@@ -33,9 +33,15 @@ def horizon_costs(
             [y - low.loc[model].to_numpy(float) / unit, high.loc[model].to_numpy(float) / unit - y]
         )
         ax.errorbar(
-            place + shift, y, yerr=np.nan_to_num(ends).clip(min=0), label=model, markersize=4.5,
-            linewidth=1.2, elinewidth=0.8, **curve_style(i),
-        )  # fmt: skip
+            place + shift,
+            y,
+            yerr=np.nan_to_num(ends).clip(min=0),
+            label=model,
+            markersize=4.5,
+            linewidth=1.2,
+            elinewidth=0.8,
+            **curve_style(i),
+        )
     ax.set_yscale("log")
     ticks = [0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0]
     ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
@@ -75,9 +81,12 @@ def forces_by_distance(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Figure:
         dress(ax, x="distance (m)", title=titles[way])
     axes[0].set_ylabel("mean force, + apart, - together (N)", fontsize=9.0)
     figure.legend(
-        handles=handles, loc="outside upper center", ncols=len(handles), frameon=False,
+        handles=handles,
+        loc="outside upper center",
+        ncols=len(handles),
+        frameon=False,
         fontsize=SMALL_FONT,
-    )  # fmt: skip
+    )
     return figure
 
 
@@ -103,9 +112,13 @@ def acceleration_by_speed(tables: Mapping[str, pd.DataFrame]) -> Figure:
         ax.patch.set_visible(False)
         for part, name in names.items():
             ax.plot(
-                table.index, table[part], label=name, color=OKABE_ITO[colors[part]],
-                linestyle=lines[part], linewidth=1.4,
-            )  # fmt: skip
+                table.index,
+                table[part],
+                label=name,
+                color=OKABE_ITO[colors[part]],
+                linestyle=lines[part],
+                linewidth=1.4,
+            )
         ax.axhline(0, color=GREY, linewidth=0.6)
         dress(ax, x="own speed (m/s)", title=model)
     axes[0].set_ylabel("mean acceleration along the own way (m/s²)", fontsize=SMALL_FONT)

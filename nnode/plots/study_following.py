@@ -65,9 +65,14 @@ def sides(values: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
         style = curve_style(i)
         face = "none" if i == 0 else style["color"]
         ax.plot(
-            speed, gap, style["marker"], color=style["color"], markerfacecolor=face,
-            markersize=5, label=f"{name}: {len(gap)} pairs",
-        )  # fmt: skip
+            speed,
+            gap,
+            style["marker"],
+            color=style["color"],
+            markerfacecolor=face,
+            markersize=5,
+            label=f"{name}: {len(gap)} pairs",
+        )
     dress(ax, x="mean speed of the follower (m/s)", y="mean gap (m)")
     ax.legend(fontsize=SMALL_FONT, frameon=False)
     return figure
@@ -90,8 +95,11 @@ def profiles(found: Mapping[str, Mapping[str, np.ndarray]], units: Mapping[str, 
         dress(ax, x=f"{name} ({units.get(name, '')})", y="rise of the error (m)" if first else "")
         ax.set_xscale("log")
         ax.minorticks_off()
-        ticks = [t for t in (0.25, 0.5, 1, 2, 5, 10, 20, 50, 100)
-                 if min(one["values"]) <= t <= max(one["values"])]  # fmt: skip
+        ticks = [
+            t
+            for t in (0.25, 0.5, 1, 2, 5, 10, 20, 50, 100)
+            if min(one["values"]) <= t <= max(one["values"])
+        ]
         ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes[0].set_ylim(-0.1 * SHOWN, SHOWN)
     return figure
@@ -181,8 +189,14 @@ def by_group(values: Mapping[str, Mapping[str, np.ndarray]], y: str) -> Figure:
         for place, group in enumerate(values.values()):
             own = group.get(kind, np.empty(0))
             x = place + (i - (len(kinds) - 1) / 2) * 0.16
-            ax.plot(np.full(len(own), x), own, style["marker"], color=style["color"],
-                    markersize=5, fillstyle="none")  # fmt: skip
+            ax.plot(
+                np.full(len(own), x),
+                own,
+                style["marker"],
+                color=style["color"],
+                markersize=5,
+                fillstyle="none",
+            )
     ax.set_xticks(range(len(values)), list(values))
     dress(ax, y=y)
     handles = [

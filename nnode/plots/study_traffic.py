@@ -35,9 +35,14 @@ def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -
         y = speeds.loc[model].to_numpy(float)
         ends = np.stack([y - low.loc[model].to_numpy(float), high.loc[model].to_numpy(float) - y])
         ax.errorbar(
-            x, y, yerr=np.nan_to_num(ends).clip(min=0), fmt=style["marker"], color=style["color"],
-            markersize=4.5, elinewidth=0.8,
-        )  # fmt: skip
+            x,
+            y,
+            yerr=np.nan_to_num(ends).clip(min=0),
+            fmt=style["marker"],
+            color=style["color"],
+            markersize=4.5,
+            elinewidth=0.8,
+        )
         mean = float(np.nanmean(y))
         ax.axhline(mean, color=style["color"], linestyle=style["linestyle"], linewidth=1)
         handles.append(
@@ -46,9 +51,14 @@ def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -
     ax.set_xticks(place, [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)])
     dress(ax, x="recording", y="leader's speed v0 (km/h)")
     figure.legend(
-        handles=handles, loc="outside upper center", ncols=3, frameon=False,
-        fontsize=SMALL_FONT, handlelength=2.6, columnspacing=1.2,
-    )  # fmt: skip
+        handles=handles,
+        loc="outside upper center",
+        ncols=3,
+        frameon=False,
+        fontsize=SMALL_FONT,
+        handlelength=2.6,
+        columnspacing=1.2,
+    )
     return figure
 
 
@@ -152,9 +162,17 @@ def space_time(
         ax.plot(t[k], sequence.x[k, agent, 0], "s", color="black", fillstyle="none", markersize=10)
     if marked:
         handles.append(
-            Line2D([], [], color="black", marker="s", fillstyle="none", markersize=8,
-                   linestyle="", label="fault of the measurement")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                color="black",
+                marker="s",
+                fillstyle="none",
+                markersize=8,
+                linestyle="",
+                label="fault of the measurement",
+            )
+        )
     dress(ax, x="time in the sequence (s)", y="position along the lane (m)", title=sequence.name)
     ax.legend(handles=handles, fontsize=SMALL_FONT)
     return figure

@@ -240,10 +240,18 @@ def _curve(
     ax.plot(gap, np.where(held, speed, np.nan), gid=f"curve:{name}", **line)
     if v0 is not None:
         ax.plot(
-            place, v0, gid=f"v0:{name}", transform=ax.get_yaxis_transform(), linestyle="",
-            marker=style["marker"], color=style["color"], markersize=5, zorder=4,
-            markeredgecolor="white", markeredgewidth=0.4,
-        )  # fmt: skip
+            place,
+            v0,
+            gid=f"v0:{name}",
+            transform=ax.get_yaxis_transform(),
+            linestyle="",
+            marker=style["marker"],
+            color=style["color"],
+            markersize=5,
+            zorder=4,
+            markeredgecolor="white",
+            markeredgewidth=0.4,
+        )
 
 
 def _left_out(models: Mapping[str, System]) -> list[str]:

@@ -75,9 +75,14 @@ class Population:
 
 
 def fit_drivers(
-    system: System, paths: Paths, drivers: str | Iterable[str] = "auto",
-    first: Mapping[str, float] | None = None, *, seed: int = 0, pairs: int = PAIRS,
-) -> Population:  # fmt: skip
+    system: System,
+    paths: Paths,
+    drivers: str | Iterable[str] = "auto",
+    first: Mapping[str, float] | None = None,
+    *,
+    seed: int = 0,
+    pairs: int = PAIRS,
+) -> Population:
     """Calibrate a law to drivers who differ.
 
     Args:
@@ -198,15 +203,27 @@ def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Popul
 
 
 def _estimated(
-    model: Followers, noise: PushNoise, theta: np.ndarray, variances: Variances,
-    agents: np.ndarray | None = None, start: np.ndarray | None = None,
-) -> Population:  # fmt: skip
+    model: Followers,
+    noise: PushNoise,
+    theta: np.ndarray,
+    variances: Variances,
+    agents: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+) -> Population:
     """The estimate of a model; the search starts at parameters, standard deviations and, where they
     are given, deviations of drivers and of starts."""
     found = estimate(
-        model, noise, theta, variances, low=model.low, high=model.high,
-        longest=LONGEST, tolerance=TOLERANCE, agents=agents, start=start,
-    )  # fmt: skip
+        model,
+        noise,
+        theta,
+        variances,
+        low=model.low,
+        high=model.high,
+        longest=LONGEST,
+        tolerance=TOLERANCE,
+        agents=agents,
+        start=start,
+    )
     return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
 
 

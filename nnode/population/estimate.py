@@ -100,11 +100,20 @@ class Estimate:
 
 
 def estimate(
-    response: Response, noise: Noise, theta: np.ndarray, variances: Variances, *,
-    low: np.ndarray | None = None, high: np.ndarray | None = None, restricted: bool = False,
-    longest: float = np.inf, steps: int = 40, tolerance: float = 1e-3,
-    agents: np.ndarray | None = None, start: np.ndarray | None = None,
-) -> Estimate:  # fmt: skip
+    response: Response,
+    noise: Noise,
+    theta: np.ndarray,
+    variances: Variances,
+    *,
+    low: np.ndarray | None = None,
+    high: np.ndarray | None = None,
+    restricted: bool = False,
+    longest: float = np.inf,
+    steps: int = 40,
+    tolerance: float = 1e-3,
+    agents: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+) -> Estimate:
     """Estimate a model of agents who differ.
 
     Args:
@@ -170,15 +179,26 @@ def estimate(
     products = noise.products(data, variances.noise)
     final = marginal(data, products, variances.spread, variances.start, restricted=restricted)
     return Estimate(
-        theta=theta, agents=agents, start=start, variances=variances, data=data,
-        marginal=final, steps=taken, converged=converged,
-    )  # fmt: skip
+        theta=theta,
+        agents=agents,
+        start=start,
+        variances=variances,
+        data=data,
+        marginal=final,
+        steps=taken,
+        converged=converged,
+    )
 
 
 def fit_deviations(
-    response: Response, noise: Noise, theta: np.ndarray, variances: Variances, *,
-    agents: np.ndarray | None = None, start: np.ndarray | None = None,
-) -> Estimate:  # fmt: skip
+    response: Response,
+    noise: Noise,
+    theta: np.ndarray,
+    variances: Variances,
+    *,
+    agents: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+) -> Estimate:
     """Estimate the deviations of agents and of starts, parameters and variances given.
 
     Args:
@@ -187,16 +207,27 @@ def fit_deviations(
     """
     fixed = replace(variances, low=variances.row, high=variances.row)
     found = estimate(
-        response, noise, theta, fixed, low=theta, high=theta, tolerance=MODES, agents=agents,
+        response,
+        noise,
+        theta,
+        fixed,
+        low=theta,
+        high=theta,
+        tolerance=MODES,
+        agents=agents,
         start=start,
-    )  # fmt: skip
+    )
     return replace(found, variances=variances)
 
 
 def fit_variances(
-    data: Linearised, noise: Noise, variances: Variances, *,
-    restricted: bool = False, tolerance: float = 1e-3,
-) -> Variances:  # fmt: skip
+    data: Linearised,
+    noise: Noise,
+    variances: Variances,
+    *,
+    restricted: bool = False,
+    tolerance: float = 1e-3,
+) -> Variances:
     """The variances that are most likely, the samples' linearisation given.
 
     Logarithms of standard deviations are scaled by the spread of the agents' scores, which is their
@@ -236,18 +267,24 @@ def fit_variances(
 
     low, high = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
     best = minimize(
-        value, whole[free] / scale, jac=True, method="L-BFGS-B",
+        value,
+        whole[free] / scale,
+        jac=True,
+        method="L-BFGS-B",
         bounds=list(zip(low, high, strict=True)),
         options={"ftol": tolerance / max(abs(first.loglik), 1.0), "gtol": tolerance},
-    )  # fmt: skip
+    )
     whole[free] = best.x * scale
     return variances.filled(np.exp(whole))
 
 
 def _misfit(
-    data: Linearised, products: Products, variances: Variances, agents: np.ndarray,
+    data: Linearised,
+    products: Products,
+    variances: Variances,
+    agents: np.ndarray,
     start: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """``(D,)`` the agents' penalised sums of squares; infinite where a simulation blows up."""
     number, count = data.fixed.shape[-1], len(agents)
     blown = ~np.isfinite(np.where(data.seen, data.residual, 0.0)).all(1)

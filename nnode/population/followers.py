@@ -103,10 +103,13 @@ class Paths:
             1,
         )
         return replace(
-            self, x=measured, smoothed=smoothed, start=start,
+            self,
+            x=measured,
+            smoothed=smoothed,
+            start=start,
             ahead=_ahead(*which, len(self.ahead), self.half),
             ahead_at_samples=_ahead(*which, x.shape[1], self.dt),
-        )  # fmt: skip
+        )
 
 
 def paths_of(sequences: list[Sequence], step: float) -> Paths:
@@ -136,14 +139,22 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
     start = np.stack([_start(smoothed[b][:, i], dt) for b, i in which], 1)
     noise = measured_noise(sequences).position
     return Paths(
-        x=x, seen=seen, sequence=sequence, place=place, agent=np.array(agent),
-        names=tuple(names), smoothed=smoothed, dt=dt, half=half,
+        x=x,
+        seen=seen,
+        sequence=sequence,
+        place=place,
+        agent=np.array(agent),
+        names=tuple(names),
+        smoothed=smoothed,
+        dt=dt,
+        half=half,
         ahead=_ahead(smoothed, sequence, place, dt, times, half),
-        ahead_at_samples=_ahead(smoothed, sequence, place, dt, samples, dt), start=start,
+        ahead_at_samples=_ahead(smoothed, sequence, place, dt, samples, dt),
+        start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
         batch=collate(_with_those_ahead(sequences[b], i) for b, i in which),
-    )  # fmt: skip
+    )
 
 
 def _with_those_ahead(s: Sequence, place: int) -> Sequence:
@@ -159,9 +170,13 @@ def _start(path: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _ahead(
-    smoothed: list[np.ndarray], sequence: np.ndarray, place: np.ndarray, dt: float, times: int,
+    smoothed: list[np.ndarray],
+    sequence: np.ndarray,
+    place: np.ndarray,
+    dt: float,
+    times: int,
     apart: float,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """``(H, 4, F)`` as in :class:`Paths`, at so many times so far apart (s); after the last sample
     vehicles stay where they were."""
     found = np.empty((times, 4, len(sequence)))
@@ -368,9 +383,16 @@ class Followers:
         moved, after = self.linear(own, states[:, :, 0])
         forced = np.ascontiguousarray(after[..., order - 1])
         return Linearised(
-            residual=residual, fixed=fixed, random=random, start=first, seen=paths.seen,
-            agent=paths.agent, step=moved, forced=forced, dt=paths.dt,
-        )  # fmt: skip
+            residual=residual,
+            fixed=fixed,
+            random=random,
+            start=first,
+            seen=paths.seen,
+            agent=paths.agent,
+            step=moved,
+            forced=forced,
+            dt=paths.dt,
+        )
 
     def rates(self, own: np.ndarray, states: np.ndarray) -> np.ndarray:
         """``(M, K, F)`` rates along a run.

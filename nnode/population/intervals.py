@@ -97,11 +97,19 @@ def variations(found: Population) -> dict[str, dict[str, Any]]:
         bound = "high" if values[k] >= highest[k] / (1 + NEAR) else bound
         lower, upper = (float(factor[k] * end) for end in ends[k])
         table[name] = {
-            "estimate": float(factor[k] * values[k]), "lower": lower, "upper": upper,
-            "unit": units[k], "at_bound": bound, "shrinkage": float(left[k]),
-        }  # fmt: skip
+            "estimate": float(factor[k] * values[k]),
+            "lower": lower,
+            "upper": upper,
+            "unit": units[k],
+            "at_bound": bound,
+            "shrinkage": float(left[k]),
+        }
     table["measurement"] = {
-        "estimate": found.noise.error, "lower": np.nan, "upper": np.nan, "unit": "m",
-        "at_bound": "", "shrinkage": np.nan,
-    }  # fmt: skip
+        "estimate": found.noise.error,
+        "lower": np.nan,
+        "upper": np.nan,
+        "unit": "m",
+        "at_bound": "",
+        "shrinkage": np.nan,
+    }
     return table

@@ -171,17 +171,27 @@ class PushNoise(Noise):
         assert data.step is not None
         assert data.forced is not None
         found: tuple[np.ndarray, np.ndarray] = _filtered(
-            np.ascontiguousarray(columns), data.seen, data.step, data.forced,
-            values[0], np.exp(-data.dt / values[1]), self.error**2,
-        )  # fmt: skip
+            np.ascontiguousarray(columns),
+            data.seen,
+            data.step,
+            data.forced,
+            values[0],
+            np.exp(-data.dt / values[1]),
+            self.error**2,
+        )
         return found
 
 
 @njit(cache=True, nogil=True)
 def _filtered(
-    columns: np.ndarray, seen: np.ndarray, step: np.ndarray, forced: np.ndarray,
-    sigma: float, keep: float, variance: float,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    columns: np.ndarray,
+    seen: np.ndarray,
+    step: np.ndarray,
+    forced: np.ndarray,
+    sigma: float,
+    keep: float,
+    variance: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Columns that a Kalman filter has whitened, and logarithms of determinants.
 
     The state is (d, e); the first element of d is measured.
@@ -265,9 +275,13 @@ class Whitening:
     """
 
     def __init__(
-        self, data: Linearised, noise: Noise, values: np.ndarray, spread: np.ndarray,
+        self,
+        data: Linearised,
+        noise: Noise,
+        values: np.ndarray,
+        spread: np.ndarray,
         start: np.ndarray,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._data, self._noise, self._values = data, noise, values
         self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         segment = np.arange(len(data.agent))
@@ -326,9 +340,13 @@ class Marginal:
 
 
 def marginal(
-    data: Linearised, segments: Products, spread: np.ndarray, start: np.ndarray, *,
+    data: Linearised,
+    segments: Products,
+    spread: np.ndarray,
+    start: np.ndarray,
+    *,
     restricted: bool = False,
-) -> Marginal:  # fmt: skip
+) -> Marginal:
     """The marginal likelihood, and what follows from it.
 
     Args:
@@ -355,9 +373,16 @@ def marginal(
     every = np.concatenate([np.tile(weights, (len(data.agent), 1)), -b[data.agent]], 1)
     h, _ = segments.factors(start, every)
     return Marginal(
-        loglik=loglik, each=each, change=change, information=information, agents=rest.gram,
-        deviations=b, variances=left, shrinkage=left / spread**2, start=h,
-    )  # fmt: skip
+        loglik=loglik,
+        each=each,
+        change=change,
+        information=information,
+        agents=rest.gram,
+        deviations=b,
+        variances=left,
+        shrinkage=left / spread**2,
+        start=h,
+    )
 
 
 def flat_solve(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -214,10 +214,13 @@ class PersonAlone:
             row = np.arange(number) if self.number > 1 else np.zeros(number, dtype=int)
             own = states.flatten(1, 2).index_select(1, place)
             found = self._kernel.accelerations(
-                own.view(-1, 4).numpy(), np.tile(np.arange(len(place)), number),
-                np.repeat(moment, len(place)), np.repeat(row, len(place)),
-                *self.around.tables, self._law,
-            )  # fmt: skip
+                own.view(-1, 4).numpy(),
+                np.tile(np.arange(len(place)), number),
+                np.repeat(moment, len(place)),
+                np.repeat(row, len(place)),
+                *self.around.tables,
+                self._law,
+            )
             rate.flatten(1, 2).index_copy_(1, place, torch.from_numpy(found).view(number, -1, 2))
         return rate
 

@@ -14,9 +14,14 @@ STEP, DT = 0.02, 0.2
 
 
 def table(
-    seed: int, *, platoons: int, cars: int, seconds: float, noise: float,
+    seed: int,
+    *,
+    platoons: int,
+    cars: int,
+    seconds: float,
+    noise: float,
     differ: dict[str, float],
-) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:  # fmt: skip
+) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
     """A tidy table of positions, and of each parameter what ``(platoons, cars - 1)`` drivers have.
 
     Steps are Heun's. Speeds of leaders are sums of two waves around 8 to 22 m/s.

@@ -54,12 +54,17 @@ def pairs(number: int, seconds: float, seed: int = 0) -> pd.DataFrame:
         tables.append(
             pd.DataFrame(
                 {
-                    "pair": f"p{pair}", "time": STEP * np.arange(len(x)),
-                    "x_follower": x[:, 0], "x_leader": x[:, 1],
-                    "v_follower": v[:, 0], "v_leader": v[:, 1],
-                    "leader_length": LONG, "follower_length": LONG,
-                    "follower": f"f{pair}", "leader": f"l{pair}",
+                    "pair": f"p{pair}",
+                    "time": STEP * np.arange(len(x)),
+                    "x_follower": x[:, 0],
+                    "x_leader": x[:, 1],
+                    "v_follower": v[:, 0],
+                    "v_leader": v[:, 1],
+                    "leader_length": LONG,
+                    "follower_length": LONG,
+                    "follower": f"f{pair}",
+                    "leader": f"l{pair}",
                 }
             )
-        )  # fmt: skip
+        )
     return pd.concat(tables, ignore_index=True)

@@ -91,9 +91,11 @@ class Forks:
         """As ``subprocess.Popen``; in place of a script's name may stand code, of several lines."""
         self._number += 1
         order = {
-            "name": name, "overrides": overrides, "env": {**self._environment, **env},
+            "name": name,
+            "overrides": overrides,
+            "env": {**self._environment, **env},
             **{kind: f"{self._folder.name}/{self._number}.{kind}" for kind in ("out", "errors")},
-        }  # fmt: skip
+        }
         return Forked(self, self.ask(order), order)
 
     def ask(self, order: dict[str, Any]) -> Any:
@@ -101,9 +103,12 @@ class Forks:
         if self._server is None:
             self._server = subprocess.Popen(
                 [sys.executable, "-m", "tests.app.forked"],
-                cwd=ROOT, env=self._environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            )  # fmt: skip
+                cwd=ROOT,
+                env=self._environment,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+            )
         assert self._server.stdin is not None
         assert self._server.stdout is not None
         print(json.dumps(order), file=self._server.stdin, flush=True)

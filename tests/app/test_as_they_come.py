@@ -63,9 +63,16 @@ OPTIONS = {
     in_frames: {"time_unit": "frame", "frame_rate": 10.0},
 }
 FORMS: list[Form] = [
-    at_map_coordinates, later, with_dates, with_clock_times, in_nanoseconds, renamed, shuffled,
-    in_feet, in_frames,
-]  # fmt: skip
+    at_map_coordinates,
+    later,
+    with_dates,
+    with_clock_times,
+    in_nanoseconds,
+    renamed,
+    shuffled,
+    in_feet,
+    in_frames,
+]
 
 
 def fitted(given: nnode.Sequences) -> pd.DataFrame:

@@ -44,8 +44,15 @@ if __name__ == "__main__":
 
 
 def overrides(table: Path, folder: Path) -> list[str]:
-    return ["model=lin", "model.leader=measured", "data=table", f"data.path={table}",
-            "data.domain=traffic", f"hydra.run.dir={folder}", "discover.sealed=0.4"]  # fmt: skip
+    return [
+        "model=lin",
+        "model.leader=measured",
+        "data=table",
+        f"data.path={table}",
+        "data.domain=traffic",
+        f"hydra.run.dir={folder}",
+        "discover.sealed=0.4",
+    ]
 
 
 #: The diagnosis by hand, then scripts that take its model, all in one process: loading the
@@ -248,9 +255,12 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
     before = sorted(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
     report = app.diagnose_table(
-        table, "crowd", model={"term": "social_force", "B": 0.3, "walls": False}, walls=walls,
+        table,
+        "crowd",
+        model={"term": "social_force", "B": 0.3, "walls": False},
+        walls=walls,
         seed=3,
-    ).plain()  # fmt: skip
+    ).plain()
     assert report["verdict"] == "named"
     assert report["model"] == "social_force"
     assert report["effects"][0]["coefficients"]["w_y"]["value"] == pytest.approx(0.35)
@@ -263,9 +273,12 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(nearest_law, "with_effects", lambda laws, effects: laws)
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     report = app.diagnose_table(
-        table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
+        table,
+        "traffic",
+        model={"term": "lin"},
+        folder=tmp_path / "run",
         options=DiscoverOptions(page=False, compare=["idm"]),
-    )  # fmt: skip
+    )
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert report.nearest is not None
     assert report.nearest.diagnosis.model == "idm"
@@ -336,9 +349,12 @@ def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
 def test_the_slow_zone_of_made_up_platoons_is_named(tmp_path: Path) -> None:
     table = lane(tmp_path / "lane.csv", sequences=12, seconds=20.0, cars=6)
     report = app.diagnose_table(
-        table, "traffic", model={"term": "lin"}, folder=tmp_path / "run",
+        table,
+        "traffic",
+        model={"term": "lin"},
+        folder=tmp_path / "run",
         options=DiscoverOptions(effects=["speed_zone", "relative_speed"]),
-    ).plain()  # fmt: skip
+    ).plain()
     assert report["verdict"] == "named"
     (effect,) = report["effects"]
     assert effect["name"] == "speed_zone"

@@ -21,10 +21,13 @@ def highd(tmp_path: Path) -> Path:
     frame = ((table["time"] - 40 * table["sequence"]) * 5).round().astype(int)
     pd.DataFrame(
         {
-            "frame": frame, "id": number, "x": table["x"] - 4.5, "width": 4.5,
+            "frame": frame,
+            "id": number,
+            "x": table["x"] - 4.5,
+            "width": 4.5,
             "laneId": table["sequence"] + 1,
         }
-    ).to_csv(tmp_path / "01_tracks.csv", index=False)  # fmt: skip
+    ).to_csv(tmp_path / "01_tracks.csv", index=False)
     pd.DataFrame({"id": sorted(set(number)), "class": "Car", "drivingDirection": 2}).to_csv(
         tmp_path / "01_tracksMeta.csv", index=False
     )
@@ -58,9 +61,15 @@ def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
 
 def test_highd_ends_with_a_verdict(highd: Path, script: Script, tmp_path: Path) -> None:
     report = diagnosed(
-        script, tmp_path / "run", "model=lin", "model.leader=measured", "data=highd",
-        f"data.path={highd}", "data.window=null", "discover.effects=[inertia]",
-    )  # fmt: skip
+        script,
+        tmp_path / "run",
+        "model=lin",
+        "model.leader=measured",
+        "data=highd",
+        f"data.path={highd}",
+        "data.window=null",
+        "discover.effects=[inertia]",
+    )
     assert report["verdict"] in ("none", "unknown")  # their law has no inertia
     assert report["effects"] == report["data_faults"] == []
     assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 9
@@ -68,10 +77,16 @@ def test_highd_ends_with_a_verdict(highd: Path, script: Script, tmp_path: Path) 
 
 def test_pedpy_ends_with_a_verdict(pedpy: Path, script: Script, tmp_path: Path) -> None:
     report = diagnosed(
-        script, tmp_path / "run", "model=sf", "model.B=0.3", "data=pedpy", f"data.path={pedpy}",
-        f"data.geometry={pedpy.with_name('area.wkt')}", "data.t_seq=2",
+        script,
+        tmp_path / "run",
+        "model=sf",
+        "model.B=0.3",
+        "data=pedpy",
+        f"data.path={pedpy}",
+        f"data.geometry={pedpy.with_name('area.wkt')}",
+        "data.t_seq=2",
         "discover.effects=[gait_sway]",
-    )  # fmt: skip
+    )
     assert report["verdict"] in ("none", "unknown")  # nobody sways
     assert report["effects"] == report["data_faults"] == []
     assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 9

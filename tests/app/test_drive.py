@@ -34,13 +34,19 @@ def run_of(folder: Path, name: str, *effects: dict[str, Any], **solver: Any) -> 
     """The folder of a training of which only the checkpoint is left."""
     options = {**model_options(name, "measured"), "effects": list(effects)}
     config = {
-        "model": options, "seed": 0, "trainer": {"dtype": "float64"}, "data": {"name": "sumo"},
+        "model": options,
+        "seed": 0,
+        "trainer": {"dtype": "float64"},
+        "data": {"name": "sumo"},
         "solver": {"name": "fused", "dt": 0.1, "method": None, **solver},
-    }  # fmt: skip
+    }
     made = Checkpoint(
-        config=config, manifest={"dt": 0.2}, model=build_model(options).state_dict(), optimizer={},
+        config=config,
+        manifest={"dt": 0.2},
+        model=build_model(options).state_dict(),
+        optimizer={},
         progress={},
-    )  # fmt: skip
+    )
     save_checkpoint(made, folder / "checkpoints" / "best.pt")
     return folder
 
@@ -143,8 +149,10 @@ def test_lengths_are_asked_for_as_the_data_had_them(known: bool, tmp_path: Path)
     with pytest.raises(ConfigError, match=r"run/data, are not there.*lengths=true"):
         _has_lengths(checkpoint, str(run), checkpoint.build())
     k = np.arange(20)
-    rows = [pd.DataFrame({"sequence": "a", "time": 0.1 * k, "agent": n, "x": 30 * n + k})
-            for n in range(2)]  # fmt: skip
+    rows = [
+        pd.DataFrame({"sequence": "a", "time": 0.1 * k, "agent": n, "x": 30 * n + k})
+        for n in range(2)
+    ]
     table = pd.concat(rows)
     if known:
         table["length"] = 4.5

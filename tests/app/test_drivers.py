@@ -70,9 +70,15 @@ def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
 ) -> None:
     small.to_parquet(tmp_path / "table.parquet")
     done = script(
-        "train", "model=idm", "trainer.drivers=[T]", "data=table", "seed=3", "data.domain=traffic",
-        f"data.path={tmp_path / 'table.parquet'}", f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
+        "train",
+        "model=idm",
+        "trainer.drivers=[T]",
+        "data=table",
+        "seed=3",
+        "data.domain=traffic",
+        f"data.path={tmp_path / 'table.parquet'}",
+        f"hydra.run.dir={tmp_path}",
+    )
     assert done.returncode == 0, done.stderr
     written = json.loads((tmp_path / "result.json").read_text())
     found = nnode.Calibrator("idm", drivers=["T"], seed=3, heldout=0.2).fit(small).result_
@@ -136,13 +142,22 @@ def test_a_run_that_is_stopped_while_drivers_are_told_apart_goes_on(
     small.to_parquet(tmp_path / "table.parquet")
     folder = tmp_path / "run"
     words = [
-        "model=idm", "trainer.drivers=[T]", "data=table", "seed=3", "data.domain=traffic",
-        "data.split.heldout=0", f"data.path={tmp_path / 'table.parquet'}",
-    ]  # fmt: skip
+        "model=idm",
+        "trainer.drivers=[T]",
+        "data=table",
+        "seed=3",
+        "data.domain=traffic",
+        "data.split.heldout=0",
+        f"data.path={tmp_path / 'table.parquet'}",
+    ]
     process = subprocess.Popen(
         [sys.executable, "scripts/train.py", *words, f"hydra.run.dir={folder}"],
-        cwd=ROOT, env=environment(), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment(),
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert process.stdout is not None
     for line in process.stdout:
         if "with drivers who differ" in line:

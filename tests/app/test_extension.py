@@ -196,10 +196,18 @@ def trained(copy: Copy, folder: Path) -> Path:
     """The folder of a run."""
     run = folder / "run"
     done = copy(
-        "train", "model=saturating", "model.leader=measured", "model.effects=[hills]",
-        "data=table", "data.domain=traffic", f"data.path={folder / 'platoons.csv'}",
-        "solver=fused", "optimizer=gauss_newton", "trainer.max_epochs=30", f"hydra.run.dir={run}",
-    )  # fmt: skip
+        "train",
+        "model=saturating",
+        "model.leader=measured",
+        "model.effects=[hills]",
+        "data=table",
+        "data.domain=traffic",
+        f"data.path={folder / 'platoons.csv'}",
+        "solver=fused",
+        "optimizer=gauss_newton",
+        "trainer.max_epochs=30",
+        f"hydra.run.dir={run}",
+    )
     assert done.returncode == 0, done.stderr
     return run
 
@@ -224,11 +232,20 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
     (conf / "mine.yaml").write_text(head + LAWS["saturating"], "utf-8")
     (tmp_path / "effects.py").write_text(IMPORTS + HILLS)
     done = script(
-        "train", "--config-dir", str(conf.parent), "model=mine", "model.effects=[hills]",
-        "data=table", "data.domain=traffic", f"data.path={folder / 'platoons.csv'}",
-        "solver=fused", "optimizer=lbfgs", "trainer.max_epochs=30",
-        f"hydra.run.dir={tmp_path / 'run'}", NNODE_EFFECTS=str(tmp_path / "effects.py"),
-    )  # fmt: skip
+        "train",
+        "--config-dir",
+        str(conf.parent),
+        "model=mine",
+        "model.effects=[hills]",
+        "data=table",
+        "data.domain=traffic",
+        f"data.path={folder / 'platoons.csv'}",
+        "solver=fused",
+        "optimizer=lbfgs",
+        "trainer.max_epochs=30",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        NNODE_EFFECTS=str(tmp_path / "effects.py"),
+    )
     assert done.returncode == 0, done.stderr
     assert estimates(tmp_path / "run") == pytest.approx(TRUTH, rel=0.02)
 
@@ -236,11 +253,17 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
 @pytest.mark.parametrize("law", ["polite", "strolling"])
 def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) -> None:
     done = copy(
-        "train", f"model={law}", *["model.effects=[waves]"] * (law == "polite"), "data=table",
-        "data.domain=crowd", f"data.path={folder / 'people.csv'}",
+        "train",
+        f"model={law}",
+        *["model.effects=[waves]"] * (law == "polite"),
+        "data=table",
+        "data.domain=crowd",
+        f"data.path={folder / 'people.csv'}",
         f"data.walls={folder / 'walls.csv'}",
-        "solver=fused", "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
+        "solver=fused",
+        "trainer.max_epochs=1",
+        f"hydra.run.dir={tmp_path}",
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["solver"] == {"name": "fused", "uncompiled": None}
@@ -256,16 +279,28 @@ def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) 
     ],
 )
 def test_it_is_found_and_shown(
-    copy: Copy, law: str, effect: str, strength: str, value: float, data: tuple[str, ...],
+    copy: Copy,
+    law: str,
+    effect: str,
+    strength: str,
+    value: float,
+    data: tuple[str, ...],
     tmp_path: Path,
-) -> None:  # fmt: skip
+) -> None:
     domain, table, *walls = data
     leader = ["model.leader=measured"] * (domain == "traffic")
     done = copy(
-        "discover", f"model={law}", *leader, "data=table", f"data.domain={domain}",
-        f"data.path={table}", *walls, "discover.compare=[]", "discover.structure=false",
+        "discover",
+        f"model={law}",
+        *leader,
+        "data=table",
+        f"data.domain={domain}",
+        f"data.path={table}",
+        *walls,
+        "discover.compare=[]",
+        "discover.structure=false",
         f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "report.json").read_text())
     assert (found["verdict"], [one["name"] for one in found["effects"]]) == ("named", [effect])
@@ -288,9 +323,13 @@ def test_it_drives_in_sumo(copy: Copy, trained: Path, tmp_path: Path) -> None:
         '</input><time><step-length value="0.1"/><end value="20"/></time></configuration>'
     )
     done = copy(
-        "drive", f"run={trained}", f"sumo={tmp_path / 'a.sumocfg'}", "vehicles=own",
-        "steps=scenario", f"hydra.run.dir={tmp_path / 'out'}",
-    )  # fmt: skip
+        "drive",
+        f"run={trained}",
+        f"sumo={tmp_path / 'a.sumocfg'}",
+        "vehicles=own",
+        "steps=scenario",
+        f"hydra.run.dir={tmp_path / 'out'}",
+    )
     assert done.returncode == 0, done.stderr
     (seen,) = read_sumo(tmp_path / "out" / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
     v0, reach, w = estimates(trained).values()

@@ -40,9 +40,12 @@ def test_errors_by_pair_and_driver(tmp_path: Path, capsys: pytest.CaptureFixture
     assert rows["sequence"].tolist() == ["run/1", "run/2"]
     assert rows["samples"].tolist() == [20, 10]
     for key, expected in (
-        ("spacing_rmse", [1, 2]), ("spacing_bias", [1, 2]), ("final_error", [1, 2]),
-        ("speed_rmse", [0.5, 0.5]), ("speed_bias", [-0.5, -0.5]),
-    ):  # fmt: skip
+        ("spacing_rmse", [1, 2]),
+        ("spacing_bias", [1, 2]),
+        ("final_error", [1, 2]),
+        ("speed_rmse", [0.5, 0.5]),
+        ("speed_bias", [-0.5, -0.5]),
+    ):
         np.testing.assert_allclose(rows[key], expected, atol=1e-12)
     (driver,) = by_driver(rows).to_dict("records")
     assert (driver["driver"], driver["sequences"], driver["samples"]) == ("driver", 2, 30)

@@ -49,16 +49,27 @@ def made(tmp_path: Path, table: Path) -> Made:
     def make(law: dict[str, Any] = LAW, **sections: dict[str, Any]) -> Path:
         config = {
             "model": {
-                "name": "mine", "term": "formula", "effects": [], "leader": "measured", "law": law,
-                "network": None, "box": None, "desired": "last", "wall_spacing": 0.25,
+                "name": "mine",
+                "term": "formula",
+                "effects": [],
+                "leader": "measured",
+                "law": law,
+                "network": None,
+                "box": None,
+                "desired": "last",
+                "wall_spacing": 0.25,
             },
             "data": {"name": "table", "domain": "traffic", "path": str(table), "faults": "drop"},
             "solver": {"name": "fused", "dt": None, "method": None, "threads": 1},
             "optimizer": {"name": "gauss_newton"},
             "trainer": {"dtype": "float64", "threads": None, "cost": "integral", "device": "cpu"},
-            "groups": {"model": "formula", "data": "table", "solver": "fused",
-                       "optimizer": "gauss_newton"},
-        }  # fmt: skip
+            "groups": {
+                "model": "formula",
+                "data": "table",
+                "solver": "fused",
+                "optimizer": "gauss_newton",
+            },
+        }
         config = {key: {**value, **sections.get(key, {})} for key, value in config.items()}
         config["data"] = {k: v for k, v in config["data"].items() if v is not None}
         path = tmp_path / "theirs" / "checkpoints" / "best.pt"
@@ -66,9 +77,15 @@ def made(tmp_path: Path, table: Path) -> Made:
         weights = {"terms.0.v0": 30.0, "terms.0.T": 1.2}
         model = {name: torch.tensor(value, dtype=torch.float64) for name, value in weights.items()}
         save_checkpoint(
-            Checkpoint(config={**config, "seed": 0}, manifest={}, model=model, optimizer={},
-                       progress={"epoch": 1, "step": 1}), path,
-        )  # fmt: skip
+            Checkpoint(
+                config={**config, "seed": 0},
+                manifest={},
+                model=model,
+                optimizer={},
+                progress={"epoch": 1, "step": 1},
+            ),
+            path,
+        )
         return path
 
     return make
@@ -124,11 +141,14 @@ def callbacks(folder: Path, trap: Path) -> str:
 @pytest.mark.parametrize(
     ("command", "option", "group"),
     [
-        ("evaluate", "checkpoint={}", "solver"), ("evaluate", "checkpoint={}", "data"),
-        ("export", "run={}", "solver"), ("simulate", "run={}", "data"),
-        ("train", "resume={}", "solver"), ("plot_forces", "checkpoint={}", "data"),
+        ("evaluate", "checkpoint={}", "solver"),
+        ("evaluate", "checkpoint={}", "data"),
+        ("export", "run={}", "solver"),
+        ("simulate", "run={}", "data"),
+        ("train", "resume={}", "solver"),
+        ("plot_forces", "checkpoint={}", "data"),
     ],
-)  # fmt: skip
+)
 def test_a_run_brings_no_configuration(
     started: Script, made: Made, tmp_path: Path, command: str, option: str, group: str
 ) -> None:
@@ -204,10 +224,21 @@ def test_the_environment_stays_here(
 
 def test_a_model_s_name_is_no_path(started: Script, made: Made, tmp_path: Path) -> None:
     people = {
-        "name": "../../escaped", "term": "social_force", "effects": [], "tau": 0.5, "mass": 1.0,
-        "walls": False, "wall_spacing": 0.25, "desired": "last", "A": 1.0, "k": 1.0, "kappa": 1.0,
-        "r": 0.25, "B": 0.05, "opposing_wall_friction": False,
-    }  # fmt: skip
+        "name": "../../escaped",
+        "term": "social_force",
+        "effects": [],
+        "tau": 0.5,
+        "mass": 1.0,
+        "walls": False,
+        "wall_spacing": 0.25,
+        "desired": "last",
+        "A": 1.0,
+        "k": 1.0,
+        "kappa": 1.0,
+        "r": 0.25,
+        "B": 0.05,
+        "opposing_wall_friction": False,
+    }
     path = made(model=people)
     content = torch.load(path, weights_only=True)
     content["config"]["data"]["recording"] = "all"

@@ -43,9 +43,12 @@ def test_a_simulation_with_steps_of_its_own_is_shown_at_the_measured_times(tmp_p
     measured = cars(0.2, 4.0)
     other = cars(0.5, 3.0, late=2.0)
     path = nnode.replay(
-        measured, {"mine": other, "short": other[other["agent"] == "a"]}, tmp_path / "r.html",
-        domain="traffic", zones=[Zone("zone", x=(10.0, 20.0))],
-    )  # fmt: skip
+        measured,
+        {"mine": other, "short": other[other["agent"] == "a"]},
+        tmp_path / "r.html",
+        domain="traffic",
+        zones=[Zone("zone", x=(10.0, 20.0))],
+    )
     found = held(path)
     (scene,) = found["scenes"]
     real = tracks(scene["measured"])
@@ -67,9 +70,12 @@ def test_files_of_people_and_walls(tmp_path: Path) -> None:
         tmp_path / "walls.csv", index=False
     )
     path = nnode.replay(
-        tmp_path / "real.csv", tmp_path / "model.parquet", tmp_path / "r.html",
-        domain="crowd", walls=tmp_path / "walls.csv",
-    )  # fmt: skip
+        tmp_path / "real.csv",
+        tmp_path / "model.parquet",
+        tmp_path / "r.html",
+        domain="crowd",
+        walls=tmp_path / "walls.csv",
+    )
     (scene,) = held(path)["scenes"]
     assert (scene["dims"], scene["walls"]) == (2, [[0.0, 0.0, 4.0, 0.0]])
     np.testing.assert_allclose(tracks(scene["measured"]), [time, 1 + time], atol=0.0051)

@@ -16,10 +16,15 @@ ROUNDING = 1e-9
 
 def trained(script: Script, raw: Path, folder: Path, *overrides: str) -> dict[str, float]:  # noqa: F811
     done = script(
-        "train", "experiment=demo_crowd", f"data.source={raw}", "trainer.max_epochs=3",
-        "trainer.figure_every=0", "data.loader.batch_size=2", f"hydra.run.dir={folder}",
+        "train",
+        "experiment=demo_crowd",
+        f"data.source={raw}",
+        "trainer.max_epochs=3",
+        "trainer.figure_every=0",
+        "data.loader.batch_size=2",
+        f"hydra.run.dir={folder}",
         *overrides,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     model = load_checkpoint(folder / "checkpoints" / "last.pt").build()
     return {

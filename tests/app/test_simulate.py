@@ -28,9 +28,14 @@ def run(started: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulate")
     table(10, 10.0).to_csv(folder / "mine.csv", index=False)
     done = started(
-        "train", "model=idm", "data=table", "data.domain=traffic", f"data.path={folder}/mine.csv",
-        "trainer.max_epochs=2", f"hydra.run.dir={folder}/run",
-    )  # fmt: skip
+        "train",
+        "model=idm",
+        "data=table",
+        "data.domain=traffic",
+        f"data.path={folder}/mine.csv",
+        "trainer.max_epochs=2",
+        f"hydra.run.dir={folder}/run",
+    )
     assert done.returncode == 0, done.stderr
     return folder / "run"
 
@@ -130,8 +135,10 @@ def test_the_lines_of_the_page(
     exec(compile(text.replace('"RUN"', repr(str(run))), "sampling.md", "exec"), names)
     assert "noise of idm: " in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "runs" / "samples").iterdir()} == {
-        "scores.json", "bands.png", "samples.parquet",
-    }  # fmt: skip
+        "scores.json",
+        "bands.png",
+        "samples.parquet",
+    }
 
 
 def walks(number: int = 10, people: int = 4, seconds: float = 8.0) -> pd.DataFrame:
@@ -170,9 +177,10 @@ def test_people_are_sampled(tmp_path: Path) -> None:
     names = {path.name for path in found.write(tmp_path / "out")}
     assert names == {"scores.json", "bands.png", "samples.parquet", "walls.csv"}
     again = TableOptions(
-        domain="crowd", path=str(tmp_path / "out" / "samples.parquet"),
+        domain="crowd",
+        path=str(tmp_path / "out" / "samples.parquet"),
         walls=str(tmp_path / "out" / "walls.csv"),
-    )  # fmt: skip
+    )
     store = prepare(again, tmp_path / "again")
     assert len(store) == SAMPLES * len(found.sampling.indices)
     np.testing.assert_array_equal(store[5].x, found.trajectories[5].x)

@@ -79,10 +79,15 @@ def test_scikit_learn_s_checks_pass_where_they_apply() -> None:
     passed = {row["check_name"] for row in found if row["status"] == "passed"}
     assert failed == set(NOT_APPLICABLE), [r["exception"] for r in found if r["exception"]]
     assert {
-        "check_estimator_cloneable", "check_get_params_invariance", "check_set_params",
-        "check_no_attributes_set_in_init", "check_parameters_default_constructible",
-        "check_estimators_unfitted", "check_estimator_repr", "check_valid_tag_types",
-    } <= passed  # fmt: skip
+        "check_estimator_cloneable",
+        "check_get_params_invariance",
+        "check_set_params",
+        "check_no_attributes_set_in_init",
+        "check_parameters_default_constructible",
+        "check_estimators_unfitted",
+        "check_estimator_repr",
+        "check_valid_tag_types",
+    } <= passed
 
 
 def test_a_clone_has_the_parameters_and_no_fit(sequences: nnode.Sequences) -> None:
@@ -137,8 +142,12 @@ def test_a_search_over_models_finds_the_law_that_was_driven(sequences: nnode.Seq
 
 def test_estimators_of_the_folds_are_told(sequences: nnode.Sequences) -> None:
     found = cross_validate(
-        nnode.Calibrator("lin", leader="measured", epochs=3), sequences, cv=GroupKFold(2),
-        groups=sequences.groups, return_estimator=True, return_train_score=True,
-    )  # fmt: skip
+        nnode.Calibrator("lin", leader="measured", epochs=3),
+        sequences,
+        cv=GroupKFold(2),
+        groups=sequences.groups,
+        return_estimator=True,
+        return_train_score=True,
+    )
     assert [len(e.result_.checkpoint.split["train"]) for e in found["estimator"]] == [3, 3]
     assert np.isfinite(found["train_score"]).all()

@@ -36,8 +36,12 @@ def of_platoons(folder: Path) -> Path:
 
 def in_feet(folder: Path) -> Path:
     table = platoons().assign(pos=lambda d: d.pos / 0.3048)
-    return saved(table.rename(columns={"pos": "pos [ft]", "t": "t [ms]"}).assign(
-        **{"t [ms]": lambda d: (1000 * d["t [ms]"]).round()}), folder)  # fmt: skip
+    return saved(
+        table.rename(columns={"pos": "pos [ft]", "t": "t [ms]"}).assign(
+            **{"t [ms]": lambda d: (1000 * d["t [ms]"]).round()}
+        ),
+        folder,
+    )
 
 
 def with_semicolons(folder: Path) -> Path:
@@ -60,8 +64,13 @@ def recordings(folder: Path) -> Path:
 def pairs(folder: Path) -> Path:
     table = cars(2)
     lead, follow = (table[table.veh == i].reset_index() for i in (0, 1))
-    columns = {"t_ms": 1000 * lead.t, "xFollower": follow.x, "x_leader": lead.x,
-               "v_follower": follow.v, "v_leader": lead.v}  # fmt: skip
+    columns = {
+        "t_ms": 1000 * lead.t,
+        "xFollower": follow.x,
+        "x_leader": lead.x,
+        "v_follower": follow.v,
+        "v_leader": lead.v,
+    }
     return saved(pd.DataFrame(columns), folder, "pairs.csv")
 
 
@@ -81,18 +90,28 @@ def pedpy(folder: Path) -> Path:
 Form = Callable[[Path], Path]
 #: Tables, with the number of sequences that each is.
 FORMS: list[tuple[Form, int | None]] = [
-    (tidy, 5), (of_platoons, 5), (in_feet, 5), (with_semicolons, 5), (vehicles, 1),
-    (recordings, None), (pairs, 1), (crowd, None), (crowd_of_runs, None), (pedpy, None),
-]  # fmt: skip
+    (tidy, 5),
+    (of_platoons, 5),
+    (in_feet, 5),
+    (with_semicolons, 5),
+    (vehicles, 1),
+    (recordings, None),
+    (pairs, 1),
+    (crowd, None),
+    (crowd_of_runs, None),
+    (pedpy, None),
+]
 #: Those that every run of the tests takes; the others take half a minute each.
 QUICK = ("of_platoons", "recordings", "pairs")
 CASES = [
     pytest.param(
-        form, number, id=form.__name__,
+        form,
+        number,
+        id=form.__name__,
         marks=[] if form.__name__ in QUICK else [pytest.mark.thorough],
     )
     for form, number in FORMS
-]  # fmt: skip
+]
 
 
 def commands(printed: str) -> list[list[str]]:
@@ -151,8 +170,12 @@ def test_what_is_told_in_python_reads_what_is_recognised(tmp_path: Path) -> None
         folder.mkdir()
         path = form(folder)
         rate = {"frame_rate": 16.0} if form in (crowd, crowd_of_runs) else {}
-        frame = nnode.sequences(pd.read_csv(path, sep=None, engine="python", decimal=(
-            "," if form is with_semicolons else ".")), **rate)  # fmt: skip
+        frame = nnode.sequences(
+            pd.read_csv(
+                path, sep=None, engine="python", decimal=("," if form is with_semicolons else ".")
+            ),
+            **rate,
+        )
         file = nnode.sequences(path, **rate)
         assert len(frame) == len(file) > 0
         for a, b in zip(frame, file, strict=True):
@@ -175,8 +198,10 @@ def test_a_command_recognises_columns_and_units(script: Script, tmp_path: Path) 
         for ours, theirs in zip(Store(run), nnode.sequences(platoons()), strict=True):
             assert ours.x == pytest.approx(theirs.x, abs=1e-9)
     done = script(
-        "prepare_data", "data=vehicles", f"data.path={of_platoons(tmp_path)}",
+        "prepare_data",
+        "data=vehicles",
+        f"data.path={of_platoons(tmp_path)}",
         f"hydra.run.dir={tmp_path / 'no'}",
-    )  # fmt: skip
+    )
     assert done.returncode == 2
     assert "has no columns of data=vehicles; python scripts/check.py" in done.stderr

@@ -9,20 +9,29 @@ from typing import Any, Self
 
 #: The browser, by the names that distributions give it.
 PROGRAM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome", "chrome")
-     if (found := shutil.which(name))), None,
-)  # fmt: skip
+    (
+        found
+        for name in ("chromium", "chromium-browser", "google-chrome", "chrome")
+        if (found := shutil.which(name))
+    ),
+    None,
+)
 #: Why there is no browser here; empty where there is one.
 MISSING = (
-    "needs a Chromium: apt-get install chromium" if PROGRAM is None
-    else "" if find_spec("playwright") else "needs Playwright: pip install 'nnode[test]'"
-)  # fmt: skip
+    "needs a Chromium: apt-get install chromium"
+    if PROGRAM is None
+    else ""
+    if find_spec("playwright")
+    else "needs Playwright: pip install 'nnode[test]'"
+)
 
 _OPTIONS = [
-    "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
     # this machine alone: every other name is unknown
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
-]  # fmt: skip
+]
 
 
 class Browser:
@@ -75,9 +84,10 @@ class Browser:
         self.complaints.clear()
         self.requests.clear()
         self._new_page(
-            viewport={"width": width, "height": height}, is_mobile=width < 600,
+            viewport={"width": width, "height": height},
+            is_mobile=width < 600,
             reduced_motion="no-preference" if motion else "reduce",
-        )  # fmt: skip
+        )
         self.page.goto(address)
 
     def evaluate(self, expression: str) -> Any:

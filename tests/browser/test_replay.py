@@ -175,8 +175,14 @@ def test_it_plays_in_its_own_time_and_stops_at_the_end(
 def test_keys_scrub_change_the_speed_and_choose(browser: Browser, pages: dict[str, str]) -> None:
     browser.open(pages["lane"], 380)
     browser.evaluate("document.querySelector('.stage').focus()")
-    for keys, time in ((["ArrowRight"] * 3, 0.3), (["ArrowLeft"], 0.2), (["End"], 4.0),
-                       (["ArrowRight"], 4.0), (["Home"], 0.0), (["ArrowLeft"], 0.0)):  # fmt: skip
+    for keys, time in (
+        (["ArrowRight"] * 3, 0.3),
+        (["ArrowLeft"], 0.2),
+        (["End"], 4.0),
+        (["ArrowRight"], 4.0),
+        (["Home"], 0.0),
+        (["ArrowLeft"], 0.0),
+    ):
         for key in keys:
             browser.press(key)
         assert float(state(browser)["time"]) == pytest.approx(time)

@@ -29,11 +29,24 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         book.scalars({"cost/train": cost, "parameters/v0": 25.0 + step}, step)
     book.close()
     process = subprocess.Popen(
-        [sys.executable, "-m", "tensorboard.main", "--logdir", str(folder), "--host", "127.0.0.1",
-         "--port", "0", "--load_fast", "false"],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        [
+            sys.executable,
+            "-m",
+            "tensorboard.main",
+            "--logdir",
+            str(folder),
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--load_fast",
+            "false",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
         env={**os.environ, "no_proxy": "127.0.0.1"},
-    )  # fmt: skip
+    )
     try:
         assert process.stdout is not None
         found = next(m[0] for line in process.stdout if (m := re.search(r"http://\S+:\d+/", line)))

@@ -55,9 +55,13 @@ def test_within_a_box_as_scipy() -> None:
             return 0.5 * float((x - away) @ slope) + 1.0, slope
 
         best = scipy.optimize.minimize(
-            one, np.zeros(6), jac=True, method="L-BFGS-B", bounds=[(-1, 1)] * 6,
+            one,
+            np.zeros(6),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(-1, 1)] * 6,
             options={"ftol": 1e-15, "gtol": 1e-10},
-        )  # fmt: skip
+        )
         assert found.costs[r] == pytest.approx(best.fun, rel=1e-8)
         np.testing.assert_allclose(found.rows[r], best.x, atol=1e-4)
     residual = optimality_residual(found.rows, found.costs, found.gradients, low, high)

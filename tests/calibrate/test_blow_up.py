@@ -57,10 +57,21 @@ def test_people_who_stand_in_one_place_give_numbers(solver: Any) -> None:
     x[:, 2, 0] = 1.0 + time
     batch = collate([Sequence(name="hall/1", recording="hall", time=time, x=x)])
     model = build_model(
-        {"term": "social_force", "name": "sf", "A": 5.0, "k": 5.0, "kappa": 5.0, "B": 0.3,
-         "r": 0.25, "tau": 0.5, "mass": 1.0, "walls": False, "opposing_wall_friction": False,
-         "wall_spacing": 0.5}
-    )  # fmt: skip
+        {
+            "term": "social_force",
+            "name": "sf",
+            "A": 5.0,
+            "k": 5.0,
+            "kappa": 5.0,
+            "B": 0.3,
+            "r": 0.25,
+            "tau": 0.5,
+            "mass": 1.0,
+            "walls": False,
+            "opposing_wall_friction": False,
+            "wall_spacing": 0.5,
+        }
+    )
     solve: Solver = solver(0.05)
     found = evaluate(lambda b: solve(model, b), [batch])
     assert math.isfinite(found.J)

@@ -22,8 +22,9 @@ TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
 
 
 def model(**values: float) -> System:
-    system = build_model({"term": "formula", "name": "idm", "leader": "measured",
-                          "law": CAR_FOLLOWING_LAWS["idm"]})  # fmt: skip
+    system = build_model(
+        {"term": "formula", "name": "idm", "leader": "measured", "law": CAR_FOLLOWING_LAWS["idm"]}
+    )
     with torch.no_grad():
         for name, value in values.items():
             getattr(system.terms[0], name).fill_(value)
@@ -41,8 +42,9 @@ def pairs() -> Batch:
         lead = np.cumsum(speed) * 0.1
         x = np.stack([lead - 20 - 2 * i, lead], 1)[..., None]
         v = np.stack([np.full_like(speed, 10.0), speed], 1)[..., None]
-        found.append(Sequence(name=f"p{i}", recording="r", time=time, x=x, v=v,
-                              length=np.array([4.0, 5.0])))  # fmt: skip
+        found.append(
+            Sequence(name=f"p{i}", recording="r", time=time, x=x, v=v, length=np.array([4.0, 5.0]))
+        )
     batch = collate(found)
     with torch.no_grad():
         run = FusedSolver()(model(**TRUE), batch)
@@ -93,8 +95,9 @@ def test_costs_are_what_their_names_say(pairs: Batch) -> None:
 
 
 def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) -> None:
-    cost = ResidualProblem(model(v0=30, T=1.0, s0=2, a=1.5, b=1.5), pairs, FusedSolver(),
-                       Convention.gap)  # fmt: skip
+    cost = ResidualProblem(
+        model(v0=30, T=1.0, s0=2, a=1.5, b=1.5), pairs, FusedSolver(), Convention.gap
+    )
     fit = pooled(cost)
     assert np.abs(cost(fit.row).gradient.mean(0) * (1 + np.abs(fit.row))).max() < 1e-6
     found = intervals(cost, fit.row, np.arange(6))

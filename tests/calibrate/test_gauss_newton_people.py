@@ -37,10 +37,14 @@ def crowd(seed: int) -> Sequence:
     start = rng.uniform([0.0, -0.5], [3.0, 0.5], (6, 2))
     speed = np.where(np.arange(6)[:, None] < 3, [1.2, 0.0], [-1.2, 0.0]) * rng.uniform(0.8, 1.2)
     plain = Sequence(
-        name=f"s{seed}", recording=f"r{seed}", time=time,
-        x=start + time[:, None, None] * speed, v=np.broadcast_to(speed, (25, 6, 2)).copy(),
-        agents=tuple(f"{seed}-{n}" for n in range(6)), destination=start + 10 * speed,
-    )  # fmt: skip
+        name=f"s{seed}",
+        recording=f"r{seed}",
+        time=time,
+        x=start + time[:, None, None] * speed,
+        v=np.broadcast_to(speed, (25, 6, 2)).copy(),
+        agents=tuple(f"{seed}-{n}" for n in range(6)),
+        destination=start + 10 * speed,
+    )
     batch = collate([plain])
     with torch.no_grad():
         found = FusedSolver()(social(*TRUTH), batch)
@@ -142,8 +146,10 @@ def test_people_who_do_not_meet_identify_no_force() -> None:
     time = 0.1 * np.arange(12)
     rows = [
         {"sequence": f"s{s}", "time": t, "agent": f"{s}-{n}", "x": 10.0 * n + v * t, "y": 0.0}
-        for s in range(3) for n, v in enumerate((1.0 + 0.1 * s, 1.3)) for t in time
-    ]  # fmt: skip
+        for s in range(3)
+        for n, v in enumerate((1.0 + 0.1 * s, 1.3))
+        for t in time
+    ]
     fitted = nnode.Calibrator("sf").fit(pd.DataFrame(rows))
     assert fitted.parameters_.identified.tolist() == [False] * 3
     assert "not identified" in fitted.result_.summary()

@@ -20,7 +20,7 @@ def solved(
     low: Any = -np.inf,
     high: Any = np.inf,
     **options: Any,
-) -> Minimum:  # fmt: skip
+) -> Minimum:
     """The minima of problems side by side, each a function of ``(P,)`` parameters to residuals
     and their derivatives."""
 

@@ -173,10 +173,13 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
         length = np.full(4, 4.5)
         found.append(
             Sequence(
-                name=f"s{number}", recording=f"r{number}", time=0.1 * np.arange(401),
-                x=path[..., None], length=length,
+                name=f"s{number}",
+                recording=f"r{number}",
+                time=0.1 * np.arange(401),
+                x=path[..., None],
+                length=length,
             )
-        )  # fmt: skip
+        )
     return found
 
 

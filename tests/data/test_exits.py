@@ -54,8 +54,11 @@ def test_whose_exit() -> None:
     # without direction the nearest to where people are last seen
     lines = read_exits({name: {"line": one["line"]} for name, one in ENDS.items()})
     assert [one.name for one in exits_of(lines, first, last, "abcd")] == [
-        "right", "left", "right", "left",
-    ]  # fmt: skip
+        "right",
+        "left",
+        "right",
+        "left",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -94,10 +97,18 @@ def test_people_of_a_text_file(tmp_path: Path) -> None:
 def test_people_of_a_table(tmp_path: Path) -> None:
     k = np.arange(5)
     parts = [
-        pd.DataFrame({"sequence": 1, "time": 0.1 * k, "agent": name, "x": sign * 0.1 * k,
-                      "y": y, "group": group})
+        pd.DataFrame(
+            {
+                "sequence": 1,
+                "time": 0.1 * k,
+                "agent": name,
+                "x": sign * 0.1 * k,
+                "y": y,
+                "group": group,
+            }
+        )
         for name, sign, y, group in (("a", 1, 2.0, ""), ("b", -1, 2.5, ""), ("c", 1, 1.0, "band"))
-    ]  # fmt: skip
+    ]
     path = tmp_path / "t.csv"
     pd.concat(parts).to_csv(path, index=False)
     exits = {**ENDS, "stage": {"line": [0, 3, 2, 3], "group": "band"}}

@@ -38,10 +38,16 @@ def cells() -> np.ndarray:
 @pytest.mark.parametrize("packed", [False, True])
 def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
     path = saved(
-        tmp_path / "a.mat", packed=packed, cells=cells(), small=np.array([[1, 2]], np.uint8),
-        one=np.array([(1.0, 2)], dtype=[("a", "f8"), ("b", "i4")]), text="words", z=np.array([1j]),
-        many=np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]), empty=np.zeros((0, 3)),
-    )  # fmt: skip
+        tmp_path / "a.mat",
+        packed=packed,
+        cells=cells(),
+        small=np.array([[1, 2]], np.uint8),
+        one=np.array([(1.0, 2)], dtype=[("a", "f8"), ("b", "i4")]),
+        text="words",
+        z=np.array([1j]),
+        many=np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
+        empty=np.zeros((0, 3)),
+    )
     found = read_matlab(path)
     for i in range(2):
         np.testing.assert_array_equal(

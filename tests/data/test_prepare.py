@@ -136,8 +136,10 @@ def test_interrupted_preparation_starts_clean(
     (out / ".sequences.parquet.123.partial").write_text("half")
     prepare(options, out, draw=plot_faults)
     assert sorted(p.name for p in out.iterdir()) == [
-        "faults", "manifest.json", "sequences-2.parquet"
-    ]  # fmt: skip
+        "faults",
+        "manifest.json",
+        "sequences-2.parquet",
+    ]
 
 
 def test_same_data_same_files(tmp_path: Path, options: EsimasOptions) -> None:

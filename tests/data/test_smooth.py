@@ -167,9 +167,13 @@ def test_the_noise_of_positions_is_found(rate: float, sigma: float) -> None:
 def record(time: np.ndarray, x: np.ndarray) -> list[Record]:
     """Records of one car at 10 Hz."""
     rows = Trajectories(
-        path=Path("t"), name="t", where=str, agent=np.full(len(time), "a", dtype=object),
-        time=time, x=x[:, None],
-    )  # fmt: skip
+        path=Path("t"),
+        name="t",
+        where=str,
+        agent=np.full(len(time), "a", dtype=object),
+        time=time,
+        x=x[:, None],
+    )
     return records(rows, Grid(0.1), fill=0.5)
 
 

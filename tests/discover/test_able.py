@@ -227,8 +227,14 @@ class Moody(IndividualEffect):
     name = "moody"
     domain = "traffic"
     source = "this test"
-    rules: ClassVar = {1: Rule(rate="m", states={"m": ("m/s", "eta*(W - m)/unit", "W")},
-                               inputs={"eta": "1"}, constants={"unit": (1.0, "s")})}  # fmt: skip
+    rules: ClassVar = {
+        1: Rule(
+            rate="m",
+            states={"m": ("m/s", "eta*(W - m)/unit", "W")},
+            inputs={"eta": "1"},
+            constants={"unit": (1.0, "s")},
+        )
+    }
     strengths: ClassVar = {"sigma": ANY}
 
 

@@ -105,11 +105,13 @@ def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
 def test_the_gap_between_sequences_without_names_is_an_option() -> None:
     sequences = [
         Sequence(
-            name=f"r/{i}", recording="r", time=6.0 * i + np.arange(3),
+            name=f"r/{i}",
+            recording="r",
+            time=6.0 * i + np.arange(3),
             x=np.zeros((3, 2, 1)) + np.arange(2)[:, None],
         )
         for i in range(16)
-    ]  # fmt: skip
+    ]
     found = divide(sequences, DiscoverOptions(gap=3.0))
     assert found.number(found.open) == 11
     assert "are closer than 3 s in time" in found.why

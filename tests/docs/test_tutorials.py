@@ -63,9 +63,13 @@ def test_a_tutorial_does_what_it_says(name: str, tmp_path: Path) -> None:
         "MPLBACKEND": "agg",
     }
     done = subprocess.run(
-        [str(interpreter), "-c", DRIVER, *files], cwd=tmp_path, env=env, capture_output=True,
-        text=True, timeout=900,
-    )  # fmt: skip
+        [str(interpreter), "-c", DRIVER, *files],
+        cwd=tmp_path,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
     assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
 
 
@@ -75,8 +79,11 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("material")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
-        cwd=ROOT, capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     page = (tmp_path / "site" / "index.html").read_text()
     # it must work without a network

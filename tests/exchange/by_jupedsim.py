@@ -29,9 +29,11 @@ def crowds(
     rng = np.random.default_rng(seed)
     writer = jupedsim.SqliteTrajectoryWriter(output_file=path, every_nth_frame=EVERY)
     simulation = jupedsim.Simulation(
-        model=jupedsim.SocialForceModel(), geometry=shapely.box(0, 0, LONG, WIDE), dt=STEP,
+        model=jupedsim.SocialForceModel(),
+        geometry=shapely.box(0, 0, LONG, WIDE),
+        dt=STEP,
         trajectory_writer=writer,
-    )  # fmt: skip
+    )
     stage = simulation.add_exit_stage(
         [(LONG - 0.5, 0), (LONG, 0), (LONG, WIDE), (LONG - 0.5, WIDE)]
     )
@@ -40,10 +42,14 @@ def crowds(
         for place in _places(people, rng):
             simulation.add_agent(
                 jupedsim.SocialForceModelAgentParameters(
-                    position=tuple(place), journey_id=journey, stage_id=stage,
-                    desired_speed=SPEED, reaction_time=REACTION, radius=RADIUS,
+                    position=tuple(place),
+                    journey_id=journey,
+                    stage_id=stage,
+                    desired_speed=SPEED,
+                    reaction_time=REACTION,
+                    radius=RADIUS,
                 )
-            )  # fmt: skip
+            )
         # the next ones are there in the frame at which their first sequence begins
         early = 0 if crowd else EVERY
         for _ in range(round(AGAIN / STEP) - early):

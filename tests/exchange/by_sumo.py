@@ -68,10 +68,23 @@ def platoons(
     (folder / "a.add.xml").write_text(f"<additional>{types}{''.join(signs)}</additional>")
     (folder / "a.rou.xml").write_text(f"<routes>{routes}{''.join(cars_of)}</routes>")
     command = [
-        home / "bin" / "sumo", "-n", road, "-a", folder / "a.add.xml", "-r", folder / "a.rou.xml",
-        "--step-length", STEP, "--seed", seed, "--fcd-output", folder / "fcd.xml.gz",
-        "--fcd-output.attributes", "id,type,pos,lane", "--no-step-log",
-    ]  # fmt: skip
+        home / "bin" / "sumo",
+        "-n",
+        road,
+        "-a",
+        folder / "a.add.xml",
+        "-r",
+        folder / "a.rou.xml",
+        "--step-length",
+        STEP,
+        "--seed",
+        seed,
+        "--fcd-output",
+        folder / "fcd.xml.gz",
+        "--fcd-output.attributes",
+        "id,type,pos,lane",
+        "--no-step-log",
+    ]
     if steer is None:
         call(*command, "--end", seconds + STEP)
     else:
@@ -113,8 +126,15 @@ def _roads(home: Path, folder: Path, number: int) -> Path:
     )
     (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     (folder / "a.edg.xml").write_text(f"<edges>{edges}</edges>")
-    call(home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-         "-o", folder / "a.net.xml")  # fmt: skip
+    call(
+        home / "bin" / "netconvert",
+        "-n",
+        folder / "a.nod.xml",
+        "-e",
+        folder / "a.edg.xml",
+        "-o",
+        folder / "a.net.xml",
+    )
     return folder / "a.net.xml"
 
 

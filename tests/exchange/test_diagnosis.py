@@ -65,9 +65,16 @@ def test_the_law_of_sumo_s_drivers_is_calibrated(
     tmp_path: Path,
 ) -> None:
     done = script(
-        "train", "model=lin", "model.leader=measured", "data=sumo", f"data.path={drive}",
-        "solver=fused", "optimizer=lbfgs", "trainer.max_epochs=30", f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
+        "train",
+        "model=lin",
+        "model.leader=measured",
+        "data=sumo",
+        f"data.path={drive}",
+        "solver=fused",
+        "optimizer=lbfgs",
+        "trainer.max_epochs=30",
+        f"hydra.run.dir={tmp_path}",
+    )
     assert done.returncode == 0, done.stderr
     model = load_checkpoint(tmp_path / "checkpoints" / "best.pt").build()
     assert equilibrium_gap(law(model), MEAN) == pytest.approx(GAP, rel=0.05)
@@ -79,9 +86,14 @@ def test_sumo_s_drivers_mind_the_speed_ahead(
     tmp_path: Path,
 ) -> None:
     report = diagnosed(
-        script, tmp_path, "model=lin", "model.leader=measured", "data=sumo",
-        f"data.path={drive}", "data.window=null",
-    )  # fmt: skip
+        script,
+        tmp_path,
+        "model=lin",
+        "model.leader=measured",
+        "data=sumo",
+        f"data.path={drive}",
+        "data.window=null",
+    )
     (effect,) = report["effects"]
     assert effect["name"] == "asymmetric_response"
     # one kappa for both, its special case, is told apart: they brake harder than they accelerate
@@ -103,9 +115,14 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
 ) -> None:
     path = by_sumo.platoons(sumo, tmp_path)
     report = diagnosed(
-        script, tmp_path / "run", "model=lin", "model.leader=measured", "data=sumo",
-        f"data.path={path}", "data.window=null",
-    )  # fmt: skip
+        script,
+        tmp_path / "run",
+        "model=lin",
+        "model.leader=measured",
+        "data=sumo",
+        f"data.path={path}",
+        "data.window=null",
+    )
     # without noise every law that is not exactly right leaves structure: beside what drivers
     # mind first, the bounds on their accelerations may be seen, as a short inertia
     effect, *bounds = report["effects"] + report["leads"]
@@ -126,10 +143,15 @@ def test_the_stretch_of_longer_times_is_found(
 ) -> None:
     path = by_sumo.platoons(sumo, tmp_path, spread=350.0, steer=keep_longer_times)
     report = diagnosed(
-        script, tmp_path / "run", "model=lin", "model.leader=measured",
+        script,
+        tmp_path / "run",
+        "model=lin",
+        "model.leader=measured",
         f"model.effects=[{{name: asymmetric_response, kappa_open: {KAPPA}, kappa_close: {KAPPA}}}]",
-        "data=sumo", f"data.path={by_sumo.measured(path, ROAD_ERROR)}", "data.window=null",
-    )  # fmt: skip
+        "data=sumo",
+        f"data.path={by_sumo.measured(path, ROAD_ERROR)}",
+        "data.window=null",
+    )
     assert report["verdict"] == "named"
     (effect,) = report["effects"]
     assert effect["name"] == "speed_zone"
@@ -147,9 +169,15 @@ def test_jupedsim_s_people_return_to_their_speed(
 ) -> None:
     path = by_jupedsim.crowds(jupedsim, tmp_path / "walk.sqlite")
     report = diagnosed(
-        script, tmp_path / "run", "model=sf", f"model.r={by_jupedsim.RADIUS}", "model.B=0.08",
-        "data=jupedsim", f"data.path={by_jupedsim.measured(path, ROOM_ERROR)}", "data.t_seq=3",
-    )  # fmt: skip
+        script,
+        tmp_path / "run",
+        "model=sf",
+        f"model.r={by_jupedsim.RADIUS}",
+        "model.B=0.08",
+        "data=jupedsim",
+        f"data.path={by_jupedsim.measured(path, ROOM_ERROR)}",
+        "data.t_seq=3",
+    )
     assert report["verdict"] == "named"
     (effect,) = report["effects"]
     assert effect["name"] == "preferred_speed"

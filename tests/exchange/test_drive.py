@@ -53,8 +53,15 @@ def weighted(system: System, *layers: tuple[list[list[float]], list[float]]) -> 
     return system
 
 
-def scenario(sumo: Path, folder: Path, *, ballistic: bool = False, step: float = 0.1,
-             seconds: float = by_sumo.SECONDS, speed: float = 12.0) -> Path:  # fmt: skip
+def scenario(
+    sumo: Path,
+    folder: Path,
+    *,
+    ballistic: bool = False,
+    step: float = 0.1,
+    seconds: float = by_sumo.SECONDS,
+    speed: float = 12.0,
+) -> Path:
     """One leader and seven followers on a road."""
     by_sumo.write_scene(sumo, folder, "Krauss", {"decel": 4.5}, speed=speed)
     path = folder / "a.sumocfg"
@@ -80,9 +87,15 @@ def led(profile: np.ndarray) -> Any:
 
 
 def driven(
-    system: System, sumo: Path, program: str, folder: Path, *, ballistic: bool = False,
-    profile: np.ndarray = by_sumo.PROFILE, **options: Any,
-) -> tuple[Drive, Sequence]:  # fmt: skip
+    system: System,
+    sumo: Path,
+    program: str,
+    folder: Path,
+    *,
+    ballistic: bool = False,
+    profile: np.ndarray = by_sumo.PROFILE,
+    **options: Any,
+) -> tuple[Drive, Sequence]:
     """What came of it, and what SUMO wrote, with the lengths that it does not write."""
     path = scenario(sumo, folder, ballistic=ballistic, speed=float(profile[0, 1]))
     found = drive(
@@ -217,9 +230,14 @@ def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) 
         f'<edge id="f" from="b" to="c" numLanes="{lanes}" speed="{speed}"/></edges>'
     )
     by_sumo.call(
-        home / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-        "-o", folder / "a.net.xml",
-    )  # fmt: skip
+        home / "bin" / "netconvert",
+        "-n",
+        folder / "a.nod.xml",
+        "-e",
+        folder / "a.edg.xml",
+        "-o",
+        folder / "a.net.xml",
+    )
 
 
 def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path: Path) -> None:
@@ -237,10 +255,16 @@ def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path:
         '</input><time><step-length value="0.1"/></time></configuration>'
     )
     stays, changes = (
-        drive(model("idm", {"pure_delay": {"T": 0.3}}), path, ["own"], tmp_path / str(free),
-              program=program, lane_changes=free)
+        drive(
+            model("idm", {"pure_delay": {"T": 0.3}}),
+            path,
+            ["own"],
+            tmp_path / str(free),
+            program=program,
+            lane_changes=free,
+        )
         for free in (False, True)
-    )  # fmt: skip
+    )
     for found in (stays, changes):
         assert (found.driven, found.collisions, found.teleports) == (10, 0, 0)
     assert stays.mean_speed is not None
@@ -280,9 +304,15 @@ def test_a_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_pa
     ):
         drive(model("idm"), path, ["own"], tmp_path, program=program, expected=expected)
     found = drive(
-        model("idm"), path, ["own"], tmp_path, program=program, expected=expected, told=expected,
+        model("idm"),
+        path,
+        ["own"],
+        tmp_path,
+        program=program,
+        expected=expected,
+        told=expected,
         end=5.0,
-    )  # fmt: skip
+    )
     assert (found.step, found.method, found.steps) == (0.1, "ballistic", 50)
 
 

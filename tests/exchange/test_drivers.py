@@ -27,9 +27,15 @@ def seen(v: list[float], gap: list[float], lead: list[int] | None = None, **more
     own, far = np.array(v, float), np.full(len(v), np.inf)
     who = np.full(len(v), -1) if lead is None else np.array(lead)
     values = {
-        "v": own, "gap": np.array(gap, float), "v_1": np.where(who >= 0, own[who], own),
-        "length_1": np.full(len(v), 5.0), "lead": who, "gap_1": far, "v_2": own, "x": 0 * own,
-    }  # fmt: skip
+        "v": own,
+        "gap": np.array(gap, float),
+        "v_1": np.where(who >= 0, own[who], own),
+        "length_1": np.full(len(v), 5.0),
+        "lead": who,
+        "gap_1": far,
+        "v_2": own,
+        "x": 0 * own,
+    }
     return Seen(**{**values, **{k: np.array(value, float) for k, value in more.items()}})
 
 
@@ -93,8 +99,10 @@ def test_memories_belong_to_drivers() -> None:
 def test_a_delay_begins_where_a_driver_is_taken_over() -> None:
     drivers = Drivers(model("idm", {"pure_delay": {"T": 0.3}}), DT, "semi_implicit")
     drivers.enter([()])
-    now = [float(drivers.speeds(k * DT, seen([12.0], [gap]))[0]) for k, gap in
-           enumerate([25.0, 60.0, 60.0, 60.0, 60.0])]  # fmt: skip
+    now = [
+        float(drivers.speeds(k * DT, seen([12.0], [gap]))[0])
+        for k, gap in enumerate([25.0, 60.0, 60.0, 60.0, 60.0])
+    ]
     before, after = (12 + DT * idm(12.0, gap - 5, 0.0) for gap in (25.0, 60.0))
     np.testing.assert_allclose(now, [before] * 4 + [after], rtol=1e-12)
 
@@ -147,8 +155,9 @@ def test_so_do_effects_that_remember_gaps() -> None:
 def test_what_is_far_away_is_nobody() -> None:
     drivers = Drivers(model("helly"), DT, "semi_implicit", far=80.0)
     drivers.enter([()] * 3)
-    said = drivers.speeds(0.0, seen([9.0] * 3, [np.inf, 81.0, 80.0], v_1=[9.0, 2.0, 9.0],
-                                    length_1=[0.0, 5.0, 0.0]))  # fmt: skip
+    said = drivers.speeds(
+        0.0, seen([9.0] * 3, [np.inf, 81.0, 80.0], v_1=[9.0, 2.0, 9.0], length_1=[0.0, 5.0, 0.0])
+    )
     assert said[0] == said[1] == said[2]
     for far in (0.0, -1.0, 2e6):
         with pytest.raises(ConfigError, match=r"far=.* must be a distance"):

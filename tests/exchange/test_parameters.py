@@ -182,9 +182,11 @@ def test_laws_of_people_that_jupedsim_has() -> None:
     content = json.loads(jupedsim_parameters(field("cfsm"), scenes).text)
     assert content["classes"]["model"] == "CollisionFreeSpeedModel"
     assert content["model"] == {
-        "strength_neighbor_repulsion": 5.0, "range_neighbor_repulsion": 0.1,
-        "strength_geometry_repulsion": 5.0, "range_geometry_repulsion": 0.02,
-    }  # fmt: skip
+        "strength_neighbor_repulsion": 5.0,
+        "range_neighbor_repulsion": 0.1,
+        "strength_geometry_repulsion": 5.0,
+        "range_geometry_repulsion": 0.02,
+    }
     assert content["agent"] == {"desired_speed": 1.4, "time_gap": 1.0, "radius": 0.15}
     content = json.loads(jupedsim_parameters(field("gcfm"), scenes).text)
     assert content["classes"]["agent"] == "GeneralizedCentrifugalForceModelAgentParameters"

@@ -64,8 +64,15 @@ def scenario(sumo: Path, folder: Path) -> None:
     (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     edge = '<edge id="e" from="a" to="b" numLanes="1" speed="60"/>'
     (folder / "a.edg.xml").write_text(f"<edges>{edge}</edges>")
-    call(sumo / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-         "-o", folder / "a.net.xml")  # fmt: skip
+    call(
+        sumo / "bin" / "netconvert",
+        "-n",
+        folder / "a.nod.xml",
+        "-e",
+        folder / "a.edg.xml",
+        "-o",
+        folder / "a.net.xml",
+    )
     cars = "".join(
         f'<vehicle id="c{i}" type="own" route="r" depart="{3 * i}" departPos="{START}" '
         f'departSpeed="{SPEED}" insertionChecks="none"/>'

@@ -151,9 +151,13 @@ def accelerations(jupedsim: ModuleType, content: dict, x: np.ndarray, v: np.ndar
 def forces(model: Crowd, x: np.ndarray, v: np.ndarray, walls: np.ndarray | None) -> np.ndarray:
     """What the model's own interaction gives."""
     s = Sequence(
-        name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), walls=walls,
+        name="a",
+        recording="a",
+        time=np.arange(2.0),
+        x=np.stack([x, x + v]),
+        walls=walls,
         v=np.stack([v, v]),
-    )  # fmt: skip
+    )
     batch = collate([s])
     state = State(torch.tensor(0.0), batch.x[0], batch.v[0], model.scene(batch))
     force = model.find_law("social_force")
@@ -206,8 +210,15 @@ def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "a.edg.xml").write_text(
         '<edges><edge id="e" from="a" to="b" numLanes="1" speed="50"/></edges>'
     )
-    call(sumo / "bin" / "netconvert", "-n", folder / "a.nod.xml", "-e", folder / "a.edg.xml",
-         "-o", folder / "a.net.xml")  # fmt: skip
+    call(
+        sumo / "bin" / "netconvert",
+        "-n",
+        folder / "a.nod.xml",
+        "-e",
+        folder / "a.edg.xml",
+        "-o",
+        folder / "a.net.xml",
+    )
     return folder / "a.net.xml"
 
 
@@ -219,9 +230,23 @@ def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> 
         for i in range(5)
     )
     (folder / "a.rou.xml").write_text(f'<routes><route id="r" edges="e"/>{cars}</routes>')
-    call(sumo / "bin" / "sumo", "-n", road, "-a", types, "-r", folder / "a.rou.xml",
-         "--step-length", 0.2, "--end", seconds, "--fcd-output", folder / "fcd.xml.gz",
-         "--fcd-output.attributes", "id,type,speed,pos,lane")  # fmt: skip
+    call(
+        sumo / "bin" / "sumo",
+        "-n",
+        road,
+        "-a",
+        types,
+        "-r",
+        folder / "a.rou.xml",
+        "--step-length",
+        0.2,
+        "--end",
+        seconds,
+        "--fcd-output",
+        folder / "fcd.xml.gz",
+        "--fcd-output.attributes",
+        "id,type,speed,pos,lane",
+    )
     return folder / "fcd.xml.gz"
 
 

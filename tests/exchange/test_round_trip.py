@@ -46,11 +46,15 @@ def vehicles(path: Path) -> Sequence:
 @pytest.mark.parametrize(
     ("law", "case", "values", "profile"),
     [
-        ("idm", "idm_euler", {"v0": 28.0, "T": 1.1, "s0": 2.3, "a": 1.4, "b": 2.0},
-         by_sumo.PROFILE),
+        (
+            "idm",
+            "idm_euler",
+            {"v0": 28.0, "T": 1.1, "s0": 2.3, "a": 1.4, "b": 2.0},
+            by_sumo.PROFILE,
+        ),
         ("krauss", "krauss_moving", {"v0": 21.0, "T": 1.1, "s0": 2.3, "a": 1.9, "b": 3.5}, SLOWLY),
     ],
-)  # fmt: skip
+)
 def test_sumo_s_vehicles(
     sumo: Path, tmp_path: Path, law: str, case: str, values: dict[str, float], profile: np.ndarray
 ) -> None:
@@ -81,9 +85,14 @@ def people(
     folder.mkdir()
     for seed in range(2):
         walked = by_jupedsim.groups(
-            jupedsim, folder / f"{seed}.sqlite", model(**content["model"]), agent,
-            content["agent"], seed=seed, **scene,
-        )  # fmt: skip
+            jupedsim,
+            folder / f"{seed}.sqlite",
+            model(**content["model"]),
+            agent,
+            content["agent"],
+            seed=seed,
+            **scene,
+        )
         assert walked.destination is not None
         way = np.sign(walked.destination[:, :1]) * np.array([[1.3, 0.0]])
         found.append(replace(walked, preferred=way))
@@ -91,8 +100,11 @@ def people(
 
 
 def content(model: str, arguments: dict[str, float], **agent: float) -> dict[str, Any]:
-    return {"classes": {"model": model, "agent": f"{model}AgentParameters"}, "model": arguments,
-            "agent": {"desired_speed": 1.3, **agent}}  # fmt: skip
+    return {
+        "classes": {"model": model, "agent": f"{model}AgentParameters"},
+        "model": arguments,
+        "agent": {"desired_speed": 1.3, **agent},
+    }
 
 
 def exported(system: System, walked: list[Sequence]) -> dict[str, Any]:
@@ -117,9 +129,14 @@ def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
     # found is off in proportion to the step, 8 mm in 8 s at 1 ms
     dt = 0.001
     typed = content(
-        "SocialForceModel", {"body_force": 0.0, "friction": 0.0}, mass=80.0, reaction_time=0.5,
-        agent_scale=160.0, force_distance=0.3, radius=0.3,
-    )  # fmt: skip
+        "SocialForceModel",
+        {"body_force": 0.0, "friction": 0.0},
+        mass=80.0,
+        reaction_time=0.5,
+        agent_scale=160.0,
+        force_distance=0.3,
+        radius=0.3,
+    )
     first = people(jupedsim, tmp_path / "a", typed, dt=dt)
     force = make_law(
         "social_force", A=24.0, k=0.0, kappa=0.0, r=0.3, B=0.3
@@ -153,23 +170,34 @@ def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
     v = np.array([[speed, 0.0], [-speed, 0.0]])
     way = np.array([[1.3, 0.0], [-1.3, 0.0]])
     s = Sequence(
-        name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), v=np.stack([v, v]),
-        destination=x + 100 * way, preferred=way,
-    )  # fmt: skip
+        name="a",
+        recording="a",
+        time=np.arange(2.0),
+        x=np.stack([x, x + v]),
+        v=np.stack([v, v]),
+        destination=x + 100 * way,
+        preferred=way,
+    )
     written = exported(system, [s])
     simulation = jupedsim.Simulation(
         model=jupedsim.GeneralizedCentrifugalForceModel(**written["model"]),
-        geometry=shapely.box(-500, -500, 500, 500), dt=dt,
-    )  # fmt: skip
+        geometry=shapely.box(-500, -500, 500, 500),
+        dt=dt,
+    )
     stage = simulation.add_direct_steering_stage()
     journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
     ids = []
     for place, aim in zip(x, way, strict=True):
         towards = tuple(np.sign(aim))
         person = jupedsim.GeneralizedCentrifugalForceModelAgentParameters(
-            position=tuple(place), journey_id=journey, stage_id=stage, speed=speed,
-            orientation=towards, desired_direction=towards, **written["agent"],
-        )  # fmt: skip
+            position=tuple(place),
+            journey_id=journey,
+            stage_id=stage,
+            speed=speed,
+            orientation=towards,
+            desired_direction=towards,
+            **written["agent"],
+        )
         ids.append(simulation.add_agent(person))
         simulation.agent(ids[-1]).target = tuple(place + 200 * aim)
     simulation.iterate()
@@ -192,22 +220,31 @@ def in_a_room(
     room = np.array([[-5.0, -2, 5, -2], [5, -2, 5, 2], [5, 2, -5, 2], [-5, 2, -5, -2]])
     x, v = np.array([place]), np.array([[speed, 0.0]])
     s = Sequence(
-        name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]), v=np.stack([v, v]),
-        destination=np.array([goal]), preferred=np.array([[1.3, 0.0]]), walls=room,
-    )  # fmt: skip
+        name="a",
+        recording="a",
+        time=np.arange(2.0),
+        x=np.stack([x, x + v]),
+        v=np.stack([v, v]),
+        destination=np.array([goal]),
+        preferred=np.array([[1.3, 0.0]]),
+        walls=room,
+    )
     system = Crowd([law_from(name, PEDESTRIAN_LAWS[name])], desired="exit")
     written = exported(system, [s])
     simulation = jupedsim.Simulation(
         model=getattr(jupedsim, written["classes"]["model"])(**written["model"]),
-        geometry=shapely.box(-5, -2, 5, 2), dt=dt,
-    )  # fmt: skip
+        geometry=shapely.box(-5, -2, 5, 2),
+        dt=dt,
+    )
     stage = simulation.add_direct_steering_stage()
     moving = {"speed": speed, "orientation": (1.0, 0.0), "desired_direction": (1.0, 0.0)}
     person = getattr(jupedsim, written["classes"]["agent"])(
-        position=tuple(place), stage_id=stage, **written["agent"],
+        position=tuple(place),
+        stage_id=stage,
+        **written["agent"],
         journey_id=simulation.add_journey(jupedsim.JourneyDescription([stage])),
         **(moving if name == "gcfm" else {}),
-    )  # fmt: skip
+    )
     own = simulation.add_agent(person)
     simulation.agent(own).target = goal
     simulation.iterate()

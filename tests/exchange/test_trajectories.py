@@ -102,20 +102,30 @@ def drive(name: str, n: int, k: int, start: int = 0, dt: float = 0.1, **more: ob
     v = 15 + np.cumsum(rng.uniform(0.1, 0.5, (k, n)), axis=1)
     x = 20.0 * np.arange(n) + dt * np.cumsum(v, axis=0)
     return Sequence(
-        name=name, recording=name.split("/")[0], time=dt * (start + np.arange(k)),
-        x=x[:, :, None], v=v[:, :, None], **more,  # type: ignore[arg-type]
-    )  # fmt: skip
+        name=name,
+        recording=name.split("/")[0],
+        time=dt * (start + np.arange(k)),
+        x=x[:, :, None],
+        v=v[:, :, None],
+        **more,  # type: ignore[arg-type]
+    )
 
 
 def test_vehicles_are_read_as_they_were(tmp_path: Path) -> None:
     """All in one file, at the same times, some with the same identifiers and some with none."""
     given_ = [
-        drive("road/0~1", 3, 40, agents=("a", 'b"<', "c"), kind=("car", "truck", "car"),
-              length=np.array([4.0, np.nan, 12.5])),
+        drive(
+            "road/0~1",
+            3,
+            40,
+            agents=("a", 'b"<', "c"),
+            kind=("car", "truck", "car"),
+            length=np.array([4.0, np.nan, 12.5]),
+        ),
         drive("road/0~2", 3, 40, agents=("a", 'b"<', "c")),
         drive("road/1~1", 2, 25, start=20),
         drive("road:1~1", 4, 10, start=33),
-    ]  # fmt: skip
+    ]
     path = write_fcd(tmp_path / "samples.xml.gz", given_)
     options = SumoOptions(path=str(path), dt=0.1, min_vehicles=2, window=None)
     lanes = ["road_0~1", "road_0~2", "road_1~1", "road_1~1_"]

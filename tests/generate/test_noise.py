@@ -39,10 +39,14 @@ def platoons(number: int, seconds: float, cars: int = 3, seed: int = 0) -> Batch
         x, v = platoon(rng, cars, seconds)
         found.append(
             Sequence(
-                name=f"s{i}", recording=f"r{i}", time=STEP * np.arange(len(x)), x=x[..., None],
-                v=v[..., None], length=np.full(cars, 4.5),
+                name=f"s{i}",
+                recording=f"r{i}",
+                time=STEP * np.arange(len(x)),
+                x=x[..., None],
+                v=v[..., None],
+                length=np.full(cars, 4.5),
             )
-        )  # fmt: skip
+        )
     return collate(found)
 
 

@@ -22,9 +22,16 @@ def model(law: str | dict[str, Any], *effects: dict[str, Any], **options: Any) -
     name = law if isinstance(law, str) else "mine"
     more = {"network": NEURONS[name]} if name in NEURONS else {}
     found = build_model(
-        {"term": "formula", "name": name, "leader": "measured", "effects": list(effects),
-         "law": CAR_FOLLOWING_LAWS[name] if isinstance(law, str) else law, **more, **options}
-    )  # fmt: skip
+        {
+            "term": "formula",
+            "name": name,
+            "leader": "measured",
+            "effects": list(effects),
+            "law": CAR_FOLLOWING_LAWS[name] if isinstance(law, str) else law,
+            **more,
+            **options,
+        }
+    )
     assert isinstance(found, Traffic)
     return found
 
@@ -53,9 +60,13 @@ def driven(
     """A platoon from places ``(K, N)``, speeds, and one length, m, of all vehicles."""
     lengths = None if length is None else np.broadcast_to(np.asarray(length, float), x.shape[1:])
     return Sequence(
-        name=name, recording=name, time=time, x=x[..., None],
-        v=None if v is None else v[..., None], length=lengths,
-    )  # fmt: skip
+        name=name,
+        recording=name,
+        time=time,
+        x=x[..., None],
+        v=None if v is None else v[..., None],
+        length=lengths,
+    )
 
 
 def behind(

@@ -36,9 +36,17 @@ def test_laws_on_the_command_line() -> None:
     laws = re.findall(r"'model\.law=(\{parameters.*\})'", METHOD)
     assert len(laws) == 2
     lane, people = (
-        build_model({"term": "formula", "name": "mine", "leader": "measured", "effects": [],
-                     "law": yaml.safe_load(text)}) for text in laws
-    )  # fmt: skip
+        build_model(
+            {
+                "term": "formula",
+                "name": "mine",
+                "leader": "measured",
+                "effects": [],
+                "law": yaml.safe_load(text),
+            }
+        )
+        for text in laws
+    )
     assert (lane.domain, people.domain) == ("traffic", "crowd")
     assert list(lane.physical()) == ["mine.v0", "mine.L"]
     assert list(people.physical()) == ["mine.A", "mine.B", "mine.tau"]

@@ -21,10 +21,28 @@ from tests.model.test_forces import people
 FILES = sorted(Path(laws.__file__).parent.glob("*.yaml"))
 #: Everything that an entry may say.
 KEYS = {
-    "about", "formula", "source", "rank", "model", "options", "parameters", "settings", "constants",
-    "networks", "hidden", "step", "states", "delayed", "remembered", "where", "rate", "force",
-    "drive", "variants", *REDUCED,
-}  # fmt: skip
+    "about",
+    "formula",
+    "source",
+    "rank",
+    "model",
+    "options",
+    "parameters",
+    "settings",
+    "constants",
+    "networks",
+    "hidden",
+    "step",
+    "states",
+    "delayed",
+    "remembered",
+    "where",
+    "rate",
+    "force",
+    "drive",
+    "variants",
+    *REDUCED,
+}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
@@ -47,19 +65,22 @@ def test_entries_are_in_the_order_of_their_ranks() -> None:
 
 def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = {
-        "about": "Exponential saturation.", "source": "none", "model": ["saturated"],
+        "about": "Exponential saturation.",
+        "source": "none",
+        "model": ["saturated"],
         "options": ["reach", "reach_min"],
         "parameters": {"v0": "30 m/s", "reach": {"value": "12 m", "low": "1 m"}},
         "rate": {"x": "v0*(1 - exp(-gap/reach))"},
-    }  # fmt: skip
+    }
     known = {**laws.entries(), "saturated": entry}
     monkeypatch.setattr(laws, "entries", lambda: known)
     monkeypatch.setattr("nnode.model.build.entries", lambda: known)
     options = {"term": "saturated", "name": "new", "leader": "constant", "reach": 8.0}
     model = build_model({**options, "reach_min": 2.0})
     assert {k: float(v) for k, (v, _) in model.physical().items()} == {
-        "saturated.v0": 30.0, "saturated.reach": 8.0,
-    }  # fmt: skip
+        "saturated.v0": 30.0,
+        "saturated.reach": 8.0,
+    }
     assert model.bounds()["terms.0.reach"].low == 2.0
     assert isinstance(model, Traffic)
     assert model.formula is not None

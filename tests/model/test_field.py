@@ -83,9 +83,14 @@ def newell(s: float, v: float, u: float, p: Any) -> float:
 
 
 BY_HAND = {
-    "idm": idm, "ovm": ovm, "fvdm": fvdm, "gipps": gipps, "krauss": krauss, "helly": helly,
+    "idm": idm,
+    "ovm": ovm,
+    "fvdm": fvdm,
+    "gipps": gipps,
+    "krauss": krauss,
+    "helly": helly,
     "newell": newell,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BY_HAND)
@@ -112,8 +117,9 @@ def test_networks_are_their_weights_of_gap_speed_and_difference(name: str) -> No
     with torch.no_grad():
         for p in system.parameters():
             p.uniform_(-1, 1, generator=torch.Generator().manual_seed(5))
-    inside, outside = ([p.detach().numpy() for p in layer.parameters()]
-                       for layer in system.terms[0].network.layers)  # fmt: skip
+    inside, outside = (
+        [p.detach().numpy() for p in layer.parameters()] for layer in system.terms[0].network.layers
+    )
     found = accelerations(system, batch)
     for b, i, gap, v, u in each_follower(batch):
         given = (gap / 20, v / 10, (v - u) / 2)
@@ -139,8 +145,10 @@ def test_a_network_beside_a_law_starts_as_nothing(law: str) -> None:
     assert standing[np.isfinite(alone)].all()
 
 
-COMPILED = [pytest.param(name, marks=() if name in ("idm", "krauss") else pytest.mark.thorough)
-            for name in CAR_FOLLOWING_LAWS]  # fmt: skip
+COMPILED = [
+    pytest.param(name, marks=() if name in ("idm", "krauss") else pytest.mark.thorough)
+    for name in CAR_FOLLOWING_LAWS
+]
 
 
 @pytest.mark.parametrize("name", COMPILED)

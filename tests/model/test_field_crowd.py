@@ -38,9 +38,13 @@ def scene(x: Any, v: Any, preferred: Any = None) -> Sequence:
     x, v = np.asarray(x, float), np.asarray(v, float)
     wish = np.tile([1.3, 0.0], (len(x), 1)) if preferred is None else np.asarray(preferred, float)
     return Sequence(
-        name="a", recording="a", time=np.array([0.0, 0.04]), x=np.stack([x, x + 0.04 * v]),
-        v=np.stack([v, v]), preferred=wish,
-    )  # fmt: skip
+        name="a",
+        recording="a",
+        time=np.array([0.0, 0.04]),
+        x=np.stack([x, x + 0.04 * v]),
+        v=np.stack([v, v]),
+        preferred=wish,
+    )
 
 
 def rates(found: Crowd, item: Sequence) -> np.ndarray:

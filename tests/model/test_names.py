@@ -28,9 +28,27 @@ from nnode.simulation.kernels.lanes import LaneSource
 CODE = '__import__("os").abort()'
 #: An annotation, an index, a default, a second line, letters and digits that are not ASCII.
 WRONG = [
-    f"a: {CODE}", f"[{CODE}]", f"a={CODE}", f"a\n{CODE}", CODE, "", "_a", "a_", "a__b", "2a", "a b",
-    "a-b", "a.b", "ä", "a²", "a٣", "a\n", "lambda", "None", "class",
-]  # fmt: skip
+    f"a: {CODE}",
+    f"[{CODE}]",
+    f"a={CODE}",
+    f"a\n{CODE}",
+    CODE,
+    "",
+    "_a",
+    "a_",
+    "a__b",
+    "2a",
+    "a b",
+    "a-b",
+    "a.b",
+    "ä",
+    "a²",
+    "a٣",
+    "a\n",
+    "lambda",
+    "None",
+    "class",
+]
 
 LAW: dict[str, Any] = {
     "parameters": {"v0": "30 m/s", "T": "1.2 s"},

@@ -48,8 +48,10 @@ def test_it_computes_what_it_says() -> None:
     torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)
     found = {name: (float(value), unit) for name, (value, unit) in model.physical().items()}
     assert found == {
-        "mine.A": (2.0, "m/s²"), "mine.B": (pytest.approx(0.4), "m"), "mine.tau": (0.7, "s"),
-    }  # fmt: skip
+        "mine.A": (2.0, "m/s²"),
+        "mine.B": (pytest.approx(0.4), "m"),
+        "mine.tau": (0.7, "s"),
+    }
     with torch.no_grad():
         model.terms[0].A.fill_(-1.0)  # type: ignore[union-attr, operator]
     model.project_()
@@ -83,6 +85,7 @@ def test_without_interaction_it_is_its_drive() -> None:
         torch.testing.assert_close(
             FusedSolver(0.02)(bare, batch).x[batch.valid],
             FusedSolver(0.02)(Crowd([make_law("relaxation", tau=0.7)]), batch).x[batch.valid],
-            rtol=1e-12, atol=1e-12,
-        )  # fmt: skip
+            rtol=1e-12,
+            atol=1e-12,
+        )
     torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)

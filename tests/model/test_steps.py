@@ -28,11 +28,17 @@ SPEEDS = np.array([7.03, 0.2, 0.3, 0.0, 12.0, 1e-9])
 def alone(system: Traffic, speeds: Any, seconds: float, method: str | None) -> tuple[Any, Any]:
     """Places and speeds ``(K, B)`` of one car a platoon, each far behind its leader."""
     time = DT * np.arange(round(seconds / DT) + 1)
-    batch = collate([
-        driven(time, np.stack([v * time, 500 + 0 * time], 1), np.stack([v + 0 * time, 0 * time], 1),
-               name=f"p{i}")
-        for i, v in enumerate(speeds)
-    ])  # fmt: skip
+    batch = collate(
+        [
+            driven(
+                time,
+                np.stack([v * time, 500 + 0 * time], 1),
+                np.stack([v + 0 * time, 0 * time], 1),
+                name=f"p{i}",
+            )
+            for i, v in enumerate(speeds)
+        ]
+    )
     with torch.no_grad():
         found = TorchdiffeqSolver(method, "discrete", DT)(system, batch)
     assert found.v is not None
@@ -114,8 +120,9 @@ def test_orders_of_accuracy_against_dop853() -> None:
         wish = p.s0 + np.maximum(v[:2] * p.T - v[:2] * np.diff(v) / (2 * sqrt(p.a * p.b)), 0)
         return np.append(v[:2], p.a * (1 - (v[:2] / p.v0) ** 4 - (wish / np.diff(x)) ** 2))
 
-    exact = solve_ivp(rates, (0, seconds), [*start[:2], *speed[:2]], "DOP853", rtol=1e-12,
-                      atol=1e-12)  # fmt: skip
+    exact = solve_ivp(
+        rates, (0, seconds), [*start[:2], *speed[:2]], "DOP853", rtol=1e-12, atol=1e-12
+    )
     errors: dict[str, list[float]] = {method: [] for method in METHODS}
     steps = [0.1, 0.05, 0.025]
     for step, method in itertools.product(steps, METHODS):
@@ -152,9 +159,11 @@ def test_speeds_are_stepped_as_they_are() -> None:
 def test_a_method_is_the_law_s_own_the_field_s_or_the_one_that_is_asked_for() -> None:
     assert Traffic([make_law("lin")]).step == "euler"
     assert {law: model(law).step for law in CAR_FOLLOWING_LAWS} == {
-        **dict.fromkeys(CAR_FOLLOWING_LAWS, "rk4"), "gipps": "ballistic",
-        "krauss": "semi_implicit", "newell": "semi_implicit",
-    }  # fmt: skip
+        **dict.fromkeys(CAR_FOLLOWING_LAWS, "rk4"),
+        "gipps": "ballistic",
+        "krauss": "semi_implicit",
+        "newell": "semi_implicit",
+    }
     # what remembers step by step has no stages in between
     assert model("idm", {"name": "pure_delay", "T": 0.3}).step == "ballistic"
     assert model("idm", {"name": "reaction_delay", "T": 0.3}).step == "rk4"
@@ -220,8 +229,15 @@ def test_maps_from_step_to_step_have_no_stages(law: str) -> None:
 
 def test_unknown_methods_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"model\.law\.step=leapfrog is unknown, expected euler"):
-        build_model({"term": "formula", "name": "a", "leader": "measured", "effects": [],
-                     "law": {**BRAKE, "step": "leapfrog"}})  # fmt: skip
+        build_model(
+            {
+                "term": "formula",
+                "name": "a",
+                "leader": "measured",
+                "effects": [],
+                "law": {**BRAKE, "step": "leapfrog"},
+            }
+        )
     with pytest.raises(ConfigError, match=r"solver\.method=leapfrog.*ballistic"):
         FusedSolver(method="leapfrog")
     with pytest.raises(ConfigError, match=r"solver\.method=leapfrog.*ballistic"):

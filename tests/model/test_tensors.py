@@ -36,12 +36,15 @@ def test_values_and_derivatives(text: str) -> None:
     values = {n: torch.tensor(rng.uniform(0.3, 2.0, 50), requires_grad=True) for n in "abc"}
     found = computed([node], values)[0]
     names = {
-        **vars(math), "max": max, "min": min, "abs": abs,
+        **vars(math),
+        "max": max,
+        "min": min,
+        "abs": abs,
         "softplus": lambda x: x if x > 20 else math.log1p(math.exp(x)),
         "logistic": lambda x: 1 / (1 + math.exp(-x)),
         "clip": lambda x, low, high: min(max(x, low), high),
         "choose": lambda condition, x, y: x if condition > 0 else y,
-    }  # fmt: skip
+    }
     for i in range(50):
         own = {n: float(v[i].detach()) for n, v in values.items()}
         assert float(found[i]) == pytest.approx(eval(text, names, own), rel=1e-13)

@@ -344,8 +344,20 @@ def test_spreadsheets_find_no_formulas(tmp_path: Path) -> None:
     found = pd.read_csv(io.StringIO(text), keep_default_na=False, dtype=str)
     assert list(found) == ["'=name", "x"]
     assert list(found["'=name"]) == [
-        "'=1+1", "'+a", "'-a", "'@a", "'\ta", "'\ra", "''=a", "-1.5", "+3e2", "plain", "", "", "-2",
-    ]  # fmt: skip
+        "'=1+1",
+        "'+a",
+        "'-a",
+        "'@a",
+        "'\ta",
+        "'\ra",
+        "''=a",
+        "-1.5",
+        "+3e2",
+        "plain",
+        "",
+        "",
+        "-2",
+    ]
     assert [float(x) for x in found["x"]] == list(frame["x"])
     kept = [cell for cell in cells if isinstance(cell, str)]
     assert [csv_cell(cell) for cell in found["'=name"][: len(kept)]] == kept

@@ -11,9 +11,19 @@ from tests.discover import stand_in  # noqa: F401 - registers an effect of crowd
 
 LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0, "L_min": 2.0}
 FORCE = {
-    "name": "sf", "term": "social_force", "A": 1.0, "k": 1.0, "kappa": 1.0, "r": 0.25, "B": 0.1,
-    "mass": 1.0, "walls": True, "wall_spacing": 0.25, "tau": 0.5, "opposing_wall_friction": False,
-}  # fmt: skip
+    "name": "sf",
+    "term": "social_force",
+    "A": 1.0,
+    "k": 1.0,
+    "kappa": 1.0,
+    "r": 0.25,
+    "B": 0.1,
+    "mass": 1.0,
+    "walls": True,
+    "wall_spacing": 0.25,
+    "tau": 0.5,
+    "opposing_wall_friction": False,
+}
 
 
 def test_a_speed_curve_says_which_effects_it_leaves_out() -> None:

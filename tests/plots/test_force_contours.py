@@ -141,9 +141,14 @@ def test_crowd_figures() -> None:
         "settings",
     }
     assert set(crowd_figures(_network())) == {
-        "force_x", "force_y", "settings",
-        "force_x_pair", "force_x_wall", "force_y_pair", "force_y_wall",
-    }  # fmt: skip
+        "force_x",
+        "force_y",
+        "settings",
+        "force_x_pair",
+        "force_x_wall",
+        "force_y_pair",
+        "force_y_wall",
+    }
     assert plt.get_fignums() == []
 
 

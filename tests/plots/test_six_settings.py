@@ -71,8 +71,14 @@ def test_settings_of_networks_are_the_papers() -> None:
     force = make_law("network_force", generator=torch.Generator().manual_seed(0))
     _, table = six_settings(Crowd([force]))
     assert list(table.columns) == [
-        "setting", "x_blue", "x_red", "v_blue", "v_red", "force_blue", "force_red",
-    ]  # fmt: skip
+        "setting",
+        "x_blue",
+        "x_red",
+        "v_blue",
+        "v_red",
+        "force_blue",
+        "force_red",
+    ]
     assert list(table["setting"]) == ["S1", "S2", "S3", "S4", "S5", "S6"]
     blue = [(0, 4), (0, 4), (0.01, 4), (0.01, 4), (0.5, 0), (0.5, 0)]
     assert list(table["x_blue"]) == blue

@@ -26,9 +26,12 @@ def example(seed: int, states: int) -> Linearised:
         fixed=rng.normal(size=(segments, samples, 2)),
         random=rng.normal(size=(segments, samples, 2)),
         start=rng.normal(size=(segments, samples, 1)),
-        seen=seen, agent=np.array([0, 1, 0]), step=step,
-        forced=rng.normal(size=(segments, samples - 1, states)), dt=DT,
-    )  # fmt: skip
+        seen=seen,
+        agent=np.array([0, 1, 0]),
+        step=step,
+        forced=rng.normal(size=(segments, samples - 1, states)),
+        dt=DT,
+    )
 
 
 def covariance(data: Linearised) -> np.ndarray:

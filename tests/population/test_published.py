@@ -49,10 +49,13 @@ class Curves:
         if agents.size:
             residual = residual + np.einsum("dkq,dq->dk", fixed[..., self.random], agents)
         return Linearised(
-            residual=residual, fixed=fixed, random=fixed[..., self.random],
-            start=np.zeros((*self.y.shape, 0)), seen=np.ones(self.y.shape, dtype=bool),
+            residual=residual,
+            fixed=fixed,
+            random=fixed[..., self.random],
+            start=np.zeros((*self.y.shape, 0)),
+            seen=np.ones(self.y.shape, dtype=bool),
             agent=np.arange(len(self.y)),
-        )  # fmt: skip
+        )
 
 
 def table(name: str, subject: str) -> tuple[list[str], dict[str, np.ndarray]]:
@@ -70,9 +73,12 @@ def spreads(residual: float, *random: float) -> Variances:
     """Where the search for standard deviations begins, with bounds that are far away."""
     number = 1 + len(random)
     return Variances(
-        noise=np.array([residual]), spread=np.array(random), start=np.zeros(0),
-        low=np.full(number, 1e-4), high=np.full(number, 1e4),
-    )  # fmt: skip
+        noise=np.array([residual]),
+        spread=np.array(random),
+        start=np.zeros(0),
+        low=np.full(number, 1e-4),
+        high=np.full(number, 1e4),
+    )
 
 
 def errors(found: Estimate) -> np.ndarray:
@@ -88,9 +94,12 @@ def test_orange_trees_that_grow_to_sizes_of_their_own_are_nlme_s() -> None:
         return np.asarray(most / (1 + np.exp(-(data["age"] - middle) / scale)))
 
     found = estimate(
-        Curves(size, data["circumference"], [0]), WhiteNoise(), np.array([192.0, 728.0, 350.0]),
-        spreads(10.0, 20.0), tolerance=1e-7,
-    )  # fmt: skip
+        Curves(size, data["circumference"], [0]),
+        WhiteNoise(),
+        np.array([192.0, 728.0, 350.0]),
+        spreads(10.0, 20.0),
+        tolerance=1e-7,
+    )
     assert found.converged
     # nlme stops where its next step is small beside the parameters: further steps move xmid and
     # scal in the fifth digit, and all that depends on them
@@ -117,9 +126,13 @@ def growth() -> tuple[list[str], Curves]:
 def test_a_linear_mixed_model_by_restricted_likelihood_is_nlme_s() -> None:
     names, model = growth()
     found = estimate(
-        model, WhiteNoise(), np.array([10.0, 1.0]), spreads(1.0, 1.0, 1.0), restricted=True,
+        model,
+        WhiteNoise(),
+        np.array([10.0, 1.0]),
+        spreads(1.0, 1.0, 1.0),
+        restricted=True,
         tolerance=1e-6,
-    )  # fmt: skip
+    )
     assert found.converged
     np.testing.assert_allclose(found.theta, [16.7611111, 0.6601852], rtol=1e-7)
     np.testing.assert_allclose(found.variances.row, [1.3706404, 1.3860379, 0.1492532], rtol=1e-5)

@@ -77,10 +77,13 @@ def run(steps: int, contact: float) -> RunAlone:
     batch = collate([Sequence(name="s", recording="r", time=time, x=x, v=v, destination=goals)])
     big, k, kappa = STRENGTHS
     system = Crowd(
-        [make_law("relaxation", tau=TAU),
-         make_law("social_force", A=big, k=k * contact, kappa=kappa * contact, B=B, r=R,
-                  walls=False)]
-    ).double()  # fmt: skip
+        [
+            make_law("relaxation", tau=TAU),
+            make_law(
+                "social_force", A=big, k=k * contact, kappa=kappa * contact, B=B, r=R, walls=False
+            ),
+        ]
+    ).double()
     window = torch.zeros(1, dtype=torch.long)
     around = Surroundings(system.scene(batch), batch.x, batch.v, window, window, SECONDS / steps)
     own = {name: p.detach()[None] for name, p in system.named_parameters()}

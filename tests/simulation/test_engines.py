@@ -46,7 +46,9 @@ OWN: dict[str, dict[str, Any]] = {
         "rate": {"x": "(1 - c)*v0*(1 - L/gap) + c*dx_1"},
     },
     "speed_network": {
-        "parameters": {"v0": "21 m/s"}, "rate": {"x": "v0*NN(gap/20)"}, "network": 3,
+        "parameters": {"v0": "21 m/s"},
+        "rate": {"x": "v0*NN(gap/20)"},
+        "network": 3,
     },
     "state": {
         "parameters": {"c": "0.8 1/s", "T": "1.1 s", "tau": "0.7 s"},
@@ -55,11 +57,13 @@ OWN: dict[str, dict[str, Any]] = {
     },
     "delay": {
         "parameters": {"c": "0.8 1/s", "T": "1.1 s", "wait": "0.13 s"},
-        "delayed": {"late": ["gap", "m", "wait"]}, "remembered": 4,
+        "delayed": {"late": ["gap", "m", "wait"]},
+        "remembered": 4,
         "rate": {"v": "c*(late/T - v)"},
     },
     "network": {
-        "parameters": {"unit": "1 m/s²"}, "network": 3,
+        "parameters": {"unit": "1 m/s²"},
+        "network": 3,
         "rate": {"v": "unit*NN(gap/20, v/10, dv/2)"},
     },
     "second": {
@@ -67,7 +71,7 @@ OWN: dict[str, dict[str, Any]] = {
         "rate": {"v": "c*(gap_1 - gap) + k*(v_2 - v)"},
     },
     "beside": {**CAR_FOLLOWING_LAWS["idm"], "network": 2},
-}  # fmt: skip
+}
 #: One value that is not neutral of every effect.
 EFFECTS: dict[str, dict[str, Any]] = {
     "speed_zone": {"alpha": 0.7, "a": 10.0, "b": 40.0},
@@ -84,16 +88,28 @@ COMPILED = ("lin", "speed_ahead", "state", "beside", "ovm", "fvdm", "helly", "gi
 FORCES: dict[str, dict[str, Any]] = {
     "sf": {"term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1},
     "sf_opposing": {
-        "term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1, "r": 0.3,
-        "mass": 2.0, "tau": 0.7, "opposing_wall_friction": True,
+        "term": "social_force",
+        "A": 2.0,
+        "k": 30.0,
+        "kappa": 9.0,
+        "B": 0.1,
+        "r": 0.3,
+        "mass": 2.0,
+        "tau": 0.7,
+        "opposing_wall_friction": True,
     },
     "sf_open": {
-        "term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1, "walls": False,
+        "term": "social_force",
+        "A": 2.0,
+        "k": 30.0,
+        "kappa": 9.0,
+        "B": 0.1,
+        "walls": False,
     },
     "nn": {"term": "network_force"},
     "nn_open": {"term": "network_force", "hidden": 3, "mass": 2.0, "walls": False},
     "nn_self": {"term": "network_force", "self_interaction": True},
-}  # fmt: skip
+}
 #: What a user's law of people may have: sums, smallest and largest values that name each other.
 OWN_FORCES: dict[str, dict[str, Any]] = {
     "sums": {
@@ -101,13 +117,16 @@ OWN_FORCES: dict[str, dict[str, Any]] = {
         "where": {"push": "A*exp((2*r - d)/B)"},
         "others": {"push_x": "push*n_x", "push_y": "push*n_y"},
         "rate": {
-            "vx": "(speed*way_x - vx)/tau + push_x", "vy": "(speed*way_y - vy)/tau + push_y",
+            "vx": "(speed*way_x - vx)/tau + push_x",
+            "vy": "(speed*way_y - vy)/tau + push_y",
         },
     },
     "smallest": {
         "parameters": {"A": "0.6 1/s", "B": "0.5 m", "C": "0.3 1/s²", "tau": "0.7 s"},
         "where": {
-            "crowded": "1 + number", "near": "d*crowded", "push": "A*max(2*B - closest, 0)/tau",
+            "crowded": "1 + number",
+            "near": "d*crowded",
+            "push": "A*max(2*B - closest, 0)/tau",
         },
         "others": {"number": "exp(-d/B)"},
         "smallest": {"closest": "near", "slow": "sqrt(dvx**2 + dvy**2 + small_v**2)"},
@@ -117,7 +136,7 @@ OWN_FORCES: dict[str, dict[str, Any]] = {
             "vy": "(speed*way_y - vy)/tau + 0.1*A*min(slow, speed)",
         },
     },
-}  # fmt: skip
+}
 #: Values of effects on people that are not neutral.
 CROWD_EFFECTS: dict[str, dict[str, Any]] = {
     **VALUES,
@@ -140,12 +159,15 @@ def platoons() -> Batch:
         v = 12 + 2 * torch.cos(late + i)
         found.append(
             Sequence(
-                name=f"p{i}", recording="r", time=t[:, 0].numpy(),
-                x=x[..., None].numpy(), v=v[..., None].numpy(),
+                name=f"p{i}",
+                recording="r",
+                time=t[:, 0].numpy(),
+                x=x[..., None].numpy(),
+                v=v[..., None].numpy(),
                 length=torch.where(torch.arange(n) == 1, 9.0, 4.0).numpy(),
                 kind=tuple("truck" if j == 1 else "car" for j in range(n)),
             )
-        )  # fmt: skip
+        )
     return collate(found)
 
 
@@ -292,9 +314,10 @@ def cases(laws: Iterable[str]) -> list[Any]:
 
 #: Effects that act on each other, and several memories.
 TOGETHER = (
-    ("lin", "reaction_delay+relative_speed+speed_zone"), ("lin", "reaction_delay+inertia"),
+    ("lin", "reaction_delay+relative_speed+speed_zone"),
+    ("lin", "reaction_delay+inertia"),
     ("idm", "memory+relative_speed"),
-)  # fmt: skip
+)
 
 
 def _is_map(law: str, *effects: str) -> bool:
@@ -363,12 +386,16 @@ def room() -> Batch:
         x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
         found.append(
             Sequence(
-                name=f"{n}", recording="r", time=time, x=x + time[:, None, None] * v,
-                v=np.broadcast_to(v, (samples, n, 2)), walls=WALLS[:walls],
+                name=f"{n}",
+                recording="r",
+                time=time,
+                x=x + time[:, None, None] * v,
+                v=np.broadcast_to(v, (samples, n, 2)),
+                walls=WALLS[:walls],
                 preferred=draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1],
                 group=tuple("ab"[i % 2] for i in range(n)),
             )
-        )  # fmt: skip
+        )
     return collate(found)
 
 

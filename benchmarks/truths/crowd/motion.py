@@ -96,9 +96,15 @@ def _contact(
 
 @njit(cache=True, error_model="numpy")
 def _walls(
-    base: Base, fx: Hidden, x: float, y: float, u: float, w: float,
-    points: np.ndarray, segments: np.ndarray,
-) -> tuple[float, float]:  # fmt: skip
+    base: Base,
+    fx: Hidden,
+    x: float,
+    y: float,
+    u: float,
+    w: float,
+    points: np.ndarray,
+    segments: np.ndarray,
+) -> tuple[float, float]:
     """Acceleration by walls, of a person at (x, y) with the velocity (u, w)."""
     ax, ay = 0.0, 0.0
     far = base.r + _WALL_RANGES * base.B
@@ -196,9 +202,17 @@ def _others(
 
 @njit(cache=True, error_model="numpy")
 def _alone(
-    base: Base, fx: Hidden, x: np.ndarray, v: np.ndarray, e: np.ndarray, goal: np.ndarray,
-    eta: float, phase: float, clock: float, since: float,
-) -> tuple[float, float]:  # fmt: skip
+    base: Base,
+    fx: Hidden,
+    x: np.ndarray,
+    v: np.ndarray,
+    e: np.ndarray,
+    goal: np.ndarray,
+    eta: float,
+    phase: float,
+    clock: float,
+    since: float,
+) -> tuple[float, float]:
     """Acceleration of one person that nobody else has a part in."""
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1])
     wx, wy = goal[0] - x[0], goal[1] - x[1]
@@ -232,10 +246,20 @@ def _alone(
 
 @njit(cache=True, error_model="numpy")
 def accelerations(
-    base: Base, fx: Hidden, x: np.ndarray, v: np.ndarray, goal: np.ndarray, group: np.ndarray,
-    eta: np.ndarray, phase: np.ndarray, points: np.ndarray, segments: np.ndarray,
-    clock: float, since: float, out: np.ndarray,
-) -> None:  # fmt: skip
+    base: Base,
+    fx: Hidden,
+    x: np.ndarray,
+    v: np.ndarray,
+    goal: np.ndarray,
+    group: np.ndarray,
+    eta: np.ndarray,
+    phase: np.ndarray,
+    points: np.ndarray,
+    segments: np.ndarray,
+    clock: float,
+    since: float,
+    out: np.ndarray,
+) -> None:
     """``out`` (N, 2), m/s², of people at ``x`` (N, 2) m with velocities ``v`` (N, 2) m/s."""
     e = np.empty_like(v)
     for i in range(len(x)):
@@ -251,10 +275,23 @@ def accelerations(
 
 @njit(cache=True, error_model="numpy")
 def simulate(
-    base: Base, fx: Hidden, x0: np.ndarray, v0: np.ndarray, goal: np.ndarray, group: np.ndarray,
-    eta: np.ndarray, phase: np.ndarray, points: np.ndarray, segments: np.ndarray,
-    kick: np.ndarray, clock: np.ndarray, since: np.ndarray, step: float, steps: int, every: int,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    base: Base,
+    fx: Hidden,
+    x0: np.ndarray,
+    v0: np.ndarray,
+    goal: np.ndarray,
+    group: np.ndarray,
+    eta: np.ndarray,
+    phase: np.ndarray,
+    points: np.ndarray,
+    segments: np.ndarray,
+    kick: np.ndarray,
+    clock: np.ndarray,
+    since: np.ndarray,
+    step: float,
+    steps: int,
+    every: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities of S crowds of N people.
 
     Args:
@@ -292,9 +329,20 @@ def simulate(
                     vq += part * step * dv[q - 1]
                 t = (m + part) * step
                 accelerations(
-                    base, fx, xq, vq, goal[s], group[s], eta[s], phase[s], points, segments,
-                    clock[s] + t, since[s] + t, dv[q],
-                )  # fmt: skip
+                    base,
+                    fx,
+                    xq,
+                    vq,
+                    goal[s],
+                    group[s],
+                    eta[s],
+                    phase[s],
+                    points,
+                    segments,
+                    clock[s] + t,
+                    since[s] + t,
+                    dv[q],
+                )
                 if kick.shape[1] > 1:
                     dv[q] += kick[s, m] + part * (kick[s, m + 1] - kick[s, m])
                 else:

@@ -168,9 +168,23 @@ def _comfortable(
     x0, v0, goal, group = (part[None] for part in people)
     nobody = np.zeros(group.shape)
     x, _ = simulate(
-        base, Hidden(), x0, v0, goal, group, nobody, nobody, points, segments,
-        np.zeros((1, 1, *x0.shape[1:])), np.zeros(1), np.zeros(1), 0.05, round(duration / 0.05), 2,
-    )  # fmt: skip
+        base,
+        Hidden(),
+        x0,
+        v0,
+        goal,
+        group,
+        nobody,
+        nobody,
+        points,
+        segments,
+        np.zeros((1, 1, *x0.shape[1:])),
+        np.zeros(1),
+        np.zeros(1),
+        0.05,
+        round(duration / 0.05),
+        2,
+    )
     distance = np.hypot(*(x[0][:, :, None] - x[0][:, None]).transpose(3, 0, 1, 2))
     distance += np.where(np.eye(len(goal[0]), dtype=bool), np.inf, 0.0)
     y = x[..., 1]

@@ -66,11 +66,16 @@ def measured(case: LawCase) -> tuple[pd.DataFrame, dict[str, float]]:
         x = x - x[0, -1] + _fading(rng, x.shape, keep, error)
         k, n = (axis.ravel() for axis in np.indices(x.shape))
         tables.append(
-            pd.DataFrame({
-                "sequence": f"s{s:03d}", "time": 1000.0 * s + case.dt * k,
-                "agent": [f"{s}-{i}" for i in n], "x": x.ravel(), "length": length[n],
-            })
-        )  # fmt: skip
+            pd.DataFrame(
+                {
+                    "sequence": f"s{s:03d}",
+                    "time": 1000.0 * s + case.dt * k,
+                    "agent": [f"{s}-{i}" for i in n],
+                    "x": x.ravel(),
+                    "length": length[n],
+                }
+            )
+        )
     return pd.concat(tables, ignore_index=True), p
 
 

@@ -27,9 +27,15 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "fvdm": {"kappa": (0.2, 0.8), "lam": (0.2, 0.8), "v0": (20, 35), "s_c": (12, 25), "w": (6, 15)},
     "helly": {"c_s": (0.05, 0.2), "c_v": (0.3, 0.8), "T": (0.8, 1.8), "s0": (2, 5)},
     "krauss": {"v0": (20, 35), "T": (0.8, 1.5), "s0": (1, 2.5), "a": (0.8, 2.5), "b": (1.5, 4.5)},
-    "gipps": {"v0": (20, 35), "T": (0.6, 1.2), "s0": (1.5, 3), "a": (0.8, 2), "b": (1.5, 3),
-              "guess": (0.8, 1.2)},
-}  # fmt: skip
+    "gipps": {
+        "v0": (20, 35),
+        "T": (0.6, 1.2),
+        "s0": (1.5, 3),
+        "a": (0.8, 2),
+        "b": (1.5, 3),
+        "guess": (0.8, 1.2),
+    },
+}
 #: Steps (s) of laws that are maps.
 MAPS: dict[str, Callable[[Parameters], float]] = {
     "krauss": lambda p: 0.1,

@@ -242,9 +242,24 @@ def simulate(
                 x[vehicles - 1] = lead_x[s, half]
                 t = (k + part) * step
                 _rates(
-                    law, v0, L, fx, own[s], x, w, noise, lead_v[s, half], xs, vs,
-                    here + part, step, clock[s] + t, since + t, dx[j], dw[j],
-                )  # fmt: skip
+                    law,
+                    v0,
+                    L,
+                    fx,
+                    own[s],
+                    x,
+                    w,
+                    noise,
+                    lead_v[s, half],
+                    xs,
+                    vs,
+                    here + part,
+                    step,
+                    clock[s] + t,
+                    since + t,
+                    dx[j],
+                    dw[j],
+                )
                 if j == 0:
                     for i in range(vehicles):
                         vs[here, i] = dx[0, i] * step

@@ -192,8 +192,10 @@ def _start_value(model: DictConfig, rest: str, value: str) -> str:
     about = parameters[own]
     now = str(about.value if OmegaConf.is_dict(about) else about)
     unit = now.partition(" ")[2]
-    low, high = (str(about.get(e)) if OmegaConf.is_dict(about) and about.get(e) is not None
-                 else "" for e in ("low", "high"))  # fmt: skip
+    low, high = (
+        str(about.get(e)) if OmegaConf.is_dict(about) and about.get(e) is not None else ""
+        for e in ("low", "high")
+    )
     asked, least, most = _number(value), _number(low), _number(high)
     within = f"between {low} and {high}" if low and high else ""
     outside = asked is not None and (

@@ -43,15 +43,34 @@ _RAISE = "HYDRA_FULL_ERROR"
 
 #: Flags of Hydra's, and those that take a value, with the values that there are.
 _FLAGS = (
-    "-h", "--help", "-m", "--multirun", "--version", "--resolve", "-r", "--run", "--hydra-help",
-    "-sc", "--shell-completion",
-)  # fmt: skip
+    "-h",
+    "--help",
+    "-m",
+    "--multirun",
+    "--version",
+    "--resolve",
+    "-r",
+    "--run",
+    "--hydra-help",
+    "-sc",
+    "--shell-completion",
+)
 _CFG = ("job", "hydra", "all")
 _VALUED: dict[str, tuple[str, ...]] = {
-    "-c": _CFG, "--cfg": _CFG, "-p": (), "--package": (), "-cd": (), "--config-dir": (),
-    "-cp": (), "--config-path": (), "-cn": (), "--config-name": (), "-i": (), "--info": (),
+    "-c": _CFG,
+    "--cfg": _CFG,
+    "-p": (),
+    "--package": (),
+    "-cd": (),
+    "--config-dir": (),
+    "-cp": (),
+    "--config-path": (),
+    "-cn": (),
+    "--config-name": (),
+    "-i": (),
+    "--info": (),
     "--experimental-rerun": (),
-}  # fmt: skip
+}
 
 
 def run(

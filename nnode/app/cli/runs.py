@@ -100,8 +100,12 @@ def _take(folder: Path, what: str = "run") -> None:
         end(error)
     except (OSError, ValueError) as error:  # a path that the system does not know how to make
         said = getattr(error, "strerror", None) or error
-        end(WriteError(f"the folder {folder} cannot be made: {said}; choose another one with "
-                       f"hydra.{what}.dir="))  # fmt: skip
+        end(
+            WriteError(
+                f"the folder {folder} cannot be made: {said}; choose another one with "
+                f"hydra.{what}.dir="
+            )
+        )
 
 
 def _results(folder: Path) -> set[tuple[Path, int]]:

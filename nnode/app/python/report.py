@@ -80,14 +80,21 @@ class Report:
         """A row per coefficient of what was named, and of what was not confirmed."""
         rows = [
             {
-                "effect": effect.name, "named": named, "coefficient": name,
-                "estimate": c.value, "lower": c.low, "upper": c.high, "unit": c.unit,
-                "p_value": effect.p_value, "confirmed": effect.confirmed, "where": effect.where,
+                "effect": effect.name,
+                "named": named,
+                "coefficient": name,
+                "estimate": c.value,
+                "lower": c.low,
+                "upper": c.high,
+                "unit": c.unit,
+                "p_value": effect.p_value,
+                "confirmed": effect.confirmed,
+                "where": effect.where,
             }
             for effects, named in ((self.effects, True), (self.leads, False))
             for effect in effects
             for name, c in effect.coefficients.items()
-        ]  # fmt: skip
+        ]
         columns = ["effect", "named", "coefficient", "estimate", "lower", "upper", "unit"]
         return pd.DataFrame(rows, columns=[*columns, "p_value", "confirmed", "where"])
 

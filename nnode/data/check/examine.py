@@ -125,9 +125,10 @@ def _table(
     source = source_of(raw, found, seen.scale, seen.tracks)
     examined = Examination(raw.path, raw, found, every, seen.known, seen.tracks, [], source)
     needed: dict[str, str] = {
-        m: found[m].column for m in ("agent", seen.clock, "x", "y", "x_follower", "x_leader")
+        m: found[m].column
+        for m in ("agent", seen.clock, "x", "y", "x_follower", "x_leader")
         if m in found
-    }  # fmt: skip
+    }
     if is_spaced(found):
         needed |= {m: found[m].column for m in ("spacing", "v_follower", "v_leader")}
     examined.findings += find.cells(table, needed)
@@ -143,10 +144,11 @@ def _rivals(found: Mapping[str, Meaning]) -> Iterator[Finding]:
     for meaning, one in found.items():
         if one.rivals:
             yield Finding(
-                "columns", "warning",
+                "columns",
+                "warning",
                 f"{meaning} may be {one.column} or {' or '.join(one.rivals)}, which hold different "
                 f"values; {one.column} is taken",
-            )  # fmt: skip
+            )
 
 
 def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:
@@ -159,11 +161,12 @@ def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:
     if rate is None and best.rate is not None:
         rates = sorted(one.rate for one in same if one.rate and one.probability > FAIR)
         yield Finding(
-            "units", "warning",
+            "units",
+            "warning",
             f"times are frames of a rate that the file does not tell; of the usual ones "
             f"{', '.join(f'{one:g}' for one in rates)} frames/s fit, {best.rate:g} is taken: tell "
             "the right one with frame_rate=",
-        )  # fmt: skip
+        )
 
 
 def unit_names(scale: Scale) -> tuple[str, ...]:

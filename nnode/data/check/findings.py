@@ -55,10 +55,11 @@ def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
             i = int(np.flatnonzero(bad)[0])
             shown = "nothing" if empty[i] else quoted(own.iloc[i])[:42]
             yield Finding(
-                "cells", "error",
+                "cells",
+                "error",
                 f"column {column!r} ({meaning}) holds no number in {bad.sum()} of {len(own)} rows, "
                 f"first {shown} in {table.row(i)}; correct or remove these rows",
-            )  # fmt: skip
+            )
 
 
 def rows(table: Table, agent: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
@@ -70,20 +71,22 @@ def rows(table: Table, agent: np.ndarray, time: np.ndarray) -> Iterator[Finding]
         i = int(np.flatnonzero(again)[0])
         whole = int(table.frame.duplicated().sum())
         yield Finding(
-            "duplicates", "error",
+            "duplicates",
+            "error",
             f"{again.sum()} rows have an agent and a time that stood there before ({whole} of them "
             f"are the same throughout), first agent {agent[i]} at {time[i]:g} in {table.row(i)}; "
             "keep one row per agent and time, or tell agents of one name apart",
-        )  # fmt: skip
+        )
     order = np.argsort(code, kind="stable")
     back = (np.diff(time[order]) < 0) & (np.diff(code[order]) == 0)
     if back.any():
         i = int(order[np.flatnonzero(back)[0] + 1])
         yield Finding(
-            "unsorted", "note",
+            "unsorted",
+            "note",
             f"{back.sum()} rows stand before earlier ones of their agent, first in {table.row(i)}; "
             "the readers sort them",
-        )  # fmt: skip
+        )
 
 
 def sampling(tracks: Tracks) -> Iterator[Finding]:
@@ -107,9 +110,10 @@ def sampling(tracks: Tracks) -> Iterator[Finding]:
     yield Finding("rate", level, text)
     if holes.any():
         yield Finding(
-            "holes", "warning" if holes.mean() > FEW else "note",
+            "holes",
+            "warning" if holes.mean() > FEW else "note",
             f"{holes.sum()} holes in agents' records, the longest of {steps.max():.3g} s",
-        )  # fmt: skip
+        )
 
 
 def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Finding]:
@@ -125,11 +129,12 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
     if told is not None and scale.rate is not None and abs(scale.rate / told - 1) > 0.01:
         own = f"; its own velocities say {speed / ratio:.3g} m/s" if np.isfinite(ratio) else ""
         yield Finding(
-            "time_scale", "error",
+            "time_scale",
+            "error",
             f"at the {told:g} frames/s that are told, {who} "
             f"{known.speed * scale.metres * told:.3g} m/s (median of those who move){own}: "
             f"{scale.rate:g} frames/s fit",
-        )  # fmt: skip
+        )
     elif np.isfinite(ratio) and AGREE.score(ratio) < -4:
         if scale.rate is not None:
             right = scale.rate / ratio
@@ -142,10 +147,11 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
                 "both were made"
             )
         yield Finding(
-            "time_scale", "error",
+            "time_scale",
+            "error",
             f"by their positions {who} {speed:.3g} m/s (median of those who move), by the file's "
             f"own velocities {speed / ratio:.3g} m/s; {cure}",
-        )  # fmt: skip
+        )
     clock = known.sway / scale.seconds
     walk = USUAL["crowd"]["sway"]
     fine = known.dt * scale.seconds <= SWAYS
@@ -163,10 +169,11 @@ def time_scale(known: Medians, scale: Scale, told: float | None) -> Iterator[Fin
             yield Finding("time_scale", "error", f"{text} ({walk.source}); {cure}")
     if np.isfinite(speed) and usual.score(speed) < -2:
         yield Finding(
-            "speed", "error" if usual.score(speed) < -8 else "warning",
+            "speed",
+            "error" if usual.score(speed) < -8 else "warning",
             f"{who} {speed:.3g} m/s (median of those who move); expected {usual.low:g} to "
             f"{usual.high:g} m/s: {usual.source}; check rate and units",
-        )  # fmt: skip
+        )
 
 
 def measurement(noise: Noise, sequences: list[Sequence], domain: Domain) -> Iterator[Finding]:
@@ -201,11 +208,12 @@ def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
     a = np.linalg.norm(v[next_] - v, axis=1)[good] / moves.took[good]
     if a.size and (a > FRICTION).mean() > 0.001:
         yield Finding(
-            "acceleration", "warning",
+            "acceleration",
+            "warning",
             f"{(a > FRICTION).mean():.1%} of the changes of speed over a second exceed "
             f"{FRICTION:g} m/s², what friction can give; 99 % are below "
             f"{np.percentile(a, 99):.3g} m/s²: the time scale or the positions are off",
-        )  # fmt: skip
+        )
 
 
 def _jumps(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
@@ -215,10 +223,11 @@ def _jumps(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
     if fast.any():
         who = sorted({tracks.names[i] for i in tracks.agent[steps.first[fast]]})
         yield Finding(
-            "fast", "error",
+            "fast",
+            "error",
             f"{fast.sum()} of {len(steps)} steps are faster than {limits.max_speed:g} m/s, of "
             f"{_some(who)}",
-        )  # fmt: skip
+        )
 
 
 def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
@@ -234,9 +243,10 @@ def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
         axis = int(np.argmax(np.abs(net[went]).sum(axis=0)))
         forth = float((net[went, axis] > 0).mean())
         yield Finding(
-            "direction", "note",
+            "direction",
+            "note",
             f"people walk along {'xy'[axis]}, {forth:.0%} of them towards larger values",
-        )  # fmt: skip
+        )
         return
     back = net[went, 0] < 0
     if not back.any():
@@ -251,10 +261,11 @@ def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
     where = f" in lane {_some(names)}" if names else ""
     opposed = "both ways" + where if both else "one way in some lanes, the other way in others"
     yield Finding(
-        "direction", "error" if min(back.mean(), 1 - back.mean()) > EDGE else "warning",
+        "direction",
+        "error" if min(back.mean(), 1 - back.mean()) > EDGE else "warning",
         f"vehicles drive {opposed}: {back.mean():.0%} of {back.size} towards smaller positions; "
         "choose one direction with data.lane, or tell the lanes apart",
-    )  # fmt: skip
+    )
 
 
 def _usual(tracks: Tracks) -> np.ndarray:
@@ -281,11 +292,12 @@ def coming_and_going(tracks: Tracks, domain: Domain, whole: bool) -> Iterator[Fi
     times, count = np.unique(tracks.time, return_counts=True)
     span = times[-1] - times[0]
     yield Finding(
-        "agents", "note",
+        "agents",
+        "note",
         f"{len(start)} {'people' if domain == 'crowd' else 'vehicles'} in {span:.5g} s, "
         f"{np.median(count):.0f} at a time (at most {count.max()}), each for "
         f"{np.median(tracks.time[end] - tracks.time[start]):.3g} s",
-    )  # fmt: skip
+    )
     if not whole:
         return
     axis = int(np.argmax(np.abs(tracks.x[end] - tracks.x[start]).sum(axis=0)))
@@ -351,11 +363,12 @@ def faults(found: list[Fault], sequences: int) -> Iterator[Finding]:
         first = next(f for f in found if f.kind == kind)
         level = "error" if number > 0.1 * sequences else "warning"
         yield Finding(
-            kind, level,
+            kind,
+            level,
             f"{KINDS[kind]}: in {number} of {sequences} sequences, first in {first.sequence}"
             + (f" at {first.time:g} s" if first.time is not None else "")
             + f": {first.detail}",
-        )  # fmt: skip
+        )
 
 
 def _some(names: list[str], most: int = 5) -> str:

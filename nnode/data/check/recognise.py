@@ -243,9 +243,10 @@ def _sure_enough(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, 
         )
     if best.rate is not None and rate is None:
         rates = {
-            one.rate: one.probability for one in seen.scales
+            one.rate: one.probability
+            for one in seen.scales
             if one.rate and unit_names(one) == unit_names(best) and one.probability > FAIR
-        }  # fmt: skip
+        }
         if len(rates) > 1:
             listed = " or ".join(f"{one:g}" for one in sorted(rates))
             raise ConfigError(

@@ -18,8 +18,10 @@ from nnode.errors import DataError
 
 #: Columns whose names tell a unit.
 _TELL: dict[str, tuple[str, ...]] = {
-    "position": ("x", "x_follower", "spacing"), "time": (), "speed": ("speed", "vx", "v_follower"),
-}  # fmt: skip
+    "position": ("x", "x_follower", "spacing"),
+    "time": (),
+    "speed": ("speed", "vx", "v_follower"),
+}
 
 
 @dataclass(frozen=True)
@@ -110,9 +112,12 @@ def scaled(
     known = {d: medians(tracks, d) for d in _domains(found, tracks, domain)}
     frames = clock == "frame" or bool((tracks.time % 1 == 0).all())
     every = scales(
-        known, {k: v for k, v in units.items() if v}, frames=frames, rate=rate,
+        known,
+        {k: v for k, v in units.items() if v},
+        frames=frames,
+        rate=rate,
         speeds=speed is not None,
-    )  # fmt: skip
+    )
     scale = every[0]
     si = tracks.scaled(scale.metres, scale.seconds, scale.per_second)
     return Scaled(found, every, known[scale.domain], si, files, time, clock)

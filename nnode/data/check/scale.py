@@ -52,15 +52,21 @@ class Range:
 USUAL: dict[Domain, dict[str, Range]] = {
     "crowd": {
         "speed": Range(
-            0.2, 1.6, 0.19,
+            0.2,
+            1.6,
+            0.19,
             "free walking 1.34 ± 0.26 m/s (Weidmann 1993), less in a crowd",
         ),
         "nearest": Range(
-            0.4, 6.0, 0.3,
+            0.4,
+            6.0,
+            0.3,
             "5.4 people on a square metre at most (Weidmann 1993), 0.43 m from each other",
         ),
         "sway": Range(
-            0.8, 1.08, 0.08,
+            0.8,
+            1.08,
+            0.08,
             "people sway once in two steps, of which they make 2.0 ± 0.13 in a second (MacDougall "
             "& Moore 2005), 1.6 in a dense crowd",
         ),
@@ -68,13 +74,15 @@ USUAL: dict[Domain, dict[str, Range]] = {
     "traffic": {
         "speed": Range(1.0, 42.0, 0.2, "from a jam to 150 km/h"),
         "nearest": Range(
-            5.5, 120.0, 0.25,
+            5.5,
+            120.0,
+            0.25,
             "a car's length and the gap of standing cars (Treiber & Kesting 2013: 2 m); at most "
             "about 5 s behind at 25 m/s",
         ),
         "length": Range(3.5, 7.0, 0.12, "cars are 3.5 to 5 m long; up to half trucks"),
     },
-}  # fmt: skip
+}
 #: s; sampled more coarsely, people's sway does not show.
 SWAYS = 1 / 3
 INTERVAL = Range(0.02, 1.0, 0.4, "recordings take 1 to 50 samples in a second")
@@ -82,10 +90,20 @@ INTERVAL = Range(0.02, 1.0, 0.4, "recordings take 1 to 50 samples in a second")
 AGREE = Range(0.995, 1.005, 0.025, "two measurements of one motion")
 #: What units are expected at all, without a name that tells: most data are in SI units.
 _BEFORE = {
-    "m": 1.0, "cm": 0.1, "ft": 0.03, "km": 0.01,
-    "s": 1.0, "ms": 0.1, "us": 0.01, "ns": 0.1, "frame": 0.3,
-    "m/s": 1.0, "km/h": 0.2, "ft/s": 0.03, "mph": 0.03,
-}  # fmt: skip
+    "m": 1.0,
+    "cm": 0.1,
+    "ft": 0.03,
+    "km": 0.01,
+    "s": 1.0,
+    "ms": 0.1,
+    "us": 0.01,
+    "ns": 0.1,
+    "frame": 0.3,
+    "m/s": 1.0,
+    "km/h": 0.2,
+    "ft/s": 0.03,
+    "mph": 0.03,
+}
 #: The same for two coordinates that are of vehicles, though nothing names a vehicle or a lane.
 _UNNAMED = 0.02
 #: The same for another rate than the one that is told, which is copied from set to set.

@@ -231,12 +231,26 @@ def _most(tracks: Tracks) -> int:
 
 def _pairs(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:
     meant = {
-        "time": "time", "run": "recording", "lane": "lane",
-        **{name: name for name in (
-            "pair", "x_follower", "x_leader", "v_follower", "v_leader", "leader_length", "spacing",
-            "follower", "leader", "split", "leader_kind",
-        )},
-    }  # fmt: skip
+        "time": "time",
+        "run": "recording",
+        "lane": "lane",
+        **{
+            name: name
+            for name in (
+                "pair",
+                "x_follower",
+                "x_leader",
+                "v_follower",
+                "v_leader",
+                "leader_length",
+                "spacing",
+                "follower",
+                "leader",
+                "split",
+                "leader_kind",
+            )
+        },
+    }
     columns = {m: one.column for m, one in found.items()}
     named = {name: columns[m] for name, m in meant.items() if m in columns and name != columns[m]}
     own: dict[str, Any] = {"columns": named, "position_unit": scale.position}

@@ -151,11 +151,22 @@ def tracks_from(sequences: Iterable[Sequence], *, cut: bool) -> Tracks:
         long = np.full(n, np.nan) if s.length is None else s.length
         lane = np.full(k * n, s.recording, dtype=object)
         parts.append(
-            (np.tile(names, k), np.repeat(s.time, n), s.x.reshape(k * n, -1), v.ravel(),
-             np.tile(long, k), lane)
-        )  # fmt: skip
+            (
+                np.tile(names, k),
+                np.repeat(s.time, n),
+                s.x.reshape(k * n, -1),
+                v.ravel(),
+                np.tile(long, k),
+                lane,
+            )
+        )
     agent, time, x, v, long, lane = (np.concatenate(part) for part in zip(*parts, strict=True))
     return tracks_of(
-        agent, time, x, None if np.isnan(v).all() else v, lane,
-        None if np.isnan(long).all() else long, lane,
-    )  # fmt: skip
+        agent,
+        time,
+        x,
+        None if np.isnan(v).all() else v,
+        lane,
+        None if np.isnan(long).all() else long,
+        lane,
+    )

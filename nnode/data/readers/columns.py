@@ -88,9 +88,15 @@ def layout(text: str, whole: bool = True) -> Layout | None:
             names, named = said, True
     above = next(i for i, line in enumerate(lines) if line.strip() and line[0] != "#")
     return Layout(
-        rows[0], len(cells), separator, "," if comma else ".", names, named, above,
+        rows[0],
+        len(cells),
+        separator,
+        "," if comma else ".",
+        names,
+        named,
+        above,
         "\n".join(comments),
-    )  # fmt: skip
+    )
 
 
 def _separator(rows: list[str]) -> str:

@@ -115,13 +115,18 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
             of = [Member(record.agent, record.row, [record]) for record in there]
             found.append(
                 sequence_of(
-                    f"{recording}/{number:03d}", own, of, first, last, grid,
+                    f"{recording}/{number:03d}",
+                    own,
+                    of,
+                    first,
+                    last,
+                    grid,
                     recording=recording,
                     destination=_destinations(goals, there, first, last),
                     preferred=_before(every, there, first, before, dt),
                     walls=walls,
                 )
-            )  # fmt: skip
+            )
     if not found:
         span = float(rows.time.max() - rows.time.min()) + dt
         raise DataError(

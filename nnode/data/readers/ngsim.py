@@ -196,8 +196,10 @@ def _roads(table: Table, place: np.ndarray, direction: np.ndarray | None) -> np.
     if street.any():
         log.info(
             "%s: %d rows of streets with intersections (%s) are left out",
-            table.path.name, street.sum(), names,
-        )  # fmt: skip
+            table.path.name,
+            street.sum(),
+            names,
+        )
     return np.flatnonzero(~street)
 
 

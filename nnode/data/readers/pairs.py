@@ -171,8 +171,9 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         log.info(
             "%d of %d pairs name neither follower nor leader and are taken as independent of each "
             "other; data.columns.follower and data.columns.leader tell which share a vehicle",
-            anonymous, len(pairs),
-        )  # fmt: skip
+            anonymous,
+            len(pairs),
+        )
     return Reading(found, short, told_uneven(every, dt))
 
 
@@ -443,9 +444,14 @@ def _sequences(
     made = [
         sequence_of(
             name if len(parts) == 1 else f"{name}_{number:03d}",
-            rows, both, first, last, grid,
-            time=measured_times(rows, grid, first, last), split=split,
+            rows,
+            both,
+            first,
+            last,
+            grid,
+            time=measured_times(rows, grid, first, last),
+            split=split,
         )
         for number, (first, last) in enumerate(parts)
-    ]  # fmt: skip
+    ]
     return made, found

@@ -14,9 +14,14 @@ from nnode.errors import ConfigError, DataError, NNodeError
 
 #: What Python and its libraries raise for contents that no reader expects.
 FOREIGN = (
-    ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError,
-    TypeError, ValueError,
-)  # fmt: skip
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
 
 
 @contextmanager

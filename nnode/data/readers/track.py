@@ -130,8 +130,12 @@ def _sound(run: Run, v: np.ndarray, most: float | None) -> np.ndarray:
         log.info(
             "%s: %d of %d gaps of %s to %s are not above 0, or change otherwise than their speeds "
             "tell (data.max_error); they count as unknown",
-            run.name, bad.sum(), np.isfinite(run.gap[:, i]).sum(), run.make[i], run.make[i - 1],
-        )  # fmt: skip
+            run.name,
+            bad.sum(),
+            np.isfinite(run.gap[:, i]).sum(),
+            run.make[i],
+            run.make[i - 1],
+        )
     return gap
 
 

@@ -145,9 +145,10 @@ def imitated(
         return [], p_value
     shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [
-        step for step in found.steps
+        step
+        for step in found.steps
         if not step.chosen.score.effect.built_into_laws and step.chosen.name not in shared
-    ]  # fmt: skip
+    ]
     return steps, p_value
 
 

@@ -106,9 +106,12 @@ class CrowdEngine:
             keep = first + stride * np.arange(length * len(windows))
             goal = s.x[-1] if s.destination is None else s.destination
             part = replace(
-                s, time=s.time[keep], x=s.x[keep], v=None if s.v is None else s.v[keep],
+                s,
+                time=s.time[keep],
+                x=s.x[keep],
+                v=None if s.v is None else s.v[keep],
                 destination=goal,
-            )  # fmt: skip
+            )
             x = part.x.copy()
             for number, window in enumerate(windows):
                 people = self.windows.person[:, 0] == window

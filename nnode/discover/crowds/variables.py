@@ -125,17 +125,27 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
     ]
     if bool((agent.sum(1) > 1).any()):
         looks += [
-            ("distance to the nearest person", "m", _distance,
-             {"away from him": _away_from_nearest, **own}, KNOTS),
+            (
+                "distance to the nearest person",
+                "m",
+                _distance,
+                {"away from him": _away_from_nearest, **own},
+                KNOTS,
+            ),
             ("bearing of the nearest person", "degrees", _bearing, own, KNOTS),
             ("speed of approach of the nearest person", "m/s", _approach, own, KNOTS),
             ("local density", "1/m²", _density, own, KNOTS),
-        ]  # fmt: skip
+        ]
     if not state.scene.segment.isnan().any(-1).all():
         looks.append(
-            ("distance to the nearest wall", "m", _wall,
-             {"away from it": _away_from_wall, ahead: _ahead}, KNOTS)
-        )  # fmt: skip
+            (
+                "distance to the nearest wall",
+                "m",
+                _wall,
+                {"away from it": _away_from_wall, ahead: _ahead},
+                KNOTS,
+            )
+        )
     found = []
     for name, unit, value, directions, most in looks:
         seen = value(state)[agent].numpy().astype(float)

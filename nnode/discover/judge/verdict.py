@@ -168,11 +168,13 @@ def _absence(score: Score, way: Way) -> Absence:
         unit=strength.unit,
         detectable=detectable if math.isfinite(detectable) else None,
         bound=bound if testable else None,
-        reason="" if testable else (
+        reason=""
+        if testable
+        else (
             f"{name} would not be named with these data with a probability of {rules().power:.0%} "
             f"even if it were off by {expected:.3g}{unit}"
         ),
-    )  # fmt: skip
+    )
 
 
 def _without_strength(score: Score, way: Way) -> Absence:
@@ -180,15 +182,21 @@ def _without_strength(score: Score, way: Way) -> Absence:
     effect = score.effect
     name, setting = next(iter(effect.settings.items()))
     found = [
-        one for one in score.evidence
+        one
+        for one in score.evidence
         if one.grams.sum() > 0 and way.power(score, one, 1.0) >= rules().power
-    ]  # fmt: skip
+    ]
     weakest = min(found, key=_information, default=None)
     value = None if weakest is None else float(weakest.options[name])
     return Absence(
-        effect.name, value is not None, name, setting.unit, value, value,
+        effect.name,
+        value is not None,
+        name,
+        setting.unit,
+        value,
+        value,
         "" if value is not None else "it acts too rarely, or in too few clusters, to be named",
-    )  # fmt: skip
+    )
 
 
 def _information(one: Evidence) -> float:
@@ -202,14 +210,19 @@ def agents_absent(one: Individuals, alpha: float, enough: bool) -> Absence:
     detectable, (_, high) = one.detectable(alpha), one.interval()
     testable = enough and 0 < detectable <= strength.expected
     return Absence(
-        one.effect.name, testable, name, strength.unit,
+        one.effect.name,
+        testable,
+        name,
+        strength.unit,
         detectable if math.isfinite(detectable) else None,
         high if testable else None,
-        "" if testable else (
+        ""
+        if testable
+        else (
             f"{name} would not stand out with a probability of {rules().power:.0%} even if it were "
             f"{strength.expected:.3g}{'' if strength.unit == '1' else ' ' + strength.unit}"
         ),
-    )  # fmt: skip
+    )
 
 
 def _relative(effect: type[Effect], name: str, error: float) -> float:

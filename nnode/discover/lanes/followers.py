@@ -385,9 +385,13 @@ def _parts(system: System) -> tuple[System, Curve | None]:
 
 
 def _seen(
-    model: Followers, time: Tensor, x: np.ndarray, speed: np.ndarray, ahead: np.ndarray,
+    model: Followers,
+    time: Tensor,
+    x: np.ndarray,
+    speed: np.ndarray,
+    ahead: np.ndarray,
     scene: Scene,
-) -> State:  # fmt: skip
+) -> State:
     """What terms see of every follower and of the one or two vehicles ahead of him.
 
     Args:

@@ -114,4 +114,4 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         of("place in the platoon", "1", _rank, rank.to(x.dtype)),
         *waves("position", "m", _position, x, ROAD),
         *waves("clock time", "s", clock, times, (max(CLOCK[0], 4 * batch.dt), CLOCK[1])),
-    ]  # fmt: skip
+    ]

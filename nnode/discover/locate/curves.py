@@ -99,9 +99,13 @@ class _Look:
     """
 
     def __init__(
-        self, engine: Engine, fit: Fit, screen: Screen, variable: Variable,
+        self,
+        engine: Engine,
+        fit: Fit,
+        screen: Screen,
+        variable: Variable,
         bias: np.ndarray | float = 0.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.engine, self.fit, self.variable, self.bias = engine, fit, variable, bias
         self.screen, self.squares = screen, list[np.ndarray]()
         if variable.lengths:

@@ -229,13 +229,14 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
     tried += [score for score in scores if score.effect.name in hinted and score not in tried]
     candidates = _in_order(engine, found, tried, hint, shown)
     good = [
-        c for c in candidates
+        c
+        for c in candidates
         if c.removed >= engine.least
         and c.gain.gain > 0
         and c.there < rules().level
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
-    ]  # fmt: skip
+    ]
     passing = [c for c in good if c.score.p_value <= alpha]
     if not passing and not isinstance(engine, FollowersEngine):
         passing = [c for c in good if _sure(c, screen, len(scores))]
@@ -410,9 +411,10 @@ def _pruned(engine: Engine, found: Search) -> Search:
         rest.sort(key=lambda one: -one[0].gain)
         found.steps = [step for _, step, _ in rest]
         needless = [
-            one for one in rest
+            one
+            for one in rest
             if one[0].gain <= 0 or there(one[2], found.fit, engine.cluster) > rules().level
-        ]  # fmt: skip
+        ]
         if not needless:
             break
         _, step, found.fit = needless[-1]

@@ -235,8 +235,10 @@ def _agents(d: Diagnosis) -> list[Block]:
         for one in d.agents
     ]
     blocks: list[Block] = [
-        Heading("Do agents differ?"), Text("\n".join(words)), tables.agents_table(d)
-    ]  # fmt: skip
+        Heading("Do agents differ?"),
+        Text("\n".join(words)),
+        tables.agents_table(d),
+    ]
     if any(one.later for one in d.agents):
         blocks.append(tables.later_table(d))
     return blocks

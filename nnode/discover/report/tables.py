@@ -94,12 +94,13 @@ def screen_table(d: Diagnosis) -> TableBlock:
             "share of the squared residuals": _percent(one["share"]),
             "p": amount(one["p_value"], 2),
             "about": ", ".join(
-                f"{name} {amount(value)}" for name, value in one.items()
+                f"{name} {amount(value)}"
+                for name, value in one.items()
                 if name not in ("name", "share", "p_value")
             ),
         }
         for one in d.screen.leads
-    ]  # fmt: skip
+    ]
     return _table(
         "screen",
         rows,
@@ -117,14 +118,11 @@ def agents_table(d: Diagnosis) -> TableBlock:
             "strength": f"{amount(one.strength, 2)} [{amount(one.low, 2)}, {amount(one.high, 2)}]",
             "unit": _unit(one.unit),
             "p": amount(one.p_value, 2),
-            **{
-                who: "–" if share is None else _percent(share)
-                for who, share in one.share.items()
-            },
+            **{who: "–" if share is None else _percent(share) for who, share in one.share.items()},
             "p on sealed clusters": amount(one.confirmed, 2),
         }
         for one in d.agents
-    ]  # fmt: skip
+    ]
     return _table(
         "agents",
         rows,
@@ -137,19 +135,22 @@ def agents_table(d: Diagnosis) -> TableBlock:
 def drivers_table(d: Diagnosis) -> TableBlock:
     """What differs between drivers and over time."""
     known = {
-        "push": "pushes", "push_time": "time that pushes last", "measurement": "measured positions",
-    }  # fmt: skip
+        "push": "pushes",
+        "push_time": "time that pushes last",
+        "measurement": "measured positions",
+    }
     rows = [
         {
             "what": known.get(one.name, f"{one.name} between drivers"),
             "standard deviation or time": amount(one.estimate),
-            "95 % interval": "not estimable" if math.isnan(one.lower)
+            "95 % interval": "not estimable"
+            if math.isnan(one.lower)
             else f"[{amount(one.lower)}, {amount(one.upper)}]",
             "unit": _unit(one.unit),
             "left open per driver": _percent(one.shrinkage),
         }
         for one in d.drivers
-    ]  # fmt: skip
+    ]
     return _table(
         "drivers",
         rows,
@@ -230,11 +231,15 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
 
 def _apart(other: Alternative) -> str:
     profile = other.profile
-    leader = "" if profile is None else (
-        f"{profile.platoons} platoons of {profile.lasts:g} s behind a leader who drives from "
-        f"{profile.mean - profile.swing:.0f} to {profile.mean + profile.swing:.0f} m/s and back "
-        f"every {profile.period:g} s"
-    )  # fmt: skip
+    leader = (
+        ""
+        if profile is None
+        else (
+            f"{profile.platoons} platoons of {profile.lasts:g} s behind a leader who drives from "
+            f"{profile.mean - profile.swing:.0f} to {profile.mean + profile.swing:.0f} m/s and "
+            f"back every {profile.period:g} s"
+        )
+    )
     return "; ".join(part for part in (other.separated_by, leader) if part) or "–"
 
 

@@ -170,8 +170,9 @@ def waves_of(
     lengths = lengths_of(*between, high - low)
     return [
         Variable(f"waves of {name}", unit, value, (low, high), direction, level, lengths)
-        for level, direction in directions.items() if lengths
-    ]  # fmt: skip
+        for level, direction in directions.items()
+        if lengths
+    ]
 
 
 @dataclass

@@ -280,9 +280,11 @@ class Screen:
         square = np.zeros((len(parts), cells + 1, cells + 1))
         square[:, 1:, 1:] = grams.cumsum(1).cumsum(2)
         sizes = (
-            square[:, last + 1, last + 1] - square[:, first, last + 1]
-            - square[:, last + 1, first] + square[:, first, first]
-        )  # fmt: skip
+            square[:, last + 1, last + 1]
+            - square[:, first, last + 1]
+            - square[:, last + 1, first]
+            + square[:, first, first]
+        )
         size = sizes.sum(0)
         usable = size > 1e-9 * max(size.max(), 1e-300)
         each, sizes, size = each[:, usable], sizes[:, usable], size[usable]
@@ -310,11 +312,16 @@ class Screen:
         options[name] = strength.at(amount)
         return [
             Score(
-                trace.effect, options, float(flipped[0].max()), 1.0, float(gain[i]),
-                {name: float(amount)}, {name: float(error)},
+                trace.effect,
+                options,
+                float(flipped[0].max()),
+                1.0,
+                float(gain[i]),
+                {name: float(amount)},
+                {name: float(error)},
                 [Evidence(options, 0.0, each[:, i], sizes[:, i], minimal)],
             )
-        ]  # fmt: skip
+        ]
 
     def _estimate(
         self, parts: np.ndarray, grams: np.ndarray

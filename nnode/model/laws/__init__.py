@@ -226,9 +226,11 @@ class Law(Term):
                 bounds["low"] = float(options.pop(f"{name}_min"))
             start = found["value"][0] if drawn is None else drawn
             self.declare(
-                name, start if given[name] is None else given[name], unit=unit or units.pop(),
+                name,
+                start if given[name] is None else given[name],
+                unit=unit or units.pop(),
                 bounds=Interval(**bounds) if bounds else None,
-            )  # fmt: skip
+            )
 
     def _connect(self, hidden: int | None, generator: torch.Generator | None) -> None:
         """Make the networks, of as many inputs as the formulas give them."""

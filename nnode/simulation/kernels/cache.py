@@ -173,8 +173,9 @@ class _Compiled(FunctionCache):
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # a damaged file leads to almost any error
-            log.info("compiled code in %s cannot be read (%s) and is made again",
-                     self.cache_path, error)  # fmt: skip
+            log.info(
+                "compiled code in %s cannot be read (%s) and is made again", self.cache_path, error
+            )
             with suppress(OSError):
                 self.flush()
             return None
@@ -183,5 +184,6 @@ class _Compiled(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            log.warning("compiled code is not kept in %s: %s; %s",
-                        self.cache_path, error.strerror, _WAY_OUT)  # fmt: skip
+            log.warning(
+                "compiled code is not kept in %s: %s; %s", self.cache_path, error.strerror, _WAY_OUT
+            )

@@ -87,10 +87,14 @@ _Part = tuple[str, str, int, str]
 _PARTS = {
     OTHERS: {"dx": ("x", "x"), "dy": ("y", "y"), "dvx": ("vx", "vx"), "dvy": ("vy", "vy")},
     POINTS: {
-        "dx": ("x", "x"), "dy": ("y", "y"), "vx": ("vx", ""), "vy": ("vy", ""),
-        "normal_x": ("", "normal_x"), "normal_y": ("", "normal_y"),
+        "dx": ("x", "x"),
+        "dy": ("y", "y"),
+        "vx": ("vx", ""),
+        "vy": ("vy", ""),
+        "normal_x": ("", "normal_x"),
+        "normal_y": ("", "normal_y"),
     },
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)

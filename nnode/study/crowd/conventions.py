@@ -98,11 +98,14 @@ class Tracks:
             path = path[:, who]
             before = self.x[begin - 1, who] if begin else np.full_like(path[0], np.nan)
             sequence = Sequence(
-                name=f"{RECORDING}/{number:03d}", recording=RECORDING,
-                time=(begin + np.arange(how.samples)) / self.rate, x=path,
+                name=f"{RECORDING}/{number:03d}",
+                recording=RECORDING,
+                time=(begin + np.arange(how.samples)) / self.rate,
+                x=path,
                 v=np.broadcast_to(self.rate * _step(how.velocity, before, path), path.shape).copy(),
-                destination=self._destination(how.destination, path, who), walls=self.walls,
-            )  # fmt: skip
+                destination=self._destination(how.destination, path, who),
+                walls=self.walls,
+            )
             found.append(sequence)
         return collate(found)
 

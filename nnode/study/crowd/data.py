@@ -20,9 +20,13 @@ from nnode.errors import ConfigError
 RECORDING, WALLS = "bi_corr_400_b_03", {"*": [0.0, 4.0]}
 #: Two-way flows of other widths and densities: corridors of 3.0 and 3.6 m.
 OTHERS = (
-    "bo-360-050-050", "bo-360-090-090", "boa-300-065-105", "bot-300-075-075", "bot-300-100-100",
+    "bo-360-050-050",
+    "bo-360-090-090",
+    "boa-300-065-105",
+    "bot-300-075-075",
+    "bot-300-100-100",
     "bot-360-160-160",
-)  # fmt: skip
+)
 OTHER_WALLS = {"*-300-*": [0.0, 3.0], "*-360-*": [0.0, 3.6]}
 #: Part of the other corridors that is looked at, m along the walking axis.
 VIEW = [-4.0, 4.0]
@@ -70,9 +74,15 @@ def corridor(others: bool, **more: Any) -> JuelichOptions:
     if not others:
         return JuelichOptions(recording=RECORDING, walls=WALLS, **more)
     return JuelichOptions(
-        name="hermes", recording=list(OTHERS), frame_rate=16.0, unit="cm", walking_axis="y",
-        walls=OTHER_WALLS, view=VIEW, **more,
-    )  # fmt: skip
+        name="hermes",
+        recording=list(OTHERS),
+        frame_rate=16.0,
+        unit="cm",
+        walking_axis="y",
+        walls=OTHER_WALLS,
+        view=VIEW,
+        **more,
+    )
 
 
 @lru_cache(maxsize=8)

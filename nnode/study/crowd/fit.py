@@ -71,9 +71,15 @@ class Fitted:
 
 
 def calibrate(
-    model: str, batch: Batch, start: np.ndarray, *, people: bool = True, grow: bool = True,
-    weights: np.ndarray | None = None, steps: int = 30,
-) -> Fitted:  # fmt: skip
+    model: str,
+    batch: Batch,
+    start: np.ndarray,
+    *,
+    people: bool = True,
+    grow: bool = True,
+    weights: np.ndarray | None = None,
+    steps: int = 30,
+) -> Fitted:
     """Damped least squares within the model's bounds.
 
     Args:

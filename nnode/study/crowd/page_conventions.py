@@ -31,9 +31,18 @@ def scans(study: Crowd) -> pd.DataFrame:
             found["offsets"], found["printed"], found["people"], strict=True
         ):
             rows.append(
-                (how.velocity, how.samples, how.destination, offset, cost, people,
-                 found["printed"][0], found["relaxation"], found["sf"])
-            )  # fmt: skip
+                (
+                    how.velocity,
+                    how.samples,
+                    how.destination,
+                    offset,
+                    cost,
+                    people,
+                    found["printed"][0],
+                    found["relaxation"],
+                    found["sf"],
+                )
+            )
     columns = [*_LEVELS, "offset", "printed", "people", "first", "relaxation", "sf"]
     return pd.DataFrame(rows, columns=columns).set_index([*_LEVELS, "offset"])
 
@@ -146,9 +155,11 @@ def _networks(study: Crowd) -> pd.DataFrame:
             found = [value["J"] for name, value in study.found.items() if name.startswith(prefix)]
             scan = study.found[key(how)]
             rows[(*vars(how).values(), label)] = {
-                "NN, least": min(found), "NN, greatest": max(found), "SF calibrated": scan["sf"],
+                "NN, least": min(found),
+                "NN, greatest": max(found),
+                "SF calibrated": scan["sf"],
                 "relaxation alone": scan["relaxation"],
-            }  # fmt: skip
+            }
     return pd.DataFrame(rows).T.rename_axis([*_LEVELS, "sum over"])
 
 

@@ -186,9 +186,11 @@ class Crowd:
                 label: value
                 for i, name in enumerate(NAMES)
                 for label, value in (
-                    (name, row[i]), (f"{name}, low", ends[0, i]), (f"{name}, high", ends[1, i]),
+                    (name, row[i]),
+                    (f"{name}, low", ends[0, i]),
+                    (f"{name}, high", ends[1, i]),
                 )
-            }  # fmt: skip
+            }
         table = pd.DataFrame(rows).T
         order = [f"{name}{end}" for name in NAMES for end in ("", ", low", ", high")]
         return table.reindex(columns=order)

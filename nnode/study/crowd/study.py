@@ -41,12 +41,15 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
     options = _checked(options)
     stores = {
         (kind, horizon): prepare_horizon(
-            options.source, options.download or str(folder / "data" / "raw"), horizon,
-            folder / "data" / f"{kind}-{horizon:g}s", others=kind == "others",
+            options.source,
+            options.download or str(folder / "data" / "raw"),
+            horizon,
+            folder / "data" / f"{kind}-{horizon:g}s",
+            others=kind == "others",
         )
         for horizon in options.horizons
         for kind in ("main", "others")
-    }  # fmt: skip
+    }
     raw = conventions.recording_file(options.source, options.download or str(folder / "data/raw"))
     study = Crowd(options, stores, raw)
     for number in range(len(options.horizons) + 1):
@@ -65,9 +68,14 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
 def _checked(options: CrowdStudyOptions) -> CrowdStudyOptions:
     if options.quick:
         options = replace(
-            options, horizons=options.horizons[:3:2], restarts=1, folds=2, bootstrap=4, steps=1,
+            options,
+            horizons=options.horizons[:3:2],
+            restarts=1,
+            folds=2,
+            bootstrap=4,
+            steps=1,
             cuts=1,
-        )  # fmt: skip
+        )
     for name, least in (("restarts", 1), ("folds", 2), ("bootstrap", 2), ("steps", 1), ("cuts", 1)):
         if getattr(options, name) < least:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {least}")
@@ -132,14 +140,16 @@ def _networks(study: Crowd) -> list[Task]:
             conventions.network,
             {
                 **conventions.arguments(study.raw, one),
-                "model": model, "seed": options.seed + i, "steps": options.steps,
+                "model": model,
+                "seed": options.seed + i,
+                "steps": options.steps,
             },
             cost=_COSTS["nn"],
         )
         for one in to_calibrate(study)
         for model in NETWORKS
         for i in range(max(1, options.restarts // 4))
-    ]  # fmt: skip
+    ]
 
 
 def _fits(study: Crowd, kind: str, scope: str, number: int) -> list[Task]:

@@ -29,9 +29,15 @@ SF_STEPS, REFIT = 30, 4
 
 
 def fit(
-    kind: str, folder: str, scope: str, folds: int, span: list[float], seed: int,
-    start: list[float] | None, steps: int,
-) -> Result:  # fmt: skip
+    kind: str,
+    folder: str,
+    scope: str,
+    folds: int,
+    span: list[float],
+    seed: int,
+    start: list[float] | None,
+    steps: int,
+) -> Result:
     """Calibrate one model from one start, and evaluate it on what was held out.
 
     Args:
@@ -48,9 +54,13 @@ def fit(
     begin = row_of(new_system(model, seed)) if start is None else np.array(start)
     fresh = start is None
     found = calibrate(
-        model, batch, begin, people=kind != "wall", grow=fresh,
+        model,
+        batch,
+        begin,
+        people=kind != "wall",
+        grow=fresh,
         steps=SF_STEPS if kind == "sf" else steps,
-    )  # fmt: skip
+    )
     each = costs(model, found.row, batch)
     return {
         "row": found.row.tolist(),

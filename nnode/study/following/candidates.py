@@ -27,13 +27,15 @@ _REMEMBERING: dict[str, Any] = {
     "constants": {"s0": "2 m", "slowest": "2 m/s", "shortest": "0.1 s", "longest": "5 s"},
     "states": {
         "q": [
-            "s", "(T - q)/tau_m", "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)"
+            "s",
+            "(T - q)/tau_m",
+            "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)",
         ]
     },
     "where": {"net": "gap - length_1"},
     "rate": {"v": "NN(net/20, v/10, dv/2, q)"},
     "source": "acceleration as a network of gap, speed, speed difference and a fading time gap",
-}  # fmt: skip
+}
 
 
 def ballistic(law: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,13 +44,18 @@ def stores(options: FollowingStudyOptions, folder: Path) -> dict[str, Store]:
             path="tgsim",
             files=["*.parquet"],
             columns={
-                "time": "timestamp", "x_follower": "xFollowerReal", "v_follower": "vFollowerReal",
-                "x_leader": "xLeaderReal", "v_leader": "vLeaderReal", "follower": "follower_id",
-                "leader": "leader_id", "run": "run_no",
+                "time": "timestamp",
+                "x_follower": "xFollowerReal",
+                "v_follower": "vFollowerReal",
+                "x_leader": "xLeaderReal",
+                "v_leader": "vLeaderReal",
+                "follower": "follower_id",
+                "leader": "leader_id",
+                "run": "run_no",
             },
             constant={"follower_kind": "HV"},
         ),
-    }  # fmt: skip
+    }
     return {
         name: prepare(
             replace(one, source=options.source, faults=Faults.drop), folder / "data" / name

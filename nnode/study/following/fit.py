@@ -35,9 +35,12 @@ def costs_of(candidate: Candidate, batch: Batch, objective: str = "spacing") -> 
 
 
 def calibrated(
-    candidate: Candidate, cost: ResidualProblem, restarts: int, seed: int,
+    candidate: Candidate,
+    cost: ResidualProblem,
+    restarts: int,
+    seed: int,
     weights: np.ndarray | None = None,
-) -> tuple[Minimum, list[float]]:  # fmt: skip
+) -> tuple[Minimum, list[float]]:
     """The best of several starts, and the costs of all, penalty included."""
     fits = [
         pooled(cost, row, weights, penalty=decay(cost), steps=STEPS, tolerance=TOLERANCE)

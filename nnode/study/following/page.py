@@ -139,9 +139,11 @@ def _cross_validated(study: Study) -> list[Block]:
         "test, pairs resampled": _rows(study.test_against(n) for n in order),
     }
     objectives = pd.DataFrame(
-        {n: {o: float(study.heldout(n, o).mean()) for o in study.one("cv", n)["heldout"]}
-         for n in order}
-    ).T  # fmt: skip
+        {
+            n: {o: float(study.heldout(n, o).mean()) for o in study.one("cv", n)["heldout"]}
+            for n in order
+        }
+    ).T
     objectives.index.name = "candidate"
     objectives.columns = pd.Index(_WITH_UNITS[o] for o in objectives.columns)
     return [

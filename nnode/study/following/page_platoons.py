@@ -45,8 +45,9 @@ def platoon_blocks(study: Study) -> list[Block]:
     each = [found[n]["heldout"][i] for i, n in enumerate(own)]
     rows["chosen by follower"] = {
         "fold": float(np.mean([found[n]["chosen"][i] for i, n in enumerate(own)])),
-        "last 30 %": float(np.mean(each)), **dict(zip(makes, each, strict=True)),
-    }  # fmt: skip
+        "last 30 %": float(np.mean(each)),
+        **dict(zip(makes, each, strict=True)),
+    }
     rows["ovm, printed"] = {
         "last 30 %": float(np.mean(list(printed.PLATOON_ERRORS.values()))),
         **printed.PLATOON_ERRORS,
@@ -153,8 +154,10 @@ def leader_blocks(study: Study) -> list[Block]:
         away = values["CAV"] - values["HV"]
         _, half = leaders.jackknifed(away, out["CAV"] - out["HV"])
         rows[name] = row | {
-            "CAV minus HV": away[i], "from": away[i] - half[i], "to": away[i] + half[i]
-        }  # fmt: skip
+            "CAV minus HV": away[i],
+            "from": away[i] - half[i],
+            "to": away[i] + half[i],
+        }
     table = pd.DataFrame(rows).T
     table.index.name = "parameter"
     sure = [n for n in names if float(table.loc[n, "from"]) * float(table.loc[n, "to"]) > 0]
@@ -167,8 +170,10 @@ def leader_blocks(study: Study) -> list[Block]:
             judged[(f"behind {k}", f"calibrated on {source}")] = {
                 "pairs": int(on.sum()),
                 "held out (m)": held[source][on].mean(),
-                "minus both": away.difference, "from": away.low, "to": away.high,
-            }  # fmt: skip
+                "minus both": away.difference,
+                "from": away.low,
+                "to": away.high,
+            }
     costs = pd.DataFrame(judged).T
     costs.index.names = ["pairs", ""]
     speed, gap = np.array(one["speed"]), np.array(one["gap"])

@@ -14,10 +14,22 @@ from nnode.study.statistics import paired
 
 #: Units of parameters, by name.
 UNITS = {
-    "v0": "m/s", "T": "s", "s0": "m", "a": "m/s²", "b": "m/s²", "b_1": "m/s²", "kappa": "1/s",
-    "lam": "1/s", "s_c": "m", "w": "m", "c_s": "1/s²", "c_v": "1/s", "d": "m", "tau_m": "s",
+    "v0": "m/s",
+    "T": "s",
+    "s0": "m",
+    "a": "m/s²",
+    "b": "m/s²",
+    "b_1": "m/s²",
+    "kappa": "1/s",
+    "lam": "1/s",
+    "s_c": "m",
+    "w": "m",
+    "c_s": "1/s²",
+    "c_v": "1/s",
+    "d": "m",
+    "tau_m": "s",
     "tau_v": "s",
-}  # fmt: skip
+}
 #: A correlation from here on is strong.
 STRONG = 0.9
 
@@ -45,9 +57,11 @@ def _objectives(study: Study) -> list[Block]:
         table.index.name = "minimised"
         numbers = pd.DataFrame({o: one[o]["parameters"] for o in OBJECTIVES}).T
         weights = [c for c in numbers.columns if c.startswith("n") and c[1:2].isdigit()]
-        numbers = numbers.drop(columns=weights)[list(numbers.columns[:8])] if not weights else (
-            numbers.drop(columns=weights)
-        )  # fmt: skip
+        numbers = (
+            numbers.drop(columns=weights)[list(numbers.columns[:8])]
+            if not weights
+            else (numbers.drop(columns=weights))
+        )
         both = pd.concat([table, numbers], axis=1)
         both["at a limit"] = [", ".join(one[o]["limits"]) for o in OBJECTIVES]
         both.index.name = "minimised"
@@ -99,16 +113,14 @@ def _precision(study: Study, name: str) -> list[Block]:
     text = (
         f"*{name}*: intervals from how gradients differ between clusters (CR2). "
         + (f"Strongly correlated: {', '.join(pairs)}. " if pairs else "")
-        + (
-            f"The strongest correlation is {strongest:.2f}. " if not pairs else ""
-        )
+        + (f"The strongest correlation is {strongest:.2f}. " if not pairs else "")
         + (
             "Weakly identified, as the error's rise is within what clusters vary on a side of the "
             f"profile: {', '.join(open_)}."
             if open_
             else "Every profile closes on both sides."
         )
-    )  # fmt: skip
+    )
     units = {n: UNITS.get(n, "1") for n in names}
     blocks: list[Block] = [
         Text(text),
@@ -153,10 +165,13 @@ def _drivers(study: Study) -> list[Block]:
     for name, values in costs.items():
         away = paired(values, costs["pooled"], group, study.options.seed)
         rows[name] = {
-            "second half (m)": values.mean(), "median (m)": np.median(values),
-            "minus pooled": away.difference, "from": away.low, "to": away.high,
+            "second half (m)": values.mean(),
+            "median (m)": np.median(values),
+            "minus pooled": away.difference,
+            "from": away.low,
+            "to": away.high,
             "better": away.better,
-        }  # fmt: skip
+        }
     table = pd.DataFrame(rows).T
     table.index.name = "calibrated"
     centre, spread = np.array(one["centre"]), np.array(one["spread"])

@@ -27,10 +27,8 @@ def stability_blocks(study: Study) -> list[Block]:
     """Equilibrium, string stability, amplification."""
     length = float(np.mean([pair.length[1] for pair in study.pairs() if pair.length is not None]))
     systems = {
-        name: study.system(name)
-        for name in study.names
-        if not name.startswith(stability.MAPS)
-    }  # fmt: skip
+        name: study.system(name) for name in study.names if not name.startswith(stability.MAPS)
+    }
     shown = [n for n in dict.fromkeys((*FIGURED, study.best)) if n in systems]
     return [
         Heading("Equilibria"),
@@ -108,9 +106,10 @@ def _stability(systems: dict[str, System], shown: list[str], length: float) -> l
     table = pd.DataFrame(rows).T.reindex(columns=columns)
     table.index.name = "candidate"
     unstable = [
-        n for n in table.index
+        n
+        for n in table.index
         if float(np.nanmax(table.loc[n, [c for c in columns if "most" in c]].astype(float))) > 1.001
-    ]  # fmt: skip
+    ]
     text = (
         "With the slopes of the acceleration f(s, v, Δv) at equilibrium, Δv = v − v of the leader, "
         "a platoon is string stable where f_v²/2 + f_v f_Δv − f_s ≥ 0 (Treiber & Kesting 2013, "

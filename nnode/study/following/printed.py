@@ -49,10 +49,15 @@ PARAMETERS: dict[str, dict[str, tuple[float, float, float]]] = {
 BOUNDS: dict[str, dict[str, tuple[float, float]]] = {
     "idm": {"v0": (15, 35), "T": (1.2, 3), "a": (1, 2.5), "b": (1.5, 3), "s0": (1.5, 5)},
     "gipps": {
-        "a": (1, 2.5), "v0": (15, 35), "T": (0.5, 2), "b": (1.5, 4), "b_1": (2, 4), "s0": (1.5, 4)
+        "a": (1, 2.5),
+        "v0": (15, 35),
+        "T": (0.5, 2),
+        "b": (1.5, 4),
+        "b_1": (2, 4),
+        "s0": (1.5, 4),
     },
     "ovm": {"kappa": (0.4, 2), "v0": (15, 35), "s_c": (15, 30), "w": (5, 20)},
-}  # fmt: skip
+}
 
 #: Their search by SciPy's differential evolution.
 EVOLUTION = {"popsize": 15, "maxiter": 60, "seed": 42}
@@ -65,23 +70,36 @@ PLATOON, FIRST = "040719_platoon7", 0.7
 
 #: By make: root mean square error of the gap on the rest, m, of an optimal-velocity model.
 PLATOON_ERRORS = {
-    "BMW X5": 2.2122, "Tesla Model3": 3.2729, "Mercedes AClass": 3.4002, "Audi A6": 4.0596,
-}  # fmt: skip
+    "BMW X5": 2.2122,
+    "Tesla Model3": 3.2729,
+    "Mercedes AClass": 3.4002,
+    "Audi A6": 4.0596,
+}
 
 #: By make: its parameters; SI units.
 PLATOON_PARAMETERS: dict[str, dict[str, float]] = {
     "BMW X5": {"kappa": 0.19394558, "v0": 35.09938675, "s_c": 19.07667874, "w": 14.21680789},
     "Tesla Model3": {"kappa": 0.34005405, "v0": 46.16538876, "s_c": 24.19703895, "w": 20.07872137},
     "Mercedes AClass": {
-        "kappa": 0.28962431, "v0": 37.48658431, "s_c": 14.57924904, "w": 27.35283726
+        "kappa": 0.28962431,
+        "v0": 37.48658431,
+        "s_c": 14.57924904,
+        "w": 27.35283726,
     },
     "Audi A6": {"kappa": 0.23499602, "v0": 35.08985883, "s_c": 14.45415175, "w": 25.67332852},
-}  # fmt: skip
+}
 
 _UNITS = {
-    "v0": "m/s", "T": "s", "s0": "m", "a": "m/s²", "b": "m/s²", "b_1": "m/s²", "kappa": "1/s",
-    "s_c": "m", "w": "m",
-}  # fmt: skip
+    "v0": "m/s",
+    "T": "s",
+    "s0": "m",
+    "a": "m/s²",
+    "b": "m/s²",
+    "b_1": "m/s²",
+    "kappa": "1/s",
+    "s_c": "m",
+    "w": "m",
+}
 
 
 def clipped(

@@ -49,9 +49,14 @@ def acceleration(
     assert law is not None
     gap, v, dv = np.broadcast_arrays(gap, v, dv)
     values = {
-        "gap": gap + length, "v": v, "dv": dv, "v_1": v - dv, "dx_1": v - dv,
-        "length_1": np.full(gap.shape, length), "dt": np.full(gap.shape, 0.1),
-    }  # fmt: skip
+        "gap": gap + length,
+        "v": v,
+        "dv": dv,
+        "v_1": v - dv,
+        "dx_1": v - dv,
+        "length_1": np.full(gap.shape, length),
+        "dt": np.full(gap.shape, 0.1),
+    }
     known = {name: torch.tensor(np.array(x, dtype=float)) for name, x in values.items()}
     # a remembered time gap has faded to the common one where driving is even
     for state in law.dynamics().starts:
@@ -125,9 +130,16 @@ def lateness(system: System) -> dict[str, float]:
 
 
 def platoon(
-    system: System, v: float, gap: float, length: float, frequency: float, *,
-    followers: int = 10, amplitude: float = 0.05, periods: int = 40,
-) -> np.ndarray:  # fmt: skip
+    system: System,
+    v: float,
+    gap: float,
+    length: float,
+    frequency: float,
+    *,
+    followers: int = 10,
+    amplitude: float = 0.05,
+    periods: int = 40,
+) -> np.ndarray:
     """``(followers + 1,)`` amplitudes of speed, m/s, leader first, behind a leader whose speed
     swings around v: the last quarter of a simulation, when all swing evenly.
 
@@ -142,9 +154,13 @@ def platoon(
     speed = np.full_like(x, v)
     speed[:, -1] += amplitude * np.sin(frequency * time)
     sequence = Sequence(
-        name="platoon", recording="platoon", time=time, x=x[..., None], v=speed[..., None],
+        name="platoon",
+        recording="platoon",
+        time=time,
+        x=x[..., None],
+        v=speed[..., None],
         length=np.full(followers + 1, length),
-    )  # fmt: skip
+    )
     found = FusedSolver()(system, collate([sequence]))
     assert found.v is not None
     last = slice(3 * len(time) // 4, None)

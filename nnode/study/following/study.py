@@ -92,14 +92,17 @@ def after(study: Study) -> list[Task]:
             "halves",
             inference.halves,
             {
-                "folder": pairs, "name": REFERENCE, "row": rows[REFERENCE],
-                "folds": options.folds, **search,
+                "folder": pairs,
+                "name": REFERENCE,
+                "row": rows[REFERENCE],
+                "folds": options.folds,
+                **search,
             },
             cost=8.0,
         ),
         Task("leaders", leaders.by_leader, {"folder": leaders_, "name": REFERENCE, **search}, 6.0),
         Task("runs", platoons.every_run, {"folder": platoons_, "name": REFERENCE, **search}, 8.0),
-    ]  # fmt: skip
+    ]
     for name in study.names:
         where = {"folder": pairs, "name": name}
         tasks.append(Task(f"test-{key(name)}", fit.tested, {**where, "row": rows[name]}))

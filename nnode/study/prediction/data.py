@@ -17,19 +17,28 @@ STEP, SEEN, AHEAD = 0.4, 8, 12
 def events(source: str) -> PairOptions:
     """People who follow automated cars, with the published division."""
     return PairOptions(
-        name="waymo_pairs", source=source, path="waymo_pairs", files=["*.parquet"],
+        name="waymo_pairs",
+        source=source,
+        path="waymo_pairs",
+        files=["*.parquet"],
         columns={"time": "t", "run": "split", "pair": "event"},
-    )  # fmt: skip
+    )
 
 
 def scene(name: str, source: str) -> WalkwayOptions:
     """A scene in windows of what is predicted; everybody was seen before, on average as fast as
     his ``preferred`` velocity says."""
     return WalkwayOptions(
-        name=name, source=source, path=f"eth_ucy/{name}.parquet",
-        columns={"agent": "id", "time": "frame"}, time_unit="frame", frame_rate=1 / STEP,
-        t_seq=AHEAD * STEP, history=(SEEN - 1) * STEP, velocity=Velocity.backward,
-    )  # fmt: skip
+        name=name,
+        source=source,
+        path=f"eth_ucy/{name}.parquet",
+        columns={"agent": "id", "time": "frame"},
+        time_unit="frame",
+        frame_rate=1 / STEP,
+        t_seq=AHEAD * STEP,
+        history=(SEEN - 1) * STEP,
+        velocity=Velocity.backward,
+    )
 
 
 def stores(source: str, folder: Path) -> dict[str, Store]:

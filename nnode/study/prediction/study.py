@@ -55,26 +55,36 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
     folders = [str(found_stores[name].folder) for name in SCENES]
     every = [
         Task(
-            f"follow-{law}", tasks.follow,
-            {"law": law, "folder": str(found_stores["waymo_pairs"].folder),
-             "starts": options.restarts, "seed": options.seed},
+            f"follow-{law}",
+            tasks.follow,
+            {
+                "law": law,
+                "folder": str(found_stores["waymo_pairs"].folder),
+                "starts": options.restarts,
+                "seed": options.seed,
+            },
         )
         for law in laws
-    ]  # fmt: skip
+    ]
     for name in held:
         where = {"folders": folders, "held": [name]}
         every.append(Task(f"simple-{name}", walking.baselines, where))
         every += [
             Task(
-                f"{law}-{name}", walking.fit, {"law": law, "desired": "direction", **where},
+                f"{law}-{name}",
+                walking.fit,
+                {"law": law, "desired": "direction", **where},
                 cost=10.0,
             )
             for law in people
-        ]  # fmt: skip
+        ]
     found = run_tasks(
-        every, folder, workers=options.workers, fingerprint=hash_of(found_stores),
+        every,
+        folder,
+        workers=options.workers,
+        fingerprint=hash_of(found_stores),
         title="prediction study",
-    )  # fmt: skip
+    )
     return [*_following(found, laws, options.seed), *_walking(found, people, held)]
 
 
@@ -87,9 +97,12 @@ def _following(found: dict[str, Any], laws: tuple[str, ...], seed: int) -> list[
         low, high = np.quantile([tasks.rmspe(sums["test"], w) for w in weights], [0.025, 0.975])
         row = ", ".join(f"{name} = {value:.3g}" for name, value in sums["row"].items())
         rows[law] = {
-            "training": tasks.rmspe(sums["train"]), "test": tasks.rmspe(sums["test"]),
-            "low": low, "high": high, "parameters": row,
-        }  # fmt: skip
+            "training": tasks.rmspe(sums["train"]),
+            "test": tasks.rmspe(sums["test"]),
+            "low": low,
+            "high": high,
+            "parameters": row,
+        }
     own = pd.DataFrame(rows).T
     best = min(laws, key=lambda law: float(rows[law]["training"]))
     test = float(rows["idm"]["test"])
@@ -107,13 +120,14 @@ def _following(found: dict[str, Any], laws: tuple[str, ...], seed: int) -> list[
             f"the least training error; its test error is {float(rows[best]['test']):.4f}."
         ),
         TableBlock(
-            "following", table,
+            "following",
+            table,
             "Root mean square percentage error of spacings over all samples. Calibrated on the 71 "
             "training events by the same metric, tested on the 18 others; the interval of 95 % "
             "resamples test events. The learned model was chosen on the test events.",
             digits={"training": 4, "test": 4, "low": 4, "high": 4},
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _walking(found: dict[str, Any], people: list[str], held: tuple[str, ...]) -> list[Block]:
@@ -157,11 +171,17 @@ def _walking(found: dict[str, Any], people: list[str], held: tuple[str, ...]) ->
             "Only people who are there throughout push others."
         ),
         TableBlock(
-            "ade", tables["ade"], "Mean distance (m) between prediction and measurement.",
-            bold=tables["ade"].eq(tables["ade"].iloc[:-1].min()), digits=3,
+            "ade",
+            tables["ade"],
+            "Mean distance (m) between prediction and measurement.",
+            bold=tables["ade"].eq(tables["ade"].iloc[:-1].min()),
+            digits=3,
         ),
         TableBlock(
-            "fde", tables["fde"], "Distance (m) at the last sample.",
-            bold=tables["fde"].eq(tables["fde"].iloc[:-1].min()), digits=3,
+            "fde",
+            tables["fde"],
+            "Distance (m) at the last sample.",
+            bold=tables["fde"].eq(tables["fde"].iloc[:-1].min()),
+            digits=3,
         ),
-    ]  # fmt: skip
+    ]

@@ -108,8 +108,10 @@ def _steps(study: Study) -> list[Block]:
     rows = {}
     for model in ORDER:
         found = [study.one("fit", n, model) for n in names]
-        own = {h: float(np.median([one["steps"][f"{h:g}"] / one["cost"] for one in found])) - 1
-               for h in steps}  # fmt: skip
+        own = {
+            h: float(np.median([one["steps"][f"{h:g}"] / one["cost"] for one in found])) - 1
+            for h in steps
+        }
         rows[model] = {f"{h:g} s": 100 * own[h] for h in sorted(steps, reverse=True)}
     table = pd.DataFrame(rows).T.rename_axis("model")
     return [

@@ -27,7 +27,7 @@ from nnode.study.traffic.results import (
     least,
     printed_costs,
     printed_lengths,
-)  # fmt: skip
+)
 
 #: Models in the player, and how many sequences of each recording.
 SHOWN, FEW = ("lin", "n2"), 4

@@ -4,8 +4,17 @@ from __future__ import annotations
 
 #: The recordings of ESIMAS in the paper's numbering, 1 to 10.
 RECORDINGS = (
-    "1-1_1", "1-1_2", "2-1_1", "2-1_2", "3-1_1", "3-1_2", "4-1_1", "4-1_2", "5-1_1", "5-1_2",
-)  # fmt: skip
+    "1-1_1",
+    "1-1_2",
+    "2-1_1",
+    "2-1_2",
+    "3-1_1",
+    "3-1_2",
+    "4-1_1",
+    "4-1_2",
+    "5-1_1",
+    "5-1_2",
+)
 
 #: Table (length): identified car lengths L, m.
 LENGTHS = {

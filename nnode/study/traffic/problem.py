@@ -135,18 +135,24 @@ class Problem:
         coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
         low, high = coarse.low, coarse.high
         found = minimise(
-            lambda r: coarse(r, weights), starts.repeat(number, 1), low, high,
+            lambda r: coarse(r, weights),
+            starts.repeat(number, 1),
+            low,
+            high,
             iterations=iterations,
-        )  # fmt: skip
+        )
         each = fine.costs(found.rows)
         judged = torch.where(weights > 0, each * weights, 0.0).sum(1).reshape(number, -1)
         few = min(FOLLOWED // 2, len(starts))
         best = judged.argsort(1)[:, :few] + len(starts) * torch.arange(number)[:, None]
         chosen = best.flatten()
         near = minimise(
-            lambda r: fine(r, weights[chosen]), found.rows[chosen], low, high,
+            lambda r: fine(r, weights[chosen]),
+            found.rows[chosen],
+            low,
+            high,
             iterations=iterations // 2,
-        )  # fmt: skip
+        )
         last = near.costs.reshape(number, few).argmin(1) + few * torch.arange(number)
         return near.rows[last]
 

@@ -48,9 +48,15 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
     _check(options)
     if options.quick:
         options = replace(
-            options, restarts=4, iterations=30, folds=2, bootstrap=10, descent_steps=30,
-            particles=10, consensus_steps=10,
-        )  # fmt: skip
+            options,
+            restarts=4,
+            iterations=30,
+            folds=2,
+            bootstrap=10,
+            descent_steps=30,
+            particles=10,
+            consensus_steps=10,
+        )
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
     assert options.workers is not None
     how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(stores)}
@@ -65,9 +71,15 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
 
 def _check(options: TrafficStudyOptions) -> None:
     least = {
-        "restarts": 1, "iterations": 3, "bootstrap": 2, "folds": 2, "descent_steps": 1,
-        "batch_size": 0, "particles": 2, "consensus_steps": 1,
-    }  # fmt: skip
+        "restarts": 1,
+        "iterations": 3,
+        "bootstrap": 2,
+        "folds": 2,
+        "descent_steps": 1,
+        "batch_size": 0,
+        "particles": 2,
+        "consensus_steps": 1,
+    }
     for name, low in least.items():
         if getattr(options, name) < low:
             raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {low}")
@@ -136,9 +148,14 @@ def _tasks(options: TrafficStudyOptions, stores: dict[str, Store]) -> Iterator[T
 
 
 def _of_model(
-    options: TrafficStudyOptions, policy: str, folder: str, name: str, model: str, size: int,
+    options: TrafficStudyOptions,
+    policy: str,
+    folder: str,
+    name: str,
+    model: str,
+    size: int,
     share: float,
-) -> Iterator[Task]:  # fmt: skip
+) -> Iterator[Task]:
     where = {"folder": folder, "recording_name": name, "model": model, "dt": options.dt}
     where["seed"] = options.seed
     time = _TIMES[model] * size

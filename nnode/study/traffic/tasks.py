@@ -24,9 +24,17 @@ Result = dict[str, Any]
 
 
 def fit(
-    folder: str, recording_name: str, model: str, box: float | None, restarts: int, dt: float,
-    iterations: int, bootstrap: int, steps: list[float], seed: int,
-) -> Result:  # fmt: skip
+    folder: str,
+    recording_name: str,
+    model: str,
+    box: float | None,
+    restarts: int,
+    dt: float,
+    iterations: int,
+    bootstrap: int,
+    steps: list[float],
+    seed: int,
+) -> Result:
     """Calibrate from many starts; costs by sequence, intervals, sensitivity to the step.
 
     Args:
@@ -81,9 +89,13 @@ def _bootstrap(
     step = COARSE if abs(costs[0] / costs[1] - 1) < 0.02 else dt
     cost = problem.cost(step, torch.float32)
     refits = minimise(
-        lambda rows: cost(rows, weights), row.expand(len(weights), -1), cost.low, cost.high,
-        iterations=iterations, inverse=inverse,
-    )  # fmt: skip
+        lambda rows: cost(rows, weights),
+        row.expand(len(weights), -1),
+        cost.low,
+        cost.high,
+        iterations=iterations,
+        inverse=inverse,
+    )
     rows = refits.rows[torch.isfinite(refits.costs)]
     vector = ParameterVector(problem.system())
     curves = [speeds(vector.fill_(one)) for one in rows]
@@ -100,9 +112,16 @@ def _bootstrap(
 
 
 def cross_validate(
-    folder: str, recording_name: str, model: str, box: float | None, folds: int,
-    restarts: int, dt: float, iterations: int, seed: int,
-) -> Result:  # fmt: skip
+    folder: str,
+    recording_name: str,
+    model: str,
+    box: float | None,
+    folds: int,
+    restarts: int,
+    dt: float,
+    iterations: int,
+    seed: int,
+) -> Result:
     """Cost of every sequence under a model that was calibrated without its group.
 
     Fewer groups than ``folds`` make as many folds as groups; a single group has none.
@@ -150,9 +169,17 @@ def _simple(
 
 
 def descend(
-    folder: str, recording_name: str, model: str, restarts: int, steps: int, dt: float,
-    updates_dt: float, lr: float, batch_size: int, seed: int,
-) -> Result:  # fmt: skip
+    folder: str,
+    recording_name: str,
+    model: str,
+    restarts: int,
+    steps: int,
+    dt: float,
+    updates_dt: float,
+    lr: float,
+    batch_size: int,
+    seed: int,
+) -> Result:
     """The paper's optimiser, noisy ADADELTA with projection, several runs side by side.
 
     Args:

@@ -29,9 +29,14 @@ def prepare_runs(
     are left out by :func:`sequences`.
     """
     options = corridor(
-        kind != "main", source=source, download=download, t_seq=horizon, history=HISTORY,
-        velocity=Velocity.backward, min_agents=2,
-    )  # fmt: skip
+        kind != "main",
+        source=source,
+        download=download,
+        t_seq=horizon,
+        history=HISTORY,
+        velocity=Velocity.backward,
+        min_agents=2,
+    )
     return prepare(options, folder)
 
 

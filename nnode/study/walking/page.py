@@ -74,11 +74,13 @@ def blocks(study: Walking) -> list[Block]:
             "change the signs of whole runs: no p is smaller than two of that many signs allow."
         ),
         TableBlock(
-            "walking_parameters", every.head(8),
+            "walking_parameters",
+            every.head(8),
             "Every calibration; the first rows are shown, the CSV holds all of them.",
-            digits=3, full=every,
+            digits=3,
+            full=every,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _models(desired: str) -> list[str]:
@@ -110,17 +112,23 @@ def _wish(study: Walking, desired: str) -> list[Block]:
         Heading(f"Where people want to go: {desired}"),
         Text(f"Everybody knows {WISHES[desired]}."),
         TableBlock(
-            f"walking_{desired}", mean,
+            f"walking_{desired}",
+            mean,
             "Mean squared distance (m²) between predicted and measured places of people in runs "
             "that were held out, over all samples of a sequence, by its length.",
-            bold=mean.eq(mean.min()), digits=3,
+            bold=mean.eq(mean.min()),
+            digits=3,
         ),
         TableBlock(
-            f"walking_{desired}_end", end, "The same at the end of the sequences (m²).",
-            bold=end.eq(end.min()), digits=3,
+            f"walking_{desired}_end",
+            end,
+            "The same at the end of the sequences (m²).",
+            bold=end.eq(end.min()),
+            digits=3,
         ),
         TableBlock(
-            f"walking_{desired}_differences", table,
+            f"walking_{desired}_differences",
+            table,
             "Difference (m²) from no interaction: below 0 the law predicts better. 95 % intervals "
             "over runs; p from random signs of whole runs, not corrected for the number of rows.",
             digits={"horizon (s)": 0, "difference": 4, "low": 4, "high": 4, "p": 3},
@@ -132,7 +140,7 @@ def _wish(study: Walking, desired: str) -> list[Block]:
             "the difference over runs.",
             alt="Relative error by horizon, one line per law",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _figure(

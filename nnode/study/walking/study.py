@@ -51,11 +51,14 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
     for horizon in options.horizons:
         stores = {
             f"{kind}-{horizon:g}s": prepare_runs(
-                kind, options.source, options.download or str(folder / "data" / "raw"), horizon,
+                kind,
+                options.source,
+                options.download or str(folder / "data" / "raw"),
+                horizon,
                 folder / "data" / f"{kind}-{horizon:g}s",
             )
             for kind in RUNS
-        }  # fmt: skip
+        }
         found |= run_tasks(
             _tasks(options, horizon, [str(store.folder) for store in stores.values()]),
             folder,
@@ -97,12 +100,14 @@ def _tasks(options: WalkingStudyOptions, horizon: float, folders: list[str]) -> 
         every.append(Task(f"simple-{horizon:g}s-{i}", tasks.baselines, where))
         every += [
             Task(
-                f"{law}-{desired}-{horizon:g}s-{i}", tasks.fit,
-                {"law": law, "desired": desired, **where}, cost=_COSTS[law],
+                f"{law}-{desired}-{horizon:g}s-{i}",
+                tasks.fit,
+                {"law": law, "desired": desired, **where},
+                cost=_COSTS[law],
             )
             for law in LAWS
             for desired in DESIRED
-        ]  # fmt: skip
+        ]
     return every
 
 

@@ -123,7 +123,7 @@ WRONG = [
     ("train -m seed=1,2 hydra.sweep.dir=$T/head.csv", "error: .*cannot be used as a folder", 1),
     ("train hydra.run.dir=/proc/none", "error: the folder /proc/none cannot be made", 1),
     ("train -m seed=1,2 hydra.sweep.dir=/proc/none", "/proc/none cannot be made: .*sweep.dir=", 1),
-]  # fmt: skip
+]
 
 
 @pytest.fixture(scope="module")

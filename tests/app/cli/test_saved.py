@@ -29,8 +29,11 @@ def checkpoint(folder: Path, **groups: object) -> Path:
     path.parent.mkdir(exist_ok=True)
     made = Checkpoint(
         config={"model": {}, "data": {}, "groups": groups},
-        manifest={}, model={"terms.0.v0": torch.ones(())}, optimizer={}, progress={},
-    )  # fmt: skip
+        manifest={},
+        model={"terms.0.v0": torch.ones(())},
+        optimizer={},
+        progress={},
+    )
     save_checkpoint(made, path)
     return path
 
@@ -48,11 +51,26 @@ def test_groups_are_files_of_the_configuration(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        UP, f"../solver/{UP}", "./fused", "fused/", "fused.yaml", "../solver/fused", "/etc/passwd",
-        "fused@hydra", "fused,torchdiffeq", "fused_schema", "none", "", "null", None, 3,
-        ["fused"], {"fused": 1}, "fused\n",
+        UP,
+        f"../solver/{UP}",
+        "./fused",
+        "fused/",
+        "fused.yaml",
+        "../solver/fused",
+        "/etc/passwd",
+        "fused@hydra",
+        "fused,torchdiffeq",
+        "fused_schema",
+        "none",
+        "",
+        "null",
+        None,
+        3,
+        ["fused"],
+        {"fused": 1},
+        "fused\n",
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("group", GROUPS)
 def test_any_other_name_is_refused(tmp_path: Path, group: str, name: object) -> None:
     (tmp_path / "theirs.yaml").write_text("hydra: {callbacks: {one: {_target_: os.abort}}}\n")
@@ -93,11 +111,12 @@ def test_a_law_stays_as_its_checkpoint_describes_it(monkeypatch: pytest.MonkeyPa
     from today's."""
     config = composed("train", "model=idm")
     monkeypatch.setattr(
-        HydraConfig, "get",
+        HydraConfig,
+        "get",
         lambda: SimpleNamespace(
             runtime=SimpleNamespace(choices={"model": "idm"}), overrides=SimpleNamespace(task=[])
         ),
-    )  # fmt: skip
+    )
     saved: dict[str, Any] = {
         "groups": {"model": "idm"},
         "model": OmegaConf.to_container(config.model, resolve=True, enum_to_str=True),

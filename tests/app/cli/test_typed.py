@@ -27,11 +27,34 @@ def _schemas() -> None:
 @pytest.mark.parametrize(
     "value",
     [
-        "runs/a/last.pt", "/tmp/a folder/it's/last.pt", "a,b=[c]/x.pt", "ends with \\", "a\\'b",
-        "", "null", "True", "1e5", "-3", "1_000", "inf", "C:/x", "größe", None, True, False, 3, -2,
-        0.25, 1e-7, 3e20, [], ["e_0", 2, None], {}, {"vehicle": "the id", "a:b, c": [1.5, "x,y"]},
+        "runs/a/last.pt",
+        "/tmp/a folder/it's/last.pt",
+        "a,b=[c]/x.pt",
+        "ends with \\",
+        "a\\'b",
+        "",
+        "null",
+        "True",
+        "1e5",
+        "-3",
+        "1_000",
+        "inf",
+        "C:/x",
+        "größe",
+        None,
+        True,
+        False,
+        3,
+        -2,
+        0.25,
+        1e-7,
+        3e20,
+        [],
+        ["e_0", 2, None],
+        {},
+        {"vehicle": "the id", "a:b, c": [1.5, "x,y"]},
     ],
-)  # fmt: skip
+)
 def test_a_value_is_read_as_it_was(value: Any) -> None:
     (typed,) = shlex.split(shell_override("data.option", value))
     (override,) = OverridesParser.create().parse_overrides([typed])
@@ -70,25 +93,50 @@ def test_only_what_differs_is_told() -> None:
     defaults = {"path": "???", "walls": {"*": [0, 4]}, "split": {"seed": 0, "gap": 5.0}, "dt": 0.2}
     values = {"path": "a.xml", "walls": {"b": [0, 3]}, "split": {"seed": 1, "gap": 5.0}, "dt": 0.2}
     assert changes("data", values, defaults) == [
-        "data.path=a.xml", "'data.walls={b: [0, 3]}'", "data.split.seed=1",
-    ]  # fmt: skip
+        "data.path=a.xml",
+        "'data.walls={b: [0, 3]}'",
+        "data.split.seed=1",
+    ]
     assert changes("data", defaults, defaults) == []
 
 
 @pytest.mark.parametrize(
     ("model", "given"),
     [
-        ("lin", ["data=sumo", "data.path='a folder/fcd.xml.gz'", "data.window=null",
-                 "data.lane=[e_0,e_1]", "data.kinds={DEFAULT_VEHTYPE: car}"]),
+        (
+            "lin",
+            [
+                "data=sumo",
+                "data.path='a folder/fcd.xml.gz'",
+                "data.window=null",
+                "data.lane=[e_0,e_1]",
+                "data.kinds={DEFAULT_VEHTYPE: car}",
+            ],
+        ),
         ("lin", ["data=highd", "data.path=01_tracks.csv", "data.lane=2", "data.split.heldout=0.3"]),
-        ("lin", ["data=vehicles", "data.path=cars.csv", "data.position_unit=ft",
-                 "data.columns={vehicle: Vehicle_ID, time: t}"]),
+        (
+            "lin",
+            [
+                "data=vehicles",
+                "data.path=cars.csv",
+                "data.position_unit=ft",
+                "data.columns={vehicle: Vehicle_ID, time: t}",
+            ],
+        ),
         ("sf", ["data=table", "data.path=walk.csv", "data.domain=crowd", "data.walls=w.csv"]),
         ("sf", ["data=jupedsim", "data.path=run.sqlite", "data.t_seq=2", "data.velocity=central"]),
-        ("sf", ["data=pedpy", r"data.path='it\'s.txt'", "data.geometry=area.wkt", "data.unit=cm",
-                "data.frame_rate=16"]),
+        (
+            "sf",
+            [
+                "data=pedpy",
+                r"data.path='it\'s.txt'",
+                "data.geometry=area.wkt",
+                "data.unit=cm",
+                "data.frame_rate=16",
+            ],
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_printed_training_reads_the_data_of_the_diagnosis(
     monkeypatch: pytest.MonkeyPatch, model: str, given: list[str], tmp_path: Path
 ) -> None:

@@ -59,10 +59,20 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
             marks=pytest.mark.thorough,
         ),
         (
-            {"model": "lin", "optimizer": "adadelta", "solver": "torchdiffeq", "epochs": 2,
-             "dt": 0.05, "effects": ["relative_speed"]},
-            ["model=lin", "solver.dt=0.05", "trainer.max_epochs=2",
-             "model.effects=[relative_speed]"],
+            {
+                "model": "lin",
+                "optimizer": "adadelta",
+                "solver": "torchdiffeq",
+                "epochs": 2,
+                "dt": 0.05,
+                "effects": ["relative_speed"],
+            },
+            [
+                "model=lin",
+                "solver.dt=0.05",
+                "trainer.max_epochs=2",
+                "model.effects=[relative_speed]",
+            ],
         ),
         pytest.param(
             {"model": "ovm", "optimizer": "lbfgs", "cost": "gap", "epochs": 3},
@@ -71,15 +81,20 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
         ),
     ],
     ids=["idm", "shrunk", "lin", "ovm"],
-)  # fmt: skip
+)
 def test_the_command_finds_the_same_to_the_last_digits(
     script: Script, tmp_path: Path, tidy: pd.DataFrame, given: dict[str, Any], options: list[str]
 ) -> None:
     tidy.to_parquet(tmp_path / "table.parquet")
     done = script(
-        "train", *options, "data=table", f"data.path={tmp_path / 'table.parquet'}",
-        "data.domain=traffic", "seed=3", f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
+        "train",
+        *options,
+        "data=table",
+        f"data.path={tmp_path / 'table.parquet'}",
+        "data.domain=traffic",
+        "seed=3",
+        f"hydra.run.dir={tmp_path}",
+    )
     assert done.returncode == 0, done.stderr
     written = json.loads((tmp_path / "result.json").read_text())
     found = nnode.Calibrator(**given, heldout=0.2, seed=3).fit(tidy)
@@ -274,8 +289,10 @@ def test_published_pairs_are_calibrated(
 def test_people_are_calibrated_as_well() -> None:
     rows = [
         (run, 0.2 * k, f"{run}/{i}", (-1) ** i * (0.4 * k * 0.9 - 2.0 + 0.2 * run), 0.6 * i)
-        for run in range(3) for k in range(8) for i in range(3)
-    ]  # fmt: skip
+        for run in range(3)
+        for k in range(8)
+        for i in range(3)
+    ]
     walk = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
     found = nnode.Calibrator("sf", epochs=2).fit(walk)
     assert list(found.parameters_.unit) == ["N", "kg/s²", "kg/(m s)"]

@@ -37,8 +37,11 @@ def test_what_was_named_is_a_table(found: nnode.Report) -> None:
     (name, value), *_ = first.coefficients.items()
     row = rows[(rows.effect == first.name) & (rows.coefficient == name)].iloc[0]
     assert (row.estimate, row.lower, row.upper, row.unit) == (
-        value.value, value.low, value.high, value.unit,
-    )  # fmt: skip
+        value.value,
+        value.low,
+        value.high,
+        value.unit,
+    )
     assert row.named
     assert [effect.name for effect in effects_of(found.model)] == [e.name for e in found.effects]
     assert found.plain()["verdict"] == "named"

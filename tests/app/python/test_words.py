@@ -30,9 +30,11 @@ def test_options_are_arguments(shell: str, python: str) -> None:
 
 def test_what_a_message_names_is_taken() -> None:
     table = pd.concat(
-        [cars(3, 6.0).assign(sequence=k).rename(columns={"veh": "agent", "t": "time"})
-         for k in range(3)]
-    )[["sequence", "time", "agent", "x"]]  # fmt: skip
+        [
+            cars(3, 6.0).assign(sequence=k).rename(columns={"veh": "agent", "t": "time"})
+            for k in range(3)
+        ]
+    )[["sequence", "time", "agent", "x"]]
     broken = table.assign(x=table.x.where(table.time != 3.0, table.x + 300))
     for call in (nnode.fit, nnode.sequences, nnode.Calibrator().fit):
         with pytest.raises(DataError, match=r"faults='keep' keeps faulty ones"):

@@ -143,14 +143,20 @@ def null_rows(number: int, rejected: int, **more: Any) -> pd.DataFrame:
     """Made-up cases with nothing hidden."""
     return pd.DataFrame(
         {
-            "domain": "traffic", "arm": "nothing", "variant": "white", "noise": 0.05,
-            "n_sequences": 20, "clusters_open": 15, "verdict": "none",
+            "domain": "traffic",
+            "arm": "nothing",
+            "variant": "white",
+            "noise": 0.05,
+            "n_sequences": 20,
+            "clusters_open": 15,
+            "verdict": "none",
             "screen_p": [0.01] * rejected + [0.6] * (number - rejected),
             "screen_false": [True] * rejected + [False] * (number - rejected),
-            "false_names": "", **more,
+            "false_names": "",
+            **more,
         },
         index=range(number),
-    )  # fmt: skip
+    )
 
 
 def test_a_gate_is_held_to_5_percent_by_a_one_sided_test():
@@ -177,13 +183,30 @@ def test_other_sizes_have_lines_but_no_criteria_of_their_own():
 def measured(**columns: Any) -> pd.DataFrame:
     """Criteria of made-up cases."""
     given = {
-        "key": "k", "domain": "crowd", "arm": "pair", "variant": "plain", "strength": "medium",
-        "noise": 0.01, "n_sequences": 20, "hidden": "drift+obstacle", "verdict": "named",
-        "exact": False, "class_right": True, "among_equals": False, "found": 2,
-        "false_names": "", "unknown": False, "right": False, "faults_hidden": 0,
-        "faults_located": 0, "faults_false": 0, "closure": None, "overlap": None, "worse": None,
+        "key": "k",
+        "domain": "crowd",
+        "arm": "pair",
+        "variant": "plain",
+        "strength": "medium",
+        "noise": 0.01,
+        "n_sequences": 20,
+        "hidden": "drift+obstacle",
+        "verdict": "named",
+        "exact": False,
+        "class_right": True,
+        "among_equals": False,
+        "found": 2,
+        "false_names": "",
+        "unknown": False,
+        "right": False,
+        "faults_hidden": 0,
+        "faults_located": 0,
+        "faults_false": 0,
+        "closure": None,
+        "overlap": None,
+        "worse": None,
         **columns,
-    }  # fmt: skip
+    }
     rows = pd.DataFrame(given, index=[0])
     return criteria.criteria(rows, tables.coefficients_of([])).set_index("measure")
 
@@ -210,12 +233,30 @@ def test_coefficients_of_crowds_are_held_to_the_same_bound():
     base = measured().reset_index()
     assert "coefficients: median relative error" not in set(base["measure"])
     frame = pd.DataFrame(
-        {"key": ["k"], "domain": "crowd", "arm": "single", "variant": "plain", "strength": "medium",
-         "noise": 0.01, "n_sequences": 20, "hidden": "drift", "verdict": "named", "exact": True,
-         "class_right": True, "among_equals": False, "false_names": "", "unknown": False,
-         "right": True, "faults_hidden": 0, "faults_located": 0, "faults_false": 0,
-         "closure": None, "overlap": None, "worse": None}
-    )  # fmt: skip
+        {
+            "key": ["k"],
+            "domain": "crowd",
+            "arm": "single",
+            "variant": "plain",
+            "strength": "medium",
+            "noise": 0.01,
+            "n_sequences": 20,
+            "hidden": "drift",
+            "verdict": "named",
+            "exact": True,
+            "class_right": True,
+            "among_equals": False,
+            "false_names": "",
+            "unknown": False,
+            "right": True,
+            "faults_hidden": 0,
+            "faults_located": 0,
+            "faults_false": 0,
+            "closure": None,
+            "overlap": None,
+            "worse": None,
+        }
+    )
     found = criteria.criteria(frame, rows).set_index("measure")
     assert not found.loc["coefficients: median relative error", "met"]
 
@@ -240,9 +281,7 @@ def test_the_diagnosis_is_told_what_it_has_to_know_and_no_more(tmp_path):
     assert traffic["leader"] == "constant"
     assert traffic["model"]["term"] in ("lin", "log")
     assert traffic["walls"] is None
-    assert crowd["model"] == {
-        "name": "sf", "term": "social_force", "B": 0.3, "r": 0.25, "tau": 0.5
-    }  # fmt: skip
+    assert crowd["model"] == {"name": "sf", "term": "social_force", "B": 0.3, "r": 0.25, "tau": 0.5}
     assert crowd["walls"].name == "walls.csv"
 
 

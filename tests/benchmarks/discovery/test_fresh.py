@@ -23,9 +23,14 @@ NUMBER = 12
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("case")
     case = Case(
-        domain="traffic", arm="single", effects=("speed_zone",), strength="medium", seed=5,
-        n_sequences=NUMBER + 8, noise=0.05,
-    )  # fmt: skip
+        domain="traffic",
+        arm="single",
+        effects=("speed_zone",),
+        strength="medium",
+        seed=5,
+        n_sequences=NUMBER + 8,
+        noise=0.05,
+    )
     return generate(case, folder), folder / TABLE
 
 

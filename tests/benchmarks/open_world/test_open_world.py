@@ -46,9 +46,16 @@ def test_what_was_reached() -> None:
         row("idm", "idm"),
         row("idm", "idm", nearest_names=["inertia"], nearest_false=["inertia"]),
         row("helly", "fvdm", p=0.4),
-        row("lin", "lin", asked="lin", asked_names=["memory"], asked_false=["memory"],
-            nearest_names=["memory"], nearest_false=["memory"]),
-    ]  # fmt: skip
+        row(
+            "lin",
+            "lin",
+            asked="lin",
+            asked_names=["memory"],
+            asked_false=["memory"],
+            nearest_names=["memory"],
+            nearest_false=["memory"],
+        ),
+    ]
     found = dict(zip(criteria(rows)["what"], criteria(rows)["reached"], strict=True))
     assert found["the true law comes first"].startswith("3 of 4 (75 %")
     assert found["another one comes first, not told from it (p > 0.05)"].startswith("1 of 4")
@@ -91,9 +98,12 @@ def test_what_is_right_to_say() -> None:
 
 def test_the_nearest_law_is_judged_and_the_last_ranking() -> None:
     report: dict[str, Any] = {
-        "laws": {"ranking": [{"name": "gipps"}]}, "laws_again": {"ranking": [{"name": "krauss"}]},
-        "verdict": "unknown", "effects": [], "leads": [],
-    }  # fmt: skip
+        "laws": {"ranking": [{"name": "gipps"}]},
+        "laws_again": {"ranking": [{"name": "krauss"}]},
+        "verdict": "unknown",
+        "effects": [],
+        "leads": [],
+    }
     zone = {"name": "speed_zone", "alternatives": []}
     found = Answer(first=("krauss",), right=("speed_zone",)).judge(
         report, {"verdict": "named", "effects": [zone], "leads": [{"name": "inertia"}]}
@@ -103,8 +113,10 @@ def test_the_nearest_law_is_judged_and_the_last_ranking() -> None:
     assert found["right"]
     assert (found["verdict"], found["asked_verdict"]) == ("named", "unknown")
     assert (found["names"], found["asked_names"], found["leads"]) == (
-        ["speed_zone"], [], ["inertia"],
-    )  # fmt: skip
+        ["speed_zone"],
+        [],
+        ["inertia"],
+    )
 
 
 def test_the_page(tmp_path: Path) -> None:

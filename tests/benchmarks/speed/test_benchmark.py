@@ -250,9 +250,10 @@ def test_tangents_of_eight_parameters_are_timed(tmp_path, monkeypatch, capsys) -
         assert len(list(pose(shape, model, torch.float32).system.parameters())) == 8
     tiny = replace(shape, models=("idm_zone",), sequences=2, agents=3, samples=3)
     monkeypatch.setitem(SHAPES, "tangents", (tiny,))
-    monkeypatch.setattr("benchmarks.speed.run.starts", lambda _: {
-        k: {"cold": 9.0, "warm": 0.5} for k in ("forward", "tangents")
-    })  # fmt: skip
+    monkeypatch.setattr(
+        "benchmarks.speed.run.starts",
+        lambda _: {k: {"cold": 9.0, "warm": 0.5} for k in ("forward", "tangents")},
+    )
     benchmark(options(shapes=["tangents"]), tmp_path)
     (row,) = json.loads((tmp_path / "benchmark.json").read_text())["problems"]
     assert row["difference"] < 1e-9

@@ -125,8 +125,9 @@ def test_a_campaign_replaces_its_own_rows(tmp_path: Path) -> None:
     keep(tmp_path, "kills", [Row("kills", "train", 2)], {})
     rows = keep(tmp_path, "fuzz", [Row("fuzz", "a", 5)], {})
     assert [(row.campaign, row.what, row.tried) for row in rows] == [
-        ("kills", "train", 2), ("fuzz", "a", 5)
-    ]  # fmt: skip
+        ("kills", "train", 2),
+        ("fuzz", "a", 5),
+    ]
     content = json.loads((tmp_path / "report.json").read_text())
     assert content["losses"] == 0
     assert content["tried"] == {"kills": 2, "disk": 0, "folder": 0, "fuzz": 5}

@@ -14,19 +14,38 @@ WALL = np.array([[-5.0, 0.0, 5.0, 0.0]])
 
 
 def acceleration(
-    x, v, *, base=FREE, hidden=None, goal=None, group=None, points=None, walls=None, clock=0.0,
-    phase=0.0, eta=0.0, since=0.0,
-):  # fmt: skip
+    x,
+    v,
+    *,
+    base=FREE,
+    hidden=None,
+    goal=None,
+    group=None,
+    points=None,
+    walls=None,
+    clock=0.0,
+    phase=0.0,
+    eta=0.0,
+    since=0.0,
+):
     """``(N, 2)`` m/s² of people who, where nothing else is said, steer straight on."""
     x, v = np.array(x, dtype=float), np.array(v, dtype=float)
     out = np.empty_like(x)
     accelerations(
-        base, hidden or Hidden(), x, v, x + 1e6 * v if goal is None else np.array(goal, float),
+        base,
+        hidden or Hidden(),
+        x,
+        v,
+        x + 1e6 * v if goal is None else np.array(goal, float),
         np.full(len(x), -1) if group is None else np.array(group),
-        np.full(len(x), eta), np.full(len(x), phase),
+        np.full(len(x), eta),
+        np.full(len(x), phase),
         np.empty((0, 2)) if points is None else np.array(points, float),
-        np.empty((0, 4)) if walls is None else walls, clock, since, out,
-    )  # fmt: skip
+        np.empty((0, 4)) if walls is None else walls,
+        clock,
+        since,
+        out,
+    )
     return out
 
 
@@ -116,9 +135,19 @@ def test_turning_the_scene_turns_the_accelerations():
     rng = np.random.default_rng(4)
     x, v = rng.uniform(0, 4, (6, 2)), rng.normal(0, 1, (6, 2))
     hidden = Hidden(
-        A_2=0.3, lambda_=0.3, T_a=0.4, side=0.3, theta=0.4, align=0.2, cohesion=0.3, pull=0.4,
-        dense=0.3, friction=0.4, sway=0.5, tiring=0.1,
-    )  # fmt: skip
+        A_2=0.3,
+        lambda_=0.3,
+        T_a=0.4,
+        side=0.3,
+        theta=0.4,
+        align=0.2,
+        cohesion=0.3,
+        pull=0.4,
+        dense=0.3,
+        friction=0.4,
+        sway=0.5,
+        tiring=0.1,
+    )
     a = 0.7
     turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
     group = [0, 0, 1, 1, 1, -1]
@@ -134,10 +163,23 @@ SMOOTH = Base(A=16.0, k=0.0, kappa=0.0)
 def walk(step: float, hidden: Hidden, x, v, goal):
     n = len(x)
     return simulate(
-        SMOOTH, hidden, x[None], v[None], goal[None], np.full((1, n), -1), np.zeros((1, n)),
-        np.zeros((1, n)), np.empty((0, 2)), WALL, np.zeros((1, 1, n, 2)),
-        np.zeros(1), np.zeros(1), step, round(2.0 / step), round(2.0 / step),
-    )[0][0, -1]  # fmt: skip
+        SMOOTH,
+        hidden,
+        x[None],
+        v[None],
+        goal[None],
+        np.full((1, n), -1),
+        np.zeros((1, n)),
+        np.zeros((1, n)),
+        np.empty((0, 2)),
+        WALL,
+        np.zeros((1, 1, n, 2)),
+        np.zeros(1),
+        np.zeros(1),
+        step,
+        round(2.0 / step),
+        round(2.0 / step),
+    )[0][0, -1]
 
 
 def test_another_integrator_finds_the_same_motion_and_errors_fall_sixteenfold():

@@ -11,9 +11,14 @@ from benchmarks.truths import score as scoring
 
 #: Classes as a catalogue states them.
 CLASSES = {
-    "reaction_delay": "late", "inertia": "late", "relative_speed": "ahead",
-    "time_gap": "ahead", "asymmetric_response": "ahead", "speed_zone": "", "speed_period": "",
-}  # fmt: skip
+    "reaction_delay": "late",
+    "inertia": "late",
+    "relative_speed": "ahead",
+    "time_gap": "ahead",
+    "asymmetric_response": "ahead",
+    "speed_zone": "",
+    "speed_period": "",
+}
 NAMES = [f"trajectories/s{i:03d}" for i in range(4)]
 
 
@@ -27,8 +32,14 @@ def truth(*effects: str, arm: str = "single", **more: Any) -> dict[str, Any]:
     content: dict[str, Any] = {
         "key": "case",
         "case": {
-            "domain": "traffic", "arm": arm, "effects": list(effects), "variant": "plain",
-            "strength": "medium", "noise": 0.05, "n_sequences": 4, "seed": 0,
+            "domain": "traffic",
+            "arm": arm,
+            "effects": list(effects),
+            "variant": "plain",
+            "strength": "medium",
+            "noise": 0.05,
+            "n_sequences": 4,
+            "seed": 0,
         },
         "effects": [
             {
@@ -37,14 +48,17 @@ def truth(*effects: str, arm: str = "single", **more: Any) -> dict[str, Any]:
             }
             for name in effects
         ],
-        "outside": [], "nuisance": [], "data_faults": [], "not_testable": [],
+        "outside": [],
+        "nuisance": [],
+        "data_faults": [],
+        "not_testable": [],
         "strength": {"reached": 0.4},
         "cost": {
             "floor": 0.1,
             "base": dict.fromkeys(NAMES, 2.0),
             "oracle": dict(zip(NAMES, [1.0, 1.0, 1.2, 1.0], strict=True)),
         },
-    }  # fmt: skip
+    }
     return {**content, **more}
 
 
@@ -178,9 +192,12 @@ def test_without_excitation_an_effect_is_to_be_called_not_testable():
 )
 def test_a_fault_is_located_by_sequence_agent_and_time(found, located, false):
     hidden = {
-        "kind": "jump", "sequence": NAMES[1], "agents": ["s001v2", "s001v3"], "places": [2, 3],
+        "kind": "jump",
+        "sequence": NAMES[1],
+        "agents": ["s001v2", "s001v3"],
+        "places": [2, 3],
         "time": 10.0,
-    }  # fmt: skip
+    }
     said = report(verdict="none", data_faults=[found])
     row = score(truth(arm="fault", data_faults=[hidden]), said)
     assert (row["faults_hidden"], row["faults_located"], row["faults_false"]) == (1, located, false)

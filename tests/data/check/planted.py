@@ -43,11 +43,15 @@ def people(
         parts.append(
             pd.DataFrame(
                 {
-                    "id": i + 1, "frame": begin + k, "x": x, "y": y, "vx": way * speed,
+                    "id": i + 1,
+                    "frame": begin + k,
+                    "x": x,
+                    "y": y,
+                    "vx": way * speed,
                     "vy": 0.03 * omega * np.cos(omega * time + phase),
                 }
             )
-        )  # fmt: skip
+        )
     return pd.concat(parts, ignore_index=True)
 
 

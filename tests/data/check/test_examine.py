@@ -221,8 +221,9 @@ def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
     options = found.source.options
     kind = FORMATS[type(options)]
     sequences = kind.read(kind.files(options), options)
-    speed = np.concatenate([np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt
-                            for s in sequences])  # fmt: skip
+    speed = np.concatenate(
+        [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in sequences]
+    )
     assert np.median(speed) == pytest.approx(1.47, rel=0.05)
 
 
@@ -230,9 +231,14 @@ def test_pairs_and_tidy_tables_and_semicolons(tmp_path: Path) -> None:
     table = cars(2)
     lead, follow = (table[table["veh"] == i].reset_index() for i in (0, 1))
     pairs = pd.DataFrame(
-        {"t": lead["t"], "xFollower": follow["x"], "x_leader": lead["x"],
-         "v_follower": follow["v"], "v_leader": lead["v"]}
-    )  # fmt: skip
+        {
+            "t": lead["t"],
+            "xFollower": follow["x"],
+            "x_leader": lead["x"],
+            "v_follower": follow["v"],
+            "v_leader": lead["v"],
+        }
+    )
     found = examine(saved(pairs, tmp_path, "pairs.csv"))
     assert found.source.group == "pairs"
     assert said(found) == {}
@@ -256,9 +262,13 @@ def spaced(units: dict[str, float]) -> pd.DataFrame:
     table = cars(2)
     lead, follow = (table[table["veh"] == i].reset_index() for i in (0, 1))
     own = pd.DataFrame(
-        {"t": lead["t"], "spacing": (lead["x"] - follow["x"] - 4.5) / units["position"],
-         "speed": follow["v"] / units["speed"], "leader_speed": lead["v"] / units["speed"]}
-    )  # fmt: skip
+        {
+            "t": lead["t"],
+            "spacing": (lead["x"] - follow["x"] - 4.5) / units["position"],
+            "speed": follow["v"] / units["speed"],
+            "leader_speed": lead["v"] / units["speed"],
+        }
+    )
     parts = [own.assign(event=i, split=side) for i in range(2) for side in ("train", "test")]
     return pd.concat(parts)
 
@@ -274,9 +284,12 @@ def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, 
     options = found.source.options
     assert isinstance(options, PairOptions)
     assert options.columns == {
-        "time": "t", "pair": "event", "run": "split", "v_follower": "speed",
+        "time": "t",
+        "pair": "event",
+        "run": "split",
+        "v_follower": "speed",
         "v_leader": "leader_speed",
-    }  # fmt: skip
+    }
     assert {s.name for s in found.sequences} == {"train/0", "train/1", "test/0", "test/1"}
     assert found.sequences[0].v is not None
     speeds = np.gradient(found.sequences[0].x[:, 0, 0], 0.1)
@@ -466,10 +479,16 @@ def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
     """At 2.5 positions a second what is left of the sway is the slow turns of the way."""
     k = np.arange(60)
     parts = [
-        pd.DataFrame({"id": i, "frame": k + 10 * i, "x": 0.4 * 1.3 * k,
-                      "y": i + 0.5 * np.sin(2 * np.pi * 0.06 * 0.4 * k)})
+        pd.DataFrame(
+            {
+                "id": i,
+                "frame": k + 10 * i,
+                "x": 0.4 * 1.3 * k,
+                "y": i + 0.5 * np.sin(2 * np.pi * 0.06 * 0.4 * k),
+            }
+        )
         for i in range(12)
-    ]  # fmt: skip
+    ]
     found = examine(saved(pd.concat(parts), tmp_path), domain="crowd", rate=2.5)
     assert "time_scale" not in said(found)
     assert found.scale.rate == 2.5
@@ -483,8 +502,11 @@ def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) 
     )
     found = examine(path)
     assert {m: one.column for m, one in found.meanings.items()} == {
-        "agent": "ID", "frame": "FR", "x": "X", "y": "Y",
-    }  # fmt: skip
+        "agent": "ID",
+        "frame": "FR",
+        "x": "X",
+        "y": "Y",
+    }
     options = cast(WalkwayOptions, found.source.options)
     assert (options.time_unit, options.frame_rate) == ("frame", 16.0)
     assert {name for s in found.sequences for name in s.agents} <= set(map(str, range(1, 13)))

@@ -38,8 +38,13 @@ def run(seconds: float = 20.0, radius: float = 100.0) -> pd.DataFrame:
 
 
 def save(path: Path, table: pd.DataFrame, acc: str = "1", setting: str = "S", n: int = 4) -> Path:
-    head = ["Date,8,10,2019", f"Vehicle_order,{','.join(MAKES)},", f"Number_of_vehicles,{n}",
-            f"ACC,{acc}", f"Distance_setting,{setting}"]  # fmt: skip
+    head = [
+        "Date,8,10,2019",
+        f"Vehicle_order,{','.join(MAKES)},",
+        f"Number_of_vehicles,{n}",
+        f"ACC,{acc}",
+        f"Distance_setting,{setting}",
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(head) + "\n" + table.to_csv(index=False))
     return path
@@ -144,10 +149,20 @@ def test_laps_of_a_circle(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> N
 def test_a_table_of_rows(tmp_path: Path) -> None:
     t = np.arange(1.0, 11.0, 0.1)
     rows = [
-        pd.DataFrame({"run": "p7", "setting": "min", "acc": True, "position": p, "make": m,
-                      "t": t, "v": SPEED, "gap": GAP[p - 2] if p > 1 else np.nan})
+        pd.DataFrame(
+            {
+                "run": "p7",
+                "setting": "min",
+                "acc": True,
+                "position": p,
+                "make": m,
+                "t": t,
+                "v": SPEED,
+                "gap": GAP[p - 2] if p > 1 else np.nan,
+            }
+        )
         for p, m in ((3, "C"), (1, "A"), (2, "B"))
-    ]  # fmt: skip
+    ]
     path = tmp_path / "runs.parquet"
     pd.concat(rows).to_parquet(path)
     (s,) = read(path)

@@ -72,8 +72,12 @@ def configured(name: str, path: Path | str, source: Path | None = None) -> PairO
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
     more = {"follower": 7, "leader": 5, "run": "a", "leader_kind": "CAV", "split": "Test"}
-    (s,) = read(save(tmp_path / f"one{suffix}", drive(unit=FOOT, **more)),
-                position_unit="ft", speed_unit="ft/s", kinds={"CAV": "automated"})  # fmt: skip
+    (s,) = read(
+        save(tmp_path / f"one{suffix}", drive(unit=FOOT, **more)),
+        position_unit="ft",
+        speed_unit="ft/s",
+        kinds={"CAV": "automated"},
+    )
     assert (s.name, s.recording, s.agents, s.split) == ("a/one", "a", ("7", "5"), "test")
     assert s.kind == ("", "automated")
     np.testing.assert_allclose(s.time, 0.1 * np.arange(51), atol=1e-12)

@@ -106,8 +106,9 @@ def test_a_platoon_whose_vehicles_never_meet_has_gaps(tmp_path: Path) -> None:
     assert np.isnan(s.x[:5, 1, 0]).all()
     faults = find_faults(s, "traffic")
     assert {(fault.kind, fault.agents) for fault in faults} == {
-        ("gap_in_time", (0,)), ("gap_in_time", (1,)),
-    }  # fmt: skip
+        ("gap_in_time", (0,)),
+        ("gap_in_time", (1,)),
+    }
 
 
 def test_walls(tmp_path: Path) -> None:
@@ -177,10 +178,17 @@ def test_uneven_times_of_people(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     time = np.sort(0.2 * np.arange(40) + rng.uniform(-0.04, 0.04, 40))
     parts = [
-        pd.DataFrame({"sequence": "s", "time": time + 0.01 * n, "agent": f"p{n}",
-                      "x": 1.3 * (time + 0.01 * n), "y": float(n)})
+        pd.DataFrame(
+            {
+                "sequence": "s",
+                "time": time + 0.01 * n,
+                "agent": f"p{n}",
+                "x": 1.3 * (time + 0.01 * n),
+                "y": float(n),
+            }
+        )
         for n in range(3)
-    ]  # fmt: skip
+    ]
     (s,) = read(tmp_path, *parts, domain="crowd")
     assert s.n_samples > 35
     np.testing.assert_allclose(s.x[:, :, 0], np.tile(1.3 * s.time[:, None], (1, 3)), atol=1e-9)

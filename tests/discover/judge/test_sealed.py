@@ -126,8 +126,11 @@ def test_an_effect_of_all_is_named_although_drivers_differ() -> None:
         own = 1 + 0.03 * rng.normal(size=4)
         (one,) = platoons(
             lambda x, law, lead, own=own: reaction(x, law * own, lead),
-            number=1, seconds=20.0, driver=0.1, seed=200 + s,
-        )  # fmt: skip
+            number=1,
+            seconds=20.0,
+            driver=0.1,
+            seed=200 + s,
+        )
         made.append(Sequence(name=f"r/{s}", recording="r", time=one.time + 100 * s, x=one.x))
     options = DiscoverOptions(effects=["relative_speed"], structure=False)
     d = diagnose(law(), made, options).diagnosis

@@ -26,9 +26,16 @@ def curves(heights: list[float], errors: list[float], removed: float, name: str 
     knots = tuple(10.0 * k for k in range(len(heights)))
     variable = Variable(name, "m", lambda s: s.x[..., 0], knots, lambda s: torch.ones_like(s.x))
     return Curves(
-        variable, np.zeros(1), np.array(heights), np.array(errors), np.zeros(16), cast(Any, None),
-        0.001, np.zeros(1), removed,
-    )  # fmt: skip
+        variable,
+        np.zeros(1),
+        np.array(heights),
+        np.array(errors),
+        np.zeros(16),
+        cast(Any, None),
+        0.001,
+        np.zeros(1),
+        removed,
+    )
 
 
 def test_a_place_is_the_stretch_of_one_sign_around_the_highest_knot() -> None:

@@ -19,8 +19,13 @@ from nnode.model.extend import effects_of
 from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
 
 LIN = {
-    "term": "lin", "name": "lin", "leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0,
-}  # fmt: skip
+    "term": "lin",
+    "name": "lin",
+    "leader": "measured",
+    "v0": V0,
+    "L": LENGTH,
+    "L_min": 1.0,
+}
 
 
 @pytest.mark.parametrize(("strength", "names"), [(0.5, ["relative_speed"]), (0.0, [])])

@@ -96,9 +96,16 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
 def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
     names = {path.stem for path in (written / "figures").iterdir()}
     assert names == {
-        "coefficients", "faults", "map", "map_beside", "moments", "sealed",
-        "trajectories", "unknown", "where",
-    }  # fmt: skip
+        "coefficients",
+        "faults",
+        "map",
+        "map_beside",
+        "moments",
+        "sealed",
+        "trajectories",
+        "unknown",
+        "where",
+    }
     alts = re.findall(r'<img alt="([^"]*)"', (written / "report.html").read_text())
     assert len(alts) == len(names)
     assert all(len(alt) > 20 for alt in alts)
@@ -129,13 +136,27 @@ def plain(case: Case, **changes: object) -> list[str]:
     found = deepcopy(case.found)
     found.diagnosis = replace(found.diagnosis, **changes)
     blocks = page_blocks(case.inputs, found, Figures(), [], Path("run"))
-    return [b.markdown if isinstance(b, Text) else b.text
-            for b in blocks if isinstance(b, Text | Heading)]  # fmt: skip
+    return [
+        b.markdown if isinstance(b, Text) else b.text
+        for b in blocks
+        if isinstance(b, Text | Heading)
+    ]
 
 
 def test_a_page_of_nothing_found(traffic: Case) -> None:
-    words = plain(traffic, effects=[], verdict="none", unknown=None, places=[], absences=[],
-                  not_testable=[], sealed=[], base={}, notes=[], agents=[])  # fmt: skip
+    words = plain(
+        traffic,
+        effects=[],
+        verdict="none",
+        unknown=None,
+        places=[],
+        absences=[],
+        not_testable=[],
+        sealed=[],
+        base={},
+        notes=[],
+        agents=[],
+    )
     assert "No effect of the catalogue was added to the model." in words
     assert "None: every sequence was used." in words
     assert "No structure that a flexible fit would find." in words
@@ -182,8 +203,10 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
 def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
     found = deepcopy(traffic.found)
     names = [traffic.inputs.sequences[i].name for i in found.sealed]
-    rows = [{"name": names[0], "before": 5.0, "after": 4.5},
-            {"name": names[1], "before": 4.0, "after": 1.0}]  # fmt: skip
+    rows = [
+        {"name": names[0], "before": 5.0, "after": 4.5},
+        {"name": names[1], "before": 4.0, "after": 1.0},
+    ]
     found.diagnosis = replace(found.diagnosis, sealed=rows)
     assert telling(found) == [1, 0]
     found.diagnosis = replace(found.diagnosis, effects=[])
@@ -202,9 +225,15 @@ def test_the_named_place_is_shaded_and_else_where_they_part(traffic: Case) -> No
     assert (zone.label, zone.x) == ("where they part", (a, b))
     assert zones(replace(d, effects=[], places=[])) == []
     (effect,) = d.effects
-    at = {name: Coefficient(value, value, value, unit)
-          for name, value, unit in (("A_o", 1.0, "m/s²"), ("B_o", 0.6, "m"),
-                                    ("x_o", -1.0, "m"), ("y_o", 2.0, "m"))}  # fmt: skip
+    at = {
+        name: Coefficient(value, value, value, unit)
+        for name, value, unit in (
+            ("A_o", 1.0, "m/s²"),
+            ("B_o", 0.6, "m"),
+            ("x_o", -1.0, "m"),
+            ("y_o", 2.0, "m"),
+        )
+    }
     (zone,) = zones(replace(d, effects=[replace(effect, name="obstacle", coefficients=at)]))
     assert zone.circle == (-1.0, 2.0, 0.6)
     at = {name: Coefficient(value, value, value, "s") for name, value in (("a", 3.0), ("b", 9.0))}

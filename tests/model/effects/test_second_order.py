@@ -28,14 +28,19 @@ def platoon() -> Batch:
     """Four vehicles, the second from behind a truck; at 50 s of the clock."""
     time, v = 50 + DT * np.arange(3), np.array(SPEEDS)
     x = np.cumsum([0.0, *GAPS]) + v * DT * np.arange(3)[:, None]
-    return collate([
-        Sequence(
-            name="r/0", recording="r", time=time, x=x[..., None],
-            v=np.broadcast_to(v, x.shape)[..., None].copy(),
-            length=np.where(np.arange(4) == 1, TRUCK, LONG),
-            kind=tuple("truck" if i == 1 else "car" for i in range(4)),
-        )
-    ])  # fmt: skip
+    return collate(
+        [
+            Sequence(
+                name="r/0",
+                recording="r",
+                time=time,
+                x=x[..., None],
+                v=np.broadcast_to(v, x.shape)[..., None].copy(),
+                length=np.where(np.arange(4) == 1, TRUCK, LONG),
+                kind=tuple("truck" if i == 1 else "car" for i in range(4)),
+            )
+        ]
+    )
 
 
 def idm(
@@ -103,7 +108,7 @@ DV = -np.diff(SPEEDS)
         ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else "",
-)  # fmt: skip
+)
 def test_accelerations_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
     system, batch = model("idm", effect), platoon()
     assert system.formula is not None

@@ -29,9 +29,10 @@ def batch(vehicles: int = 4, more: int = 0) -> Batch:
     kind = tuple("truck" if i == 1 else "car" for i in range(vehicles))
     length = np.where(np.arange(vehicles) == 1, 10.0, 4.0)
     items = [
-        Sequence(name="r/0", recording="r", time=time + 50, x=place[..., None], kind=kind,
-                 length=length)
-    ]  # fmt: skip
+        Sequence(
+            name="r/0", recording="r", time=time + 50, x=place[..., None], kind=kind, length=length
+        )
+    ]
     if more:
         wide = np.arange(vehicles + more) * 25.0 + 12 * time[:, None]
         items.append(Sequence(name="r/1", recording="r", time=time, x=wide[..., None]))
@@ -86,7 +87,7 @@ W = np.array([law(20), law(30), law(40)])
             [law(20 - 4.5), law(30 + 1.5), law(40 + 1.5)],
         ),
     ],
-)  # fmt: skip
+)
 def test_rates_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
     assert rates(model(effect), batch()) == pytest.approx(np.array(expected), rel=1e-9)
 
@@ -185,8 +186,10 @@ def test_effects_stand_in_the_order_of_their_ranks_and_can_be_removed() -> None:
     assert place == 2
     assert [t.name for t in more.terms] == ["lin", "speed_zone", "relative_speed", "inertia"]
     assert [t.name for t in without(more, "inertia").terms] == [
-        "lin", "speed_zone", "relative_speed",
-    ]  # fmt: skip
+        "lin",
+        "speed_zone",
+        "relative_speed",
+    ]
     assert copy.deepcopy(more).terms[1].options() == system.terms[1].options()
 
 

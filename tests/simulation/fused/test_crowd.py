@@ -130,9 +130,14 @@ def test_far_from_the_origin(name: str, crowd) -> None:  # type: ignore[no-untyp
     item = crowd(6, samples=4)
     far = np.array([3000.0, -800.0])
     moved = Sequence(
-        name="far", recording="r", time=item.time, x=item.x + far, v=item.v,
-        destination=item.destination + far, walls=item.walls + np.tile(far, 2),
-    )  # fmt: skip
+        name="far",
+        recording="r",
+        time=item.time,
+        x=item.x + far,
+        v=item.v,
+        destination=item.destination + far,
+        walls=item.walls + np.tile(far, 2),
+    )
     check(Crowd(MODELS[name]()), collate([moved]), FusedSolver(DT), limit=1e-9)
 
 

@@ -45,13 +45,18 @@ def _float(operation: Any, otherwise: float) -> Any:
 #: What the generated source imports, for numbers in float64.
 _NAMES: dict[str, Any] = {
     **LIBRARIES["number"],
-    "njit": _undecorated, "INLINE": {}, "LOOP": {}, "copy": _copy,
-    "real": lambda value, like: float(value), "add": lambda total, value: total + value,
-    "exp": _float(math.exp, math.inf), "log": _float(math.log, math.nan),
+    "njit": _undecorated,
+    "INLINE": {},
+    "LOOP": {},
+    "copy": _copy,
+    "real": lambda value, like: float(value),
+    "add": lambda total, value: total + value,
+    "exp": _float(math.exp, math.inf),
+    "log": _float(math.log, math.nan),
     "sqrt": _float(math.sqrt, math.nan),
     # indices are Python's numbers, which are faster than NumPy's
     "np": SimpleNamespace(uint64=int, zeros=np.zeros, array=np.array),
-}  # fmt: skip
+}
 #: Imports of the generated source.
 _IMPORTS = re.compile(r"^(?:from \S+ )?import .*$", re.MULTILINE)
 

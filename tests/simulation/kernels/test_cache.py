@@ -140,8 +140,11 @@ def test_a_home_that_cannot_be_used(tmp_path: Path) -> None:
     environment |= {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(scratch)}
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, TEXT.decode()],
-        env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("NNODE_CACHE") == 1  # one warning, not one per module
     assert done.stdout.count(str(scratch / "nnode-")) == 3

@@ -27,14 +27,19 @@ hits = [sum(f.stats.cache_hits.values()) for f in (module.forward, module.backwa
 print(json.dumps(hits))
 """
 LANE = {
-    "places": "np.cumsum(np.full((1, 4, 1), 12.0), 1)", "speed": 1.0, "dt": 0.2,
-    "model": 'Traffic([make_law("network_speed")])', "source": "lanes.LaneSource(model.formula)",
-}  # fmt: skip
+    "places": "np.cumsum(np.full((1, 4, 1), 12.0), 1)",
+    "speed": 1.0,
+    "dt": 0.2,
+    "model": 'Traffic([make_law("network_speed")])',
+    "source": "lanes.LaneSource(model.formula)",
+}
 CROWD = {
-    "places": "np.arange(12.0).reshape(1, 6, 2)", "speed": 0.1, "dt": 0.04,
+    "places": "np.arange(12.0).reshape(1, 6, 2)",
+    "speed": 0.1,
+    "dt": 0.04,
     "model": 'Crowd([make_law("relaxation"), make_law("social_force")])',
     "source": "crowds.CrowdSource(crowds.supports(model))",
-}  # fmt: skip
+}
 
 
 @pytest.mark.thorough

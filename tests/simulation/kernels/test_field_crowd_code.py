@@ -25,9 +25,14 @@ def people(n: int, seed: int, samples: int = 6) -> Sequence:
     time = 0.04 * np.arange(samples)
     wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
     return Sequence(
-        name=f"{n}-{seed}", recording="r", time=time, x=x + time[:, None, None] * v,
-        v=np.broadcast_to(v, (samples, n, 2)), preferred=wish, walls=WALLS[: seed % 4],
-    )  # fmt: skip
+        name=f"{n}-{seed}",
+        recording="r",
+        time=time,
+        x=x + time[:, None, None] * v,
+        v=np.broadcast_to(v, (samples, n, 2)),
+        preferred=wish,
+        walls=WALLS[: seed % 4],
+    )
 
 
 def batch() -> Batch:
@@ -60,9 +65,10 @@ def test_a_smallest_value_by_loops() -> None:
 def test_the_first_of_several_has_the_slope() -> None:
     # two others at the same distance: the slope by x is that of the first of them alone
     law = {
-        "parameters": {"A": "1 1/s"}, "smallest": {"closest": "d"},
+        "parameters": {"A": "1 1/s"},
+        "smallest": {"closest": "d"},
         "rate": {"x": "A*closest", "y": "0*A*closest"},
-    }  # fmt: skip
+    }
     options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
     model = build_model({**options, "law": law})
     place = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]], dtype=torch.float64)

@@ -17,13 +17,19 @@ from tests.simulation.fused.compare import difference, gradient, single
 
 DT = 0.02
 IDM = {
-    "term": "formula", "name": "idm", "leader": "measured", "effects": [],
+    "term": "formula",
+    "name": "idm",
+    "leader": "measured",
+    "effects": [],
     "law": CAR_FOLLOWING_LAWS["idm"],
-}  # fmt: skip
+}
 OWN = {
-    "term": "formula", "name": "mine", "leader": "constant", "effects": [],
+    "term": "formula",
+    "name": "mine",
+    "leader": "constant",
+    "effects": [],
     "law": {"parameters": {"v0": "64.8 km/h", "L": "4 m"}, "rate": {"x": "v0*(1 - L/gap)"}},
-}  # fmt: skip
+}
 
 
 def idm(v: float, gap: float, dv: float, row: list[float]) -> float:

@@ -46,9 +46,13 @@ def by_autograd(
     out = torch.zeros(len(names), *x.shape[:3], dtype=x.dtype)
     for index in (batch.valid & (x[..., 0] == x[..., 0])).nonzero().tolist():
         k, b, i = index
-        slopes = torch.autograd.grad(
-            x[k, b, i, 0], [known[p] for p, *_ in places], retain_graph=True, allow_unused=True
-        ) if x[k, b, i, 0].requires_grad else [None] * len(names)  # fmt: skip
+        slopes = (
+            torch.autograd.grad(
+                x[k, b, i, 0], [known[p] for p, *_ in places], retain_graph=True, allow_unused=True
+            )
+            if x[k, b, i, 0].requires_grad
+            else [None] * len(names)
+        )
         for p, (slope, (_, place, _)) in enumerate(zip(slopes, places, strict=True)):
             if slope is not None:
                 out[p, k, b, i] = slope.flatten()[place]
@@ -78,8 +82,17 @@ def owned(system: Traffic) -> list[str]:
 
 
 def linear(*effects: dict[str, Any], leader: str = "measured") -> Traffic:
-    found = build_model({"term": "lin", "name": "lin", "leader": leader, "v0": 25.0, "L": 6.0,
-                         "L_min": 2.0, "effects": list(effects)})  # fmt: skip
+    found = build_model(
+        {
+            "term": "lin",
+            "name": "lin",
+            "leader": leader,
+            "v0": 25.0,
+            "L": 6.0,
+            "L_min": 2.0,
+            "effects": list(effects),
+        }
+    )
     assert isinstance(found, Traffic)
     return found
 
@@ -134,8 +147,16 @@ def test_their_formulas_are_the_slopes_of_the_rate() -> None:
     twice = with_tangents(lane, ("lin__v0", "lin__L"))
     assert list(twice.rates) == ["x", "x__d0", "x__d1"]
     assert twice.rates["x"] is lane.rates["x"]
-    given = {"x": 3.0, "x_1": 23.0, "lin__v0": 25.0, "lin__L": 6.0, "x__d0": 0.5, "x__d0_1": 2.0,
-             "x__d1": -1.0, "x__d1_1": 0.0}  # fmt: skip
+    given = {
+        "x": 3.0,
+        "x_1": 23.0,
+        "lin__v0": 25.0,
+        "lin__L": 6.0,
+        "x__d0": 0.5,
+        "x__d0_1": 2.0,
+        "x__d1": -1.0,
+        "x__d1_1": 0.0,
+    }
     values = {k: torch.tensor(v, dtype=torch.float64) for k, v in given.items()}
     by_v0, by_L = computed([twice.rates["x__d0"], twice.rates["x__d1"]], values)
     steep = 25 * 6 / 20**2

@@ -20,9 +20,14 @@ def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -
     walls = np.array([[-5.0, 0.0, 5.0, 0.0], [5.0, 4.0, -5.0, 4.0]])
     path = x + time[:, None, None] * v
     return Sequence(
-        name=f"made/{number:03d}", recording="made", time=time + number, x=path, walls=walls,
-        agents=tuple(f"{number}-{i}" for i in range(people)), destination=path[-1] + 2 * v,
-    )  # fmt: skip
+        name=f"made/{number:03d}",
+        recording="made",
+        time=time + number,
+        x=path,
+        walls=walls,
+        agents=tuple(f"{number}-{i}" for i in range(people)),
+        destination=path[-1] + 2 * v,
+    )
 
 
 def corridor(

@@ -57,9 +57,15 @@ def _horizon(folder: str) -> int:
 
 
 def fit(
-    kind: str, folder: str, scope: str, folds: int, span: list[float], seed: int,
-    start: list[float] | None, steps: int,
-) -> dict[str, Any]:  # fmt: skip
+    kind: str,
+    folder: str,
+    scope: str,
+    folds: int,
+    span: list[float],
+    seed: int,
+    start: list[float] | None,
+    steps: int,
+) -> dict[str, Any]:
     """In place of :func:`nnode.study.crowd.tasks.fit`."""
     horizon = _horizon(folder)
     assert (start is None) == (horizon == 1), "longer horizons go on from shorter ones"
@@ -109,9 +115,13 @@ def transfer(folder: str, rows: dict[str, list[float]]) -> dict[str, Any]:
 def scan(path: str, how: dict[str, Any], cuts: int, seed: int) -> dict[str, Any]:
     """In place of :func:`nnode.study.crowd.conventions.scan`."""
     return {
-        "offsets": list(range(cuts)), "printed": [3.0] * cuts, "people": [10.0] * cuts,
-        "relaxation": 4.0, "sf": 2.0, "row": FORCE[1],
-    }  # fmt: skip
+        "offsets": list(range(cuts)),
+        "printed": [3.0] * cuts,
+        "people": [10.0] * cuts,
+        "relaxation": 4.0,
+        "sf": 2.0,
+        "row": FORCE[1],
+    }
 
 
 def network(path: str, how: dict[str, Any], model: str, seed: int, steps: int) -> dict[str, Any]:

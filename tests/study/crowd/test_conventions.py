@@ -125,9 +125,13 @@ def invented(nearest: float, gain: float, network: float) -> Crowd:
     for how in EVERY:
         cost = nearest if how == special else 2.0
         study.found[key(how)] = {
-            "offsets": [0, 12], "printed": [cost, cost + 0.2], "people": [10.0, 10.0],
-            "relaxation": cost / (1 - gain), "sf": cost, "row": [1.0, 2.0, 3.0],
-        }  # fmt: skip
+            "offsets": [0, 12],
+            "printed": [cost, cost + 0.2],
+            "people": [10.0, 10.0],
+            "relaxation": cost / (1 - gain),
+            "sf": cost,
+            "row": [1.0, 2.0, 3.0],
+        }
     for how in to_calibrate(study):
         for model in ("nn", "nn_self"):
             for seed in range(2):

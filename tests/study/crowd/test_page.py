@@ -183,7 +183,7 @@ def test_parameters_that_part_are_told() -> None:
         (1.0, {1.0: 0.0, 2.0: 1.0}, "nowhere below SF. Forces between people raise"),
         (-1.0, {1.0: -1.0, 2.0: 1.0}, "lower NN's held-out cost at 1 s and raise it at 2 s."),
     ],
-)  # fmt: skip
+)
 def test_words_on_pairs_follow_from_both_comparisons(
     wall_to_sf: float, nn_to_wall: dict[float, float], said: str
 ) -> None:

@@ -121,12 +121,16 @@ def test_weights_choose_the_sequences():
     ]
     both = collate(
         Sequence(
-            name=str(n), recording="made", time=0.04 * np.arange(26), x=one.x[:, 0].numpy(),
-            v=one.v[:, 0].numpy(), destination=one.destination[0].numpy(),
+            name=str(n),
+            recording="made",
+            time=0.04 * np.arange(26),
+            x=one.x[:, 0].numpy(),
+            v=one.v[:, 0].numpy(),
+            destination=one.destination[0].numpy(),
             walls=one.walls[0].numpy(),
         )
         for n, one in enumerate(made)
-    )  # fmt: skip
+    )
     found = calibrate("sf", both, TRUE, weights=np.array([0.0, 1.0]))
     assert found.row == pytest.approx(2 * TRUE, rel=1e-3)
 
@@ -236,11 +240,21 @@ def test_the_quick_study_writes_its_page_and_continues(real_data, tmp_path):
     kept = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "tasks").iterdir()}
     tables = {b.name: b for b in blocks if isinstance(b, TableBlock)}
     expected = {
-        "crowd_parameters", "crowd_costs", "crowd_horizons", "crowd_heldout_runs",
-        "crowd_restarts", "settings_sf", "settings_nn", "parameters", "crowd_data",
-        "crowd_blocks", "settings_nn_along", "crowd_conventions", "crowd_conventions_means",
+        "crowd_parameters",
+        "crowd_costs",
+        "crowd_horizons",
+        "crowd_heldout_runs",
+        "crowd_restarts",
+        "settings_sf",
+        "settings_nn",
+        "parameters",
+        "crowd_data",
+        "crowd_blocks",
+        "settings_nn_along",
+        "crowd_conventions",
+        "crowd_conventions_means",
         "crowd_conventions_networks",
-    }  # fmt: skip
+    }
     assert set(tables) == expected
     assert np.isfinite(tables["crowd_costs"].frame["here (m² s)"]).all()
     write_page(blocks, tmp_path, title=crowd.TITLE, subtitle=crowd.SUBTITLE)

@@ -28,12 +28,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
         assert one.walls is not None
         made.append(
             Sequence(
-                name=f"made/{number}", recording="made", time=start + DT * np.arange(26),
-                x=one.x[:, 0].numpy(), v=one.v[:, 0].numpy(), walls=one.walls[0].numpy(),
+                name=f"made/{number}",
+                recording="made",
+                time=start + DT * np.arange(26),
+                x=one.x[:, 0].numpy(),
+                v=one.v[:, 0].numpy(),
+                walls=one.walls[0].numpy(),
                 destination=one.destination[0].numpy(),
                 agents=tuple(f"{number}-{i}" for i in range(PEOPLE)),
             )
-        )  # fmt: skip
+        )
     place = tmp_path_factory.mktemp("crowd")
     write_store(place, made, {"dt": DT})
     return str(place)

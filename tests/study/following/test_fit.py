@@ -36,11 +36,16 @@ def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequenc
             x[k + 1] = x[k] + 0.1 * (v[k] + v[k + 1]) / 2
         found.append(
             Sequence(
-                name=f"r/{i}", recording="r", time=time, x=np.stack([x, lead], -1)[..., None],
-                v=np.stack([v, lead_v], -1)[..., None], agents=(f"f{i}", f"l{i // 2}"),
-                length=np.array([np.nan, 4.0]), split="train",
+                name=f"r/{i}",
+                recording="r",
+                time=time,
+                x=np.stack([x, lead], -1)[..., None],
+                v=np.stack([v, lead_v], -1)[..., None],
+                agents=(f"f{i}", f"l{i // 2}"),
+                length=np.array([np.nan, 4.0]),
+                split="train",
             )
-        )  # fmt: skip
+        )
     return found
 
 

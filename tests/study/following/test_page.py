@@ -36,55 +36,88 @@ def invented() -> dict[str, dict[str, Any]]:
     for name, (held, test) in ERRORS.items():
         system = EVERY[name].system()
         row = [float(p.detach()) for p in system.parameters()]
-        cost = cast(Any, SimpleNamespace(names=[f"x.{n.split('.')[-1]}" for n, _ in
-                                                system.named_parameters()]))  # fmt: skip
+        cost = cast(
+            Any,
+            SimpleNamespace(names=[f"x.{n.split('.')[-1]}" for n, _ in system.named_parameters()]),
+        )
         values = named(cost, np.array(row))
         noise = 0.1 * np.arange(6)
         found[f"cv-{key(name)}"] = {
-            "row": row, "parameters": values, "limits": [], "clusters": [0, 0, 1, 1, 2, 2],
+            "row": row,
+            "parameters": values,
+            "limits": [],
+            "clusters": [0, 0, 1, 1, 2, 2],
             "train": {o: (noise + held - 0.5).tolist() for o in OBJECTIVES},
             "heldout": {o: (noise + held).tolist() for o in OBJECTIVES},
-        }  # fmt: skip
+        }
         found[f"test-{key(name)}"] = {o: (noise + test).tolist() for o in OBJECTIVES}
         found[f"objectives-{key(name)}"] = {
-            o: {"reached": {x: 1.0 + (x != o) for x in OBJECTIVES}, "parameters": values,
-                "limits": []}
+            o: {
+                "reached": {x: 1.0 + (x != o) for x in OBJECTIVES},
+                "parameters": values,
+                "limits": [],
+            }
             for o in OBJECTIVES
-        }  # fmt: skip
+        }
         factors = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
         rise = np.log(factors) ** 2
         found[f"precision-{key(name)}"] = {
-            "names": list(values), "row": row, "half": [0.2] * len(row),
+            "names": list(values),
+            "row": row,
+            "half": [0.2] * len(row),
             "correlation": np.eye(len(row)).tolist(),
             "profiles": {
-                n: {"values": (factors * v).tolist(), "rise": rise.tolist(),
-                    "low": (rise - 0.1).tolist(), "high": (rise + 0.1).tolist()}
+                n: {
+                    "values": (factors * v).tolist(),
+                    "rise": rise.tolist(),
+                    "low": (rise - 0.1).tolist(),
+                    "high": (rise + 0.1).tolist(),
+                }
                 for n, v in values.items()
             },
-        }  # fmt: skip
+        }
     idm = found["cv-idm"]["parameters"]
     found["halves"] = {
-        "names": list(idm), "centre": list(idm.values()), "spread": [0.1] * 5, "between": [1.0] * 5,
-        "pooled": [4.0] * 6, "alone": [6.0] * 6, "shrunk": [3.0] * 6, "strengths": [0.1, 1.0],
-        "by_strength": [4.0], "clusters": [0, 0, 1, 1, 2, 2],
-    }  # fmt: skip
+        "names": list(idm),
+        "centre": list(idm.values()),
+        "spread": [0.1] * 5,
+        "between": [1.0] * 5,
+        "pooled": [4.0] * 6,
+        "alone": [6.0] * 6,
+        "shrunk": [3.0] * 6,
+        "strengths": [0.1, 1.0],
+        "by_strength": [4.0],
+        "clusters": [0, 0, 1, 1, 2, 2],
+    }
     for name, fold, heldout in (("idm", 2.0, 3.0), ("helly", 3.0, 1.0)):
         found[f"platoon-{name}"] = {
-            "makes": MAKES, "chosen": [fold] * 4, "train": [fold] * 4, "heldout": [heldout] * 4,
-            "parameters": [idm] * 4, "limits": [[]] * 4,
-        }  # fmt: skip
+            "makes": MAKES,
+            "chosen": [fold] * 4,
+            "train": [fold] * 4,
+            "heldout": [heldout] * 4,
+            "parameters": [idm] * 4,
+            "limits": [[]] * 4,
+        }
     found["runs"] = {
-        "runs": ["a", "a", "b", "b"], "makes": MAKES, "settings": ["min", "max", "none", "min"],
-        "costs": [1.0] * 4, "limits": [[]] * 4,
+        "runs": ["a", "a", "b", "b"],
+        "makes": MAKES,
+        "settings": ["min", "max", "none", "min"],
+        "costs": [1.0] * 4,
+        "limits": [[]] * 4,
         "parameters": [{**idm, "T": T} for T in (0.8, 2.5, 1.5, 1.0)],
-    }  # fmt: skip
+    }
     rows = {"both": [30, 1.2, 2, 1.3, 1.7], "HV": [30, 1.0, 2, 1.3, 1.7], "CAV": [30, 1.5, 2, 1, 2]}
     found["leaders"] = {
-        "names": list(idm), "kinds": ["HV", "CAV"] * 3, "clusters": [0, 0, 1, 1, 2, 2],
-        "rows": rows, "speed": [10.0] * 6, "gap": [20.0] * 6,
+        "names": list(idm),
+        "kinds": ["HV", "CAV"] * 3,
+        "clusters": [0, 0, 1, 1, 2, 2],
+        "rows": rows,
+        "speed": [10.0] * 6,
+        "gap": [20.0] * 6,
         "without": {k: [[x + d for x in row] for d in (-0.01, 0, 0.01)] for k, row in rows.items()},
-        "heldout": {k: [1.0] * 6 for k in rows}, "costs": {k: [1.0] * 6 for k in rows},
-    }  # fmt: skip
+        "heldout": {k: [1.0] * 6 for k in rows},
+        "costs": {k: [1.0] * 6 for k in rows},
+    }
     return found
 
 

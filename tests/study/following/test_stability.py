@@ -18,10 +18,13 @@ LENGTH = 4.5
 def system(name: str, effects: tuple[str, ...] = (), leader: str = "measured") -> System:
     return build_model(
         {
-            "term": "formula", "name": name, "leader": leader, "law": CAR_FOLLOWING_LAWS[name],
+            "term": "formula",
+            "name": name,
+            "leader": leader,
+            "law": CAR_FOLLOWING_LAWS[name],
             "effects": [{"name": effect} for effect in effects],
         }
-    )  # fmt: skip
+    )
 
 
 def idm_gap(v: float) -> float:

@@ -25,9 +25,15 @@ def pair(number: int, v0: float, split: str) -> Sequence:
     time = 0.1 * np.arange(31)
     x = np.stack([v0 * time, 44 + v0 * time], 1)[..., None]
     return Sequence(
-        name=f"{split}/{number}", recording=split, time=time, x=x, v=np.full_like(x, v0),
-        agents=(f"f{number}", f"l{number}"), length=np.array([np.nan, 4.0]), split=split,
-    )  # fmt: skip
+        name=f"{split}/{number}",
+        recording=split,
+        time=time,
+        x=x,
+        v=np.full_like(x, v0),
+        agents=(f"f{number}", f"l{number}"),
+        length=np.array([np.nan, 4.0]),
+        split=split,
+    )
 
 
 def test_the_metric_is_that_of_all_samples_together() -> None:

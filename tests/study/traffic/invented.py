@@ -57,21 +57,36 @@ def _parameters(model: str, name: str) -> dict[str, Any]:
 
 
 def fit(
-    folder: str, recording_name: str, model: str, box: float | None, restarts: int, dt: float,
-    iterations: int, bootstrap: int, steps: list[float], seed: int,
-) -> dict[str, Any]:  # fmt: skip
+    folder: str,
+    recording_name: str,
+    model: str,
+    box: float | None,
+    restarts: int,
+    dt: float,
+    iterations: int,
+    bootstrap: int,
+    steps: list[float],
+    seed: int,
+) -> dict[str, Any]:
     """In place of :func:`nnode.study.traffic.tasks.fit`."""
     cost = printed(model, recording_name)
     cost += 5.0 if box else ABOVE.get((model, recording_name), (-1.0, -1.0))[seed]
     cost /= 2 if folder.endswith("drop") else 1
     parameters = _parameters(model, recording_name)
     found: dict[str, Any] = {
-        "model": model, "recording": recording_name, "box": box, "restarts": restarts,
-        "cost": cost, "costs": [share * cost for share in SHARES], "groups": [0, 1, 2],
-        "parameters": parameters, "residual": 1e-3, "speeds": [15.0] * len(GAPS),
+        "model": model,
+        "recording": recording_name,
+        "box": box,
+        "restarts": restarts,
+        "cost": cost,
+        "costs": [share * cost for share in SHARES],
+        "groups": [0, 1, 2],
+        "parameters": parameters,
+        "residual": 1e-3,
+        "speeds": [15.0] * len(GAPS),
         "steps": {f"{step:g}": cost * (1 + step) for step in steps},
         "starts": [cost + k for k in range(5)],
-    }  # fmt: skip
+    }
     if bootstrap:
         found["bootstrap"] = {
             "values": {
@@ -90,17 +105,24 @@ def cross_validate(
     """In place of :func:`nnode.study.traffic.tasks.cross_validate`."""
     cost = UNSEEN.get(model, BOX if box else FREE)
     return {
-        "model": model, "recording": recording_name, "box": box, "costs": [cost] * 3,
+        "model": model,
+        "recording": recording_name,
+        "box": box,
+        "costs": [cost] * 3,
         "groups": [0, 1, 2],
         **{name: [UNSEEN[name]] * 3 for name in ("no_interaction", "constant_velocity")},
-    }  # fmt: skip
+    }
 
 
 def _run(model: str, name: str, above: float, history: list[list[float]]) -> dict[str, Any]:
     return {
-        "model": model, "recording": name, "cost": printed(model, name) + above,
-        "parameters": _parameters(model, name), "residual": 0.1, "history": history,
-    }  # fmt: skip
+        "model": model,
+        "recording": name,
+        "cost": printed(model, name) + above,
+        "parameters": _parameters(model, name),
+        "residual": 0.1,
+        "history": history,
+    }
 
 
 def descend(recording_name: str, model: str, **how: Any) -> dict[str, Any]:
@@ -122,6 +144,11 @@ def scan(recording_name: str, model: str, points: int, **how: Any) -> dict[str, 
     lengths = np.linspace(2, 12, points)
     cost = printed(model, recording_name) + 1
     return {
-        "model": model, "recording": recording_name, "cost": cost, "v0": V0, "L": 2.0,
-        "lengths": lengths.tolist(), "by_length": (cost + lengths - 2).tolist(),
-    }  # fmt: skip
+        "model": model,
+        "recording": recording_name,
+        "cost": cost,
+        "v0": V0,
+        "L": 2.0,
+        "lengths": lengths.tolist(),
+        "by_length": (cost + lengths - 2).tolist(),
+    }

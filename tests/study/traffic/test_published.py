@@ -48,9 +48,12 @@ def calibrated(parameters: pd.DataFrame, model: str, name: str) -> System:
     """The model with the published parameters of one recording."""
     p = parameters
     chosen = p[
-        (p.optimizer == "bfgs") & (p.faults == "keep") & (p.box == "")
-        & (p.model == model) & (p.recording == name)
-    ]  # fmt: skip
+        (p.optimizer == "bfgs")
+        & (p.faults == "keep")
+        & (p.box == "")
+        & (p.model == model)
+        & (p.recording == name)
+    ]
     system = build_model(model_options(model))
     own = dict(system.named_parameters())
     assert len(chosen) == sum(value.numel() for value in own.values())

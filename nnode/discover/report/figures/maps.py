@@ -121,9 +121,13 @@ def _coloured(
     for ax, (name, (_, _, value)), mean in zip(axes, panels.items(), means, strict=True):
         ax.set_facecolor(EMPTY)
         mesh = ax.pcolormesh(
-            *edges, np.ma.masked_invalid(mean.T), cmap=DIVERGING, vmin=-limit, vmax=limit,
+            *edges,
+            np.ma.masked_invalid(mean.T),
+            cmap=DIVERGING,
+            vmin=-limit,
+            vmax=limit,
             rasterized=True,
-        )  # fmt: skip
+        )
         title = f"{name}: {_rms(value):.2g} m/s rms"
         dress(ax, x=labels[0], y=labels[1], title=title, grid=False)
         ax.label_outer()
@@ -168,9 +172,19 @@ def _arrows(
         length = np.hypot(u, v)
         short = np.minimum(1, limit / np.maximum(length, 1e-12)) * side / limit
         drawn = ax.quiver(
-            *middle, u * short, v * short, length, cmap=SEQUENTIAL, clim=(0, limit),
-            angles="xy", scale_units="xy", scale=1, pivot="mid", width=0.004, zorder=3,
-        )  # fmt: skip
+            *middle,
+            u * short,
+            v * short,
+            length,
+            cmap=SEQUENTIAL,
+            clim=(0, limit),
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            pivot="mid",
+            width=0.004,
+            zorder=3,
+        )
         if person:
             ax.plot(0, 0, marker=(3, 0, -90), color="black", markersize=11)
         ax.set_aspect("equal")

@@ -41,9 +41,15 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
             ax.axvspan(place.low, place.high, color=OKABE_ITO["orange"], alpha=0.25, linewidth=0)
         if place.curve:
             ax.errorbar(
-                place.curve["at"], place.curve["deviation"], yerr=place.curve.get("error"),
-                fmt=".-", color=OKABE_ITO["blue"], linewidth=1, elinewidth=0.8, markersize=4,
-            )  # fmt: skip
+                place.curve["at"],
+                place.curve["deviation"],
+                yerr=place.curve.get("error"),
+                fmt=".-",
+                color=OKABE_ITO["blue"],
+                linewidth=1,
+                elinewidth=0.8,
+                markersize=4,
+            )
         share = f"{100 * place.share:.0f} % of the excess" if np.isfinite(place.share) else ""
         dress(
             ax,
@@ -71,9 +77,14 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
             ax.axvline(neutral, color=GREY, linestyle=":", linewidth=1.4)
         ends = np.array([[c.value - c.low], [c.high - c.value]])
         ax.errorbar(
-            [c.value], [0], xerr=np.nan_to_num(ends).clip(min=0), fmt="o",
-            color=OKABE_ITO["blue"], capsize=4, markersize=6,
-        )  # fmt: skip
+            [c.value],
+            [0],
+            xerr=np.nan_to_num(ends).clip(min=0),
+            fmt="o",
+            color=OKABE_ITO["blue"],
+            capsize=4,
+            markersize=6,
+        )
         ax.set_ylim(-1, 1)
         ax.set_yticks(
             [0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit not in ('', '1') else ''}"]
