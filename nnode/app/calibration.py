@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
@@ -14,6 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
+from scipy.stats import t as students_t
 
 from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
 from nnode.app.training import straight_loader, stream
@@ -24,12 +26,16 @@ from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import SequenceDataset, SmoothSpeeds, Source, noise_of
+from nnode.data.sequence import Sequence
+from nnode.data.sequences import Sequences
 from nnode.data.smooth import BEARABLE, Noise
-from nnode.errors import ConfigError, SimulationError
+from nnode.errors import ConfigError, DataError, SimulationError
+from nnode.exchange.trajectories import simulated
 from nnode.files import xarray
 from nnode.model import System
-from nnode.model.term import short_names
+from nnode.model.term import physical_bounds, short_names
 from nnode.plots import force_figure
+from nnode.simulation import Solver
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -59,6 +65,50 @@ STALLED = (
 )
 
 
+#: Autocorrelation of residuals at one sample from which the summary warns of it.
+_CORRELATED = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How well a calibrated model fits its training sequences.
+
+    Agents that the model is given as they were measured, such as a measured leader, do not count,
+    and neither does the first sample of a sequence, where the simulation starts.
+
+    Attributes:
+        sequences, agents: their numbers; an agent counts once per sequence.
+        observations: number of measured coordinates.
+        clusters: number of independent clusters.
+        parameters: number of calibrated parameters, with those of the variances.
+        rmse: root mean square distance of simulated from measured positions, m.
+        autocorrelation: of the residuals of an agent, at one sample.
+        log_likelihood: logarithm of the likelihood of the positions (m) at the estimates.
+        likelihood: ``independent normal errors`` of one variance; or ``mixed-effects model`` where
+            drivers differ: the marginal likelihood, with the covariance of disturbances.
+    """
+
+    sequences: int
+    agents: int
+    observations: int
+    clusters: int
+    parameters: int
+    rmse: float
+    autocorrelation: float
+    log_likelihood: float
+    likelihood: str = "independent normal errors"
+
+    @property
+    def aic(self) -> float:
+        """Akaike's information criterion, 2 k - 2 log L."""
+        return 2 * self.parameters - 2 * self.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """The Bayesian information criterion, k log n - 2 log L."""
+        return float(self.parameters * np.log(self.observations) - 2 * self.log_likelihood)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """A calibrated model, and what the data say of it.
@@ -68,7 +118,9 @@ class Calibration:
         parameters: a row per physical parameter, by its address such as ``idm.T``: ``estimate``,
             ``lower`` and ``upper`` ends of its interval of 95 % by clusters (NaN where there is
             none: models without exact tangents, or at a bound), ``unit``, ``at_bound`` (``low``,
-            ``high`` or empty) and ``identified`` (None where there are no intervals).
+            ``high`` or empty) and ``identified`` (None where there are no intervals); then
+            ``std_error``, the degrees of freedom ``df`` of Student's quantile, and ``scale``, in
+            which the interval is symmetric: ``linear`` or ``log``.
         correlation: of the estimates, by address; None without intervals.
         clusters: number of independent clusters behind the intervals; None without.
         cost: mean cost of a training sequence, at the best evaluation; ``cost_start`` at the first.
@@ -99,6 +151,9 @@ class Calibration:
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
+        fit: how well the model fits the training sequences.
+        solver: that simulates the model.
+        measured: the sequences of the training and the held-out ones, as the model starts on them.
     """
 
     model: System
@@ -123,6 +178,9 @@ class Calibration:
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
+    fit: Fit
+    solver: Solver
+    measured: Source
 
     @property
     def name(self) -> str:
@@ -130,12 +188,51 @@ class Calibration:
         return str(self.checkpoint.config["model"]["name"])
 
     def summary(self) -> str:
-        """Costs, and parameters with units and intervals, a line each."""
+        """The fit, a table of parameters with intervals of 95 %, and remarks, as text."""
+        fit, config = self.fit, self.checkpoint.config
+        optimizer = config["groups"].get("optimizer", config["optimizer"]["name"])
+        facts = [
+            ("Model", self.name, "Observations", f"{fit.observations}"),
+            ("Solver", config["solver"]["name"], "Agents", f"{fit.agents}"),
+            ("Optimizer", optimizer, "Sequences", f"{fit.sequences}"),
+            ("Status", self.status, "Clusters", f"{fit.clusters}"),
+            ("Epochs", f"{self.n_iter}", "RMSE (m)", f"{fit.rmse:.4g}"),
+            ("Parameters", f"{fit.parameters}", "Log-likelihood", f"{fit.log_likelihood:.6g}"),
+            ("Time (s)", f"{self.seconds:.1f}", "AIC", f"{fit.aic:.6g}"),
+            ("", "", "BIC", f"{fit.bic:.6g}"),
+        ]
+        lines = [f"{a:<12}{b:<26}{c:<16}{d:>12}" for a, b, c, d in facts]
+        lines += ["", *self._table(), "", *self._costs(), *self._remarks()]
+        return "\n".join(line.rstrip() for line in lines)
+
+    def _table(self) -> list[str]:
+        """The parameters, a line each, with what is wrong with an estimate."""
+        short = short_names(map(str, self.parameters.index))
+        width = max([*map(len, short.values()), 10])
+        heads = ("estimate", "std err", "[0.025", "0.975]")
+        lines = [f"{'':<{width}}" + "".join(f"{head:>12}" for head in heads) + "  unit"]
+        for name, row in _rows(self.parameters).items():
+            values = (row[key] for key in ("estimate", "std_error", "lower", "upper"))
+            cells = (f"{value:.4g}" if np.isfinite(value) else "-" for value in values)
+            remark = f"  {_remark(row)}" if _remark(row) else ""
+            lines.append(
+                f"{short[name]:<{width}}"
+                + "".join(f"{cell:>12}" for cell in cells)
+                + f"  {row['unit']}{remark}"
+            )
+        return lines
+
+    def _costs(self) -> list[str]:
         unit = self.cost_unit
         lines = [f"cost of a training sequence: {self.cost_start:.4g} -> {self.cost:.4g} {unit}"]
         if np.isfinite(self.cost_heldout):
             before, after = self.heldout_start, self.cost_heldout
             lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
+        return lines
+
+    def _remarks(self) -> list[str]:
+        """What a reader of the table should know about the data and the method."""
+        unit, fit, lines = self.cost_unit, self.fit, []
         if self.status == "stalled":
             lines.append(STALLED)
         lines.append(f"{self.noise}{self._started()}")
@@ -157,14 +254,88 @@ class Calibration:
             )
         if self.drivers is not None:
             lines += self.drivers.summary()
+        elif fit.autocorrelation > _CORRELATED:
+            lines.append(
+                "the log-likelihood, AIC and BIC assume independent errors, but the autocorrelation "
+                f"of the residuals is {fit.autocorrelation:.2f} at one sample: compare laws on "
+                "held-out sequences"
+            )
         if self.clusters == 1:
             lines.append(
                 "no intervals: the training sequences are one cluster, of those that share agents "
                 "or are near in time; intervals need at least two"
             )
-        short = short_names(map(str, self.parameters.index))
-        rows = _rows(self.parameters).items()
-        return "\n".join([*lines, *(f"{short[name]} = {_words(row)}" for name, row in rows)])
+        return lines
+
+    def conf_int(self, alpha: float = 0.05) -> pd.DataFrame:
+        """Confidence intervals of the parameters, ``lower`` and ``upper`` by address.
+
+        They are robust to dependence within clusters (CR2 with Satterthwaite's degrees of freedom)
+        and end at the bounds of what is admissible. Those without an interval are NaN.
+
+        Args:
+            alpha: one minus the level.
+
+        Raises:
+            ConfigError: a level that is not between 0 and 1.
+        """
+        if not 0 < alpha < 1:
+            raise ConfigError(f"alpha={alpha}: expected a number between 0 and 1, such as 0.05")
+        table = self.parameters
+        value, error = (table[key].to_numpy(dtype=float) for key in ("estimate", "std_error"))
+        half = students_t.ppf(1 - alpha / 2, table["df"].to_numpy(dtype=float)) * error
+        in_logs = (table["scale"] == "log").to_numpy()
+        relative = np.where(in_logs, half / value, 0.0)
+        limits = physical_bounds(self.model)
+        low = [limits[str(name)].low for name in table.index]
+        high = [limits[str(name)].high for name in table.index]
+        ends = {
+            "lower": np.where(in_logs, value * np.exp(-relative), value - half),
+            "upper": np.where(in_logs, value * np.exp(relative), value + half),
+        }
+        clipped = {key: np.clip(end, low, high) for key, end in ends.items()}
+        shown = np.isfinite(table["lower"].to_numpy(dtype=float))
+        return pd.DataFrame(
+            {key: np.where(shown, end, np.nan) for key, end in clipped.items()}, index=table.index
+        )
+
+    def residuals(self, part: str = "train") -> pd.DataFrame:
+        """Measured minus simulated positions, m.
+
+        Args:
+            part: ``train`` or ``heldout``: which sequences.
+
+        Returns:
+            A row per sequence, time (s) and agent, with ``x``, ``x_simulated`` and ``residual``
+            (for people ``y``, ``y_simulated``, ``residual_x`` and ``residual_y`` too), in the order
+            of the table and with its keys. The first sample of a sequence is left out, since the
+            simulation starts there, and so are agents that the model is given as they were
+            measured. Where drivers differ, all are simulated with the typical driver's parameters.
+
+        Raises:
+            ConfigError: no such part.
+            DataError: no sequence is held out.
+        """
+        items = self._sequences(part)
+        if not items:
+            raise DataError("no sequence is held out; fit with heldout=0.2, for example")
+        paths = list(_simulated(self.model, self.solver, items))
+        table, told = (Sequences(them).to_dataframe() for them in (items, paths))
+        kept = np.concatenate([_counted(self.model, s).ravel() for s in items])
+        found = table[["sequence", "time", "agent"]].copy()
+        axes = "xy"[: items[0].x.shape[2]]
+        for axis in axes:
+            found[axis], found[f"{axis}_simulated"] = table[axis], told[axis]
+            name = "residual" if len(axes) == 1 else f"residual_{axis}"
+            found[name] = table[axis] - told[axis]
+        return found[kept].reset_index(drop=True)
+
+    def _sequences(self, part: str) -> list[Sequence]:
+        split = self.checkpoint.split
+        if part not in ("train", "heldout"):
+            raise ConfigError(f"part={part}: expected train or heldout")
+        places = {entry["name"]: i for i, entry in enumerate(self.measured.index)}
+        return [self.measured[places[name]] for name in split.get(part, [])]
 
     def _started(self) -> str:
         """What was done about first speeds that noise makes wrong."""
@@ -184,8 +355,13 @@ class Calibration:
         )
 
     def plot(self) -> Figure:
-        """The calibrated speed curve, or the force between two people."""
-        return force_figure(self.model)
+        """The calibrated speed curve, or the force between two people, over the training data.
+
+        Points are measured gaps and speeds of followers, or positions of people relative to
+        others. For laws of second order, the curve is the speed at which a platoon is in
+        equilibrium.
+        """
+        return force_figure(self.model, self._sequences("train"))
 
     def to_dataframe(self) -> pd.DataFrame:
         """:attr:`parameters` with their addresses as a column, for a file."""
@@ -268,18 +444,17 @@ class Calibration:
         return {**found, "paths": paths, "history": history}
 
     def __repr__(self) -> str:
-        lines = self.summary().splitlines()
+        lines = [*self._costs(), *self._table(), *self._remarks()]
         return "\n".join([f"{self.name}, calibrated", *(f"  {line}" for line in lines)])
 
     def _repr_html_(self) -> str:
-        lines = [line for line in self.summary().splitlines() if line.startswith("cost")]
         shown = self.parameters[["estimate", "lower", "upper", "unit"]]
         if self.clusters is None:
             shown = shown[["estimate", "unit"]]
         table = shown.to_html(float_format="{:.4g}".format, na_rep="–", border=0)
         rows = _rows(self.parameters).items()
         notes = [f"{name}: {_remark(row)}" for name, row in rows if _remark(row)]
-        words = [f"{self.name}, calibrated", *lines]
+        words = [f"{self.name}, calibrated", *self._costs()]
         foot = "".join(f"<p>{escape(note)}</p>" for note in notes)
         return "<p>" + "<br>".join(map(escape, words)) + f"</p>{table}{foot}"
 
@@ -322,6 +497,8 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         if name in values
     }
     columns = ["estimate", "lower", "upper", "unit", "at_bound", "identified"]
+    columns += ["std_error", "df", "scale"]
+    loaded = cast(SequenceDataset, trainer.train.dataset).store
     correlation = found.get("correlation")
     return Calibration(
         model=model,
@@ -346,7 +523,63 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
+        fit=_fit(trainer, model, loaded, drivers),
+        solver=trainer.solver,
+        measured=loaded,
     )
+
+
+def _fit(trainer: Trainer, model: System, source: Source, drivers: Drivers | None) -> Fit:
+    """How well a model fits the training sequences."""
+    names = set(trainer.provenance.split["train"])
+    places = [i for i, entry in enumerate(source.index) if entry["name"] in names]
+    items = [source[i] for i in places]
+    square, before, after, lagged, agents, samples, dims = 0.0, 0.0, 0.0, 0.0, 0, 0, 1
+    for s, path in zip(items, _simulated(model, trainer.solver, items), strict=True):
+        error = (s.x - path.x)[1:, _counted(model, s)[-1]]
+        dims = error.shape[2]
+        agents, samples = agents + error.shape[1], samples + error.shape[0] * error.shape[1]
+        square += float((error**2).sum())
+        before += float((error[:-1] ** 2).sum())
+        after += float((error[1:] ** 2).sum())
+        lagged += float((error[1:] * error[:-1]).sum())
+    number = max(samples * dims, 1)
+    variance = max(square / number, np.finfo(float).tiny)
+    trained = sum(p.numel() for p in model.parameters() if p.requires_grad)
+    found = Fit(
+        sequences=len(items),
+        agents=agents,
+        observations=number,
+        clusters=len(np.unique(clusters(source.index)[places])),
+        parameters=trained + 1,  # the variance
+        rmse=float(np.sqrt(square / max(samples, 1))),
+        autocorrelation=lagged / np.sqrt(before * after) if before * after > 0 else 0.0,
+        log_likelihood=float(-0.5 * number * (np.log(2 * np.pi * variance) + 1)),
+    )
+    if drivers is None:
+        return found
+    return replace(
+        found,
+        observations=drivers.observations,
+        parameters=trained + drivers.variances,
+        log_likelihood=drivers.log_likelihood,
+        likelihood="mixed-effects model",
+    )
+
+
+def _simulated(model: System, solver: Solver, items: list[Sequence]) -> Iterator[Sequence]:
+    dtype = next(model.parameters()).dtype
+    return simulated(lambda batch: solver(model, batch), items, size=_TOGETHER, dtype=dtype)
+
+
+def _counted(model: System, s: Sequence) -> np.ndarray:
+    """``(K, N)`` True for the samples whose errors count: not the first one, and not those of a
+    leader that is given as it was measured."""
+    counted = np.ones(s.x.shape[:2], dtype=bool)
+    counted[0] = False
+    if getattr(model, "leader", "constant") == "measured":
+        counted[:, -1] = False
+    return counted
 
 
 def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
@@ -467,9 +700,12 @@ def _by_tangents(
 
 def _row(value: float, unit: str, known: dict[str, Any] | None) -> tuple[Any, ...]:
     """A line of the table of parameters."""
-    own = {"low": None, "high": None, "at_bound": None, "identified": None, **(known or {})}
-    ends = [float("nan") if own[end] is None else own[end] for end in ("low", "high")]
-    return value, *ends, unit, own["at_bound"] or "", own["identified"]
+    own = {"at_bound": None, "identified": None, "scale": "linear", **(known or {})}
+    low, high, error, df = (
+        float("nan") if own.get(key) is None else own[key]
+        for key in ("low", "high", "std_error", "df")
+    )
+    return value, low, high, unit, own["at_bound"] or "", own["identified"], error, df, own["scale"]
 
 
 def _rows(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
@@ -487,15 +723,6 @@ def _remark(row: dict[str, Any]) -> str:
     if row["at_bound"]:
         return f"at the {_BOUND[row['at_bound']]} bound of what is admissible"
     return "" if row["identified"] in (None, True) else "not identified by these data"
-
-
-def _words(row: dict[str, Any]) -> str:
-    """An estimate with its interval, and what is wrong with it."""
-    text = f"{row['estimate']:.4g} {row['unit']}"
-    if np.isfinite(row["lower"]):
-        text += f"  [{row['lower']:.4g}, {row['upper']:.4g}]"
-    remark = _remark(row)
-    return f"{text}, {remark}" if remark else text
 
 
 def _as_json(row: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -58,6 +58,9 @@ from nnode.model import build_model
 from nnode.model.effects.own import load_own
 from nnode.program import scripts, typed
 from nnode.progress import Stages
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
@@ -179,8 +182,18 @@ def _diagnosed_table(
     if place is not None:
         for one, found, where in reversed(_places(done, place)):
             _drawn(one, found, where)()
-    first, *others = [Report(diagnosis=found.diagnosis, model=found.extended) for _, found in done]
+    first, *others = [
+        Report(diagnosis=found.diagnosis, model=found.extended, draw=partial(_figure, one, found))
+        for one, found in done
+    ]
     return replace(first, nearest=others[0]) if others else first
+
+
+def _figure(job: Job, found: Found, which: str) -> Figure:
+    """A figure of a diagnosis, drawn when it is asked for."""
+    from nnode.discover.report.captions import figure  # loads Matplotlib, which takes a second
+
+    return figure(which, job.inputs, found, job.options)
 
 
 def _job(

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import t as students_t
 
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
@@ -18,6 +20,7 @@ from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.model.term import Term, short_names
+from nnode.plots.traffic import driver_figure
 
 if TYPE_CHECKING:
     from nnode.population.drivers import Population
@@ -90,8 +93,8 @@ class Drivers:
 
     Attributes:
         model: the law with the parameters of the typical driver, the medians.
-        parameters: address to ``low``, ``high``, ``at_bound``, ``identified``; see
-            :func:`nnode.calibrate.intervals.intervals`.
+        parameters: address to ``low``, ``high``, ``at_bound``, ``identified``, ``std_error``,
+            ``df`` and ``scale``; see :func:`nnode.calibrate.intervals.intervals`.
         correlation: of the estimates, by address, of logarithms where parameters are positive.
         clusters: their number.
         differ: short names of the parameters that differ between drivers.
@@ -100,6 +103,9 @@ class Drivers:
         converged: whether the estimation did.
         bias: of the parameters by short name, by how much they were corrected, as a share where
             they are positive.
+        observations: number of measured positions of followers.
+        variances: number of estimated standard deviations and times.
+        log_likelihood: logarithm of the marginal likelihood of the positions (m).
     """
 
     model: System
@@ -111,6 +117,21 @@ class Drivers:
     table: pd.DataFrame
     converged: bool
     bias: dict[str, float]
+    observations: int
+    variances: int
+    log_likelihood: float
+
+    def plot(self) -> Figure:
+        """The drivers in the order of each parameter that differs, with their standard errors."""
+        if not self.differ:
+            raise ConfigError("no parameter differs between the drivers, so there is no plot")
+        return driver_figure(self.table, self.differ, self.variability, self.units)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of the parameters, by short name."""
+        units = {name: unit for name, (_, unit) in self.model.physical().items()}
+        return {short: units[name] for name, short in short_names(units).items()}
 
     def summary(self) -> list[str]:
         """What differs between drivers, and what disturbs them."""
@@ -192,7 +213,7 @@ def calibrated_drivers(
     whole = copy.deepcopy(model)
     whole.load_state_dict({k: v.to(whole.state_dict()[k]) for k, v in double.state_dict().items()})
     parameters, correlation, number = _intervals(found, cluster)
-    short = short_names(followers.names)
+    short, variances = short_names(followers.names), found.estimate.variances
     return Drivers(
         model=whole,
         parameters=parameters,
@@ -206,6 +227,10 @@ def calibrated_drivers(
             short[name]: float(np.expm1(bias) if in_logs else bias)
             for name, bias, in_logs in zip(followers.names, found.bias, followers.logs, strict=True)
         },
+        observations=int(found.estimate.data.seen.sum()),
+        variances=int((variances.low < variances.high).sum()),
+        # that of the restricted likelihood would not compare laws with other parameters
+        log_likelihood=float(found.marginal.each.sum()),
     )
 
 
@@ -214,7 +239,7 @@ def _intervals(
 ) -> tuple[dict[str, Any], dict[str, dict[str, float]], int]:
     """Intervals, correlations and the number of clusters, as
     :func:`nnode.calibrate.intervals.intervals` gives them."""
-    from nnode.calibrate.intervals import VAGUE
+    from nnode.calibrate.intervals import LEVEL, VAGUE
     from nnode.population.intervals import at_bounds, influence
 
     model, theta, paths = found.model, found.estimate.theta, found.model.paths
@@ -224,7 +249,8 @@ def _intervals(
     known, free = influence(found, own)
     low, high = at_bounds(found)
     half = np.full(len(theta), np.inf)
-    half[free] = known.half_widths()
+    degrees = np.ones(len(theta))
+    half[free], degrees[free] = known.half_widths(), known.degrees()
     if number < 2:
         half[:] = np.inf
     ends = [model.natural(np.clip(theta + s * half, model.low, model.high)) for s in (-1.0, 1.0)]
@@ -234,9 +260,13 @@ def _intervals(
     parameters: dict[str, Any] = {}
     for i, name in enumerate(model.names):
         sure = bool(np.isfinite(half[i]))
+        error = half[i] / students_t.ppf(0.5 + LEVEL / 2, degrees[i])
         parameters[name] = {
             "low": float(ends[0][i]) if sure else None,
             "high": float(ends[1][i]) if sure else None,
+            "std_error": float(error * (value[i] if model.logs[i] else 1.0)) if sure else None,
+            "df": float(degrees[i]) if sure else None,
+            "scale": "log" if model.logs[i] else "linear",
             "at_bound": "low" if low[i] else "high" if high[i] else None,
             "identified": sure and bool(ends[1][i] - ends[0][i] < scale[i]) if number > 1 else None,
         }

@@ -141,8 +141,9 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
         cluster: ``(B,)`` which cluster a sequence belongs to.
 
     Returns:
-        ``parameters``: address to ``value``, ``low``, ``high``, ``at_bound`` and ``identified``,
-        None where there is one cluster, and the cost depends on the parameter;
+        ``parameters``: address to ``value``, ``low``, ``high``, ``std_error``, the degrees of
+        freedom ``df``, ``at_bound`` and ``identified``, None where there is one cluster, and the
+        cost depends on the parameter;
         ``correlation``: address to address to correlation; ``clusters``: their number. Weights of
         networks are not listed.
     """
@@ -150,7 +151,9 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
     free = ~(low | high)
     found, number = influence(problem, row, cluster, free), len(np.unique(cluster))
     half, lost = np.zeros(len(row)), ~free
-    half[free] = found.half_widths()
+    covariance, degrees = found.covariance(), np.ones(len(row))
+    half[free], degrees[free] = found.half_widths(), found.degrees()
+    error = half / students_t.ppf(0.5 + LEVEL / 2, degrees)
     # with one cluster nothing tells how sure the others are
     lost[free] = found.flat | (len(problem.batch) < 2)
     parameters: dict[str, Any] = {}
@@ -162,11 +165,12 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
             "value": float(row[i]),
             "low": float(max(row[i] - half[i], problem.low[i])) if known else None,
             "high": float(min(row[i] + half[i], problem.high[i])) if known else None,
+            "std_error": float(error[i]) if known else None,
+            "df": float(degrees[i]) if known else None,
             "at_bound": "low" if low[i] else "high" if high[i] else None,
             "identified": bool(known and 2 * half[i] < scale) if number > 1 or lost[i] else None,
         }
     table = np.full((len(row), len(row)), np.nan)
-    covariance = found.covariance()
     spread = np.sqrt(np.diag(covariance))
     spread = np.where((spread > 0) & np.isfinite(half[free]), spread, np.nan)
     table[np.ix_(free, free)] = covariance / np.outer(spread, spread)

@@ -225,6 +225,16 @@ def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
     }
 
 
+def physical_bounds(module: nn.Module) -> dict[str, Interval]:
+    """Address to the admissible values of every parameter of :func:`physical_parameters`."""
+    terms = [term for term in module.modules() if isinstance(term, Term) and term.units]
+    return {
+        f"{owner}.{name}": term.bounds.get(name, Interval())
+        for owner, term in zip(numbered(term.name for term in terms), terms, strict=True)
+        for name in term.units
+    }
+
+
 def numbered(names: Iterable[str]) -> list[str]:
     """Names of terms, of which the second of one name is numbered, and those after it."""
     seen: Counter[str] = Counter()

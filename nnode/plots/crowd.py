@@ -5,6 +5,7 @@ The sign of a force is explained in :mod:`nnode.plots.interaction`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
+from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.model.extend import beside
@@ -42,6 +44,8 @@ HEAD_ON = (2.0, 0.0)
 
 #: Half widths (m) of the contour panels in the paper: short and long ranged forces.
 EXTENT = {"short": 0.5, "long": 4.0}
+#: Measured pairs that a figure shows at most.
+POINTS = 1500
 #: An even number keeps the grid off the origin, where a repulsion has no direction.
 GRID = 160
 #: The colour scale ends at this percentile of |F| where a peak is far above it.
@@ -82,12 +86,34 @@ def force_contours(
     return figure
 
 
-def head_on_figure(system: System, *, extent: float | None = None) -> Figure:
-    """Both force components for v_i - v_j = (2, 0) m/s, as :func:`force_contours` draws them."""
+def relative_positions(sequences: Iterable[Sequence], number: int = POINTS) -> np.ndarray:
+    """``(P, 2)`` x_i - x_j (m) of people of one sequence and time, evenly thinned out to at most
+    ``number`` pairs within the widest figure."""
+    parts = [np.empty((0, 2))]
+    for s in sequences:
+        away = s.x[:, :, None] - s.x[:, None]
+        parts.append(away[:, ~np.eye(s.n_agents, dtype=bool)].reshape(-1, 2))
+    found = np.concatenate(parts)
+    found = found[np.abs(found).max(1, initial=0.0) <= max(EXTENT.values())]
+    return found[:: max(1, -(-len(found) // number))]
+
+
+def head_on_figure(
+    system: System, *, extent: float | None = None, points: np.ndarray | None = None
+) -> Figure:
+    """Both force components for v_i - v_j = (2, 0) m/s, as :func:`force_contours` draws them.
+
+    Args:
+        points: ``(P, 2)`` measured relative positions, m, drawn as dots.
+    """
     figure = new_figure(7.2, 3.6)
     axes = figure.subplots(1, 2, sharey=True)
     _contours(figure, system, [(axes[c], HEAD_ON, c) for c in (0, 1)], extent, None)
     for ax, letter in zip(axes, "xy", strict=True):
+        if points is not None:
+            limits = ax.get_xlim(), ax.get_ylim()
+            ax.scatter(*points.T, s=1.5, color=GREY, alpha=0.35, linewidths=0, gid="measured")
+            ax.set(xlim=limits[0], ylim=limits[1])
         _label(ax, f"$F_{letter}$, ", HEAD_ON)
     return figure
 

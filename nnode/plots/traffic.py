@@ -35,7 +35,11 @@ SHOWN = (-20.0, 60.0)
 SUPPORT = (1.0, 99.0)
 KMH = 3.6
 SAMPLES = 481
+#: Gaps (m) of a figure.
+SPAN = (2.0, 50.0)
 BINS = 48
+#: Measured samples that a figure shows at most.
+POINTS = 3000
 
 
 def follow_law(system: System, name: str = "model") -> Law:
@@ -70,6 +74,22 @@ def measured_gaps(sequences: Iterable[Sequence]) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
+def measured_speeds(sequences: Iterable[Sequence], number: int = POINTS) -> np.ndarray:
+    """``(P, 2)`` gaps x_{i+1} - x_i (m) and speeds (m/s) of followers, evenly thinned out to at
+    most ``number`` samples. Speeds that were not measured are central differences.
+
+    Raises:
+        DataError: a sequence is not one-dimensional.
+    """
+    parts = [np.empty((0, 2))]
+    for s in sequences:
+        gap = measured_gaps([s])
+        speed = s.v if s.v is not None else np.gradient(s.x, s.dt, axis=0)
+        parts.append(np.column_stack([gap, speed[:, :-1, 0].ravel()]))
+    found = np.concatenate(parts)
+    return found[:: max(1, -(-len(found) // number))]
+
+
 @torch.no_grad()
 def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
     """Speed W (m/s) of every model at ``gaps`` (m).
@@ -98,7 +118,8 @@ def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
 def speed_curves(
     models: Mapping[str, System],
     gaps: np.ndarray | None = None,
-    span: tuple[float, float] = (2.0, 50.0),
+    span: tuple[float, float] | None = None,
+    points: np.ndarray | None = None,
 ) -> Figure:
     """Speed against gap for one or many models.
 
@@ -110,7 +131,8 @@ def speed_curves(
         models: name to traffic model.
         gaps: measured gaps in m, for a histogram below. Curves fade outside the 1st to 99th
             percentile, where no data support them.
-        span: the gaps shown, m.
+        span: the gaps shown, m; None: 2 to 50 m, or as far as 99 % of the points go.
+        points: ``(P, 2)`` measured gaps (m) and speeds (m/s), drawn as dots behind the curves.
 
     Raises:
         ConfigError: no model, one without a law of the gap, or a span without 0 < low < high.
@@ -118,9 +140,7 @@ def speed_curves(
 
     Source: Göttlich & Totzeck, figure (interactionForce).
     """
-    low, high = map(float, span)
-    if not 0 < low < high < np.inf:
-        raise ConfigError(f"span must be two gaps in m with 0 < low < high, got {span}")
+    low, high = _shown_gaps(span, points)
     table = curve_table(models, np.linspace(low, high, SAMPLES))
     leaders = {
         name: float(follow_law(system).get_parameter("v0").detach())
@@ -140,7 +160,10 @@ def speed_curves(
             for edge in ((low, support[0]), (support[1], high)):
                 if edge[0] < edge[1]:
                     panel.axvspan(*edge, color=SHADE, linewidth=0, zorder=0)
-    dress(ax, x="gap (m)" if gaps is None else "", y="speed W (m/s)")
+    # a law of second order has no speed of the gap alone
+    direct = all(follow_law(system).of_gap for system in models.values())
+    what = "speed W" if direct else "equilibrium speed"
+    dress(ax, x="gap (m)" if gaps is None else "", y=f"{what} (m/s)")
     names = [str(name) for name in table]
     many = len(names) > len(OKABE_ITO)
     styles, handles = (_many if many else _few)(names)
@@ -148,14 +171,19 @@ def speed_curves(
         # side by side, since calibrated leaders often drive at nearly the same speed
         place = 0.985 - (0 if many else 0.022 * i)
         _curve(ax, name, table[name], support, leaders.get(name), place, style)
+    if points is not None:
+        style = {"color": GREY, "alpha": 0.25, "linewidths": 0, "zorder": 1}
+        ax.scatter(points[:, 0], points[:, 1], s=3, gid="measured", **style)
+        handles.append(Line2D([], [], color=GREY, marker=".", linestyle="", label="measured"))
     if leaders:
         marker = styles[0]["marker"] if many else ""
         label = "markers: leader's v0"
         handles.append(Line2D([], [], color=GREY, marker=marker, linestyle="", label=label))
     ax.set_xlim(low, high)
-    _limit(ax, table, list(leaders.values()), _left_out(models))
+    shown = [] if points is None else list(np.percentile(points[:, 1], SUPPORT))
+    _limit(ax, table, [*leaders.values(), *shown], _left_out(models))
     right = ax.secondary_yaxis("right", functions=(_to_kmh, _from_kmh))
-    right.set_ylabel("speed W (km/h)", fontsize=ax.yaxis.label.get_fontsize())
+    right.set_ylabel(f"{what} (km/h)", fontsize=ax.yaxis.label.get_fontsize())
     right.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
     right.spines["right"].set(linewidth=0.6, edgecolor=GREY)
     right_half = table.to_numpy()[SAMPLES // 2 :]
@@ -177,6 +205,17 @@ def traffic_figures(
 ) -> dict[str, Figure]:
     """Every figure of traffic models: ``speed``, see :func:`speed_curves`."""
     return {"speed": speed_curves(models, gaps)}
+
+
+def _shown_gaps(span: tuple[float, float] | None, points: np.ndarray | None) -> tuple[float, float]:
+    """The ends of the axis of gaps, m."""
+    if span is None:
+        far = 0.0 if points is None else float(np.percentile(points[:, 0], SUPPORT[1]))
+        return SPAN[0], max(SPAN[1], far)
+    low, high = map(float, span)
+    if not 0 < low < high < np.inf:
+        raise ConfigError(f"span must be two gaps in m with 0 < low < high, got {span}")
+    return low, high
 
 
 def _to_kmh(speed: Any) -> Any:
@@ -320,4 +359,37 @@ def follower_errors(rows: pd.DataFrame) -> Figure:
         ax.axhline(0, color=GREY, linewidth=0.8)
         dress(ax, x="followers, in order of RMSE", y=f"{what} error ({unit})")
     axes[0].legend(fontsize=SMALL_FONT, frameon=False)
+    return figure
+
+
+def driver_figure(
+    table: pd.DataFrame, names: list[str], variability: pd.DataFrame, units: Mapping[str, str]
+) -> Figure:
+    """The parameters of drivers in ascending order, with bars of one standard error.
+
+    Args:
+        table: a row per driver with ``NAME`` and ``NAME_error``.
+        names: the parameters, a panel each.
+        variability: by name the standard deviation between drivers, ``estimate`` in %.
+        units: by name.
+    """
+    figure = new_figure(1.2 + 3.4 * len(names), 3.4)
+    panels = figure.subplots(1, len(names), squeeze=False)[0]
+    for i, (ax, name) in enumerate(zip(panels, names, strict=True)):
+        rows = table.sort_values(name)
+        color = curve_style(i)["color"]
+        ax.errorbar(
+            rows[name],
+            np.arange(1, len(rows) + 1),
+            xerr=rows[f"{name}_error"],
+            fmt="o",
+            markersize=3,
+            linewidth=0.8,
+            color=color,
+        )
+        ax.axvline(float(rows[name].median()), color=GREY, linewidth=0.8, linestyle="--")
+        title = f"standard deviation between drivers {variability.estimate[name]:.3g} %"
+        unit = units.get(name, "")
+        label = name if unit in ("", "1") else f"{name} ({unit})"
+        dress(ax, x=label, y="driver, in order" if i == 0 else "", title=title)
     return figure

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from nnode.discover.report.files import interval, plain_report, sentence
+from nnode.discover.report.files import amount, closed, interval, plain_report, sentence
 from nnode.discover.result import Clusters, DataFault, Diagnosis, Gap, NamedEffect, Place
+from nnode.errors import ConfigError
 from nnode.files import xarray
 from nnode.model import System
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from xarray import Dataset
 
 
@@ -25,11 +28,13 @@ class Report:
         diagnosis: all that was found; the properties are its most asked parts.
         model: the model with what was named, calibrated; without, the calibrated model alone.
         nearest: the same of the law that comes nearest, where another one was asked for.
+        draw: draws a figure by its name; None: the diagnosis was read, not made.
     """
 
     diagnosis: Diagnosis
     model: System
     nearest: Report | None = None
+    draw: Callable[[str], Figure] | None = None
 
     @property
     def verdict(self) -> str:
@@ -71,6 +76,51 @@ class Report:
     def sentence(self) -> str:
         """The verdict in words."""
         return sentence(self.diagnosis)
+
+    def plot(self, which: str = "map") -> Figure:
+        """A figure of the page.
+
+        Args:
+            which: ``map``: measured minus simulated speed in space and time, or acceleration by
+                place, before and after the effects were added; ``sealed``: errors of the held-back
+                sequences, before and after; ``coefficients`` of the effects; ``where``: deviations
+                by variable.
+
+        Raises:
+            ConfigError: no such figure, or a report without the data behind it.
+        """
+        if self.draw is None:
+            raise ConfigError("this report has no data to draw; use the one of nnode.diagnose")
+        return self.draw(which)
+
+    def summary(self) -> str:
+        """The verdict, the errors, the effects and the drivers as text."""
+        d = self.diagnosis
+        gap, noise = d.gap, amount(d.gap.noise_floor)
+        lines = [
+            self.sentence,
+            "",
+            f"{'Model':<34}{d.model}",
+            f"{'Clusters, searched and held back':<34}{d.clusters.open} and {d.clusters.sealed}",
+            f"{'Error before, held-back data (m²)':<34}{amount(gap.before)}",
+            f"{'Error after, held-back data (m²)':<34}{amount(gap.after)}",
+            f"{'Noise floor (m²)':<34}{noise}",
+            f"{'Share of the gap that is closed':<34}{closed(d)}",
+        ]
+        for title, effects in (("Effects", self.effects), ("Not confirmed", self.leads)):
+            rows = [
+                (f"{effect.name}.{name}", c.value, c.low, c.high, c.unit)
+                for effect in effects
+                for name, c in effect.coefficients.items()
+            ]
+            lines += _table(title, rows)
+        drivers = [(v.name, v.estimate, v.lower, v.upper, v.unit) for v in d.drivers]
+        lines += _table("Differences between drivers and disturbances", drivers)
+        absent = [(a.name, a.detectable, a.unit) for a in d.absences if a.testable]
+        if absent:
+            lines += ["", "Not found; an effect of this strength is detected with 80 % power"]
+            lines += [f"{name:<28}{amount(size):>12}  {unit}" for name, size, unit in absent]
+        return "\n".join(line.rstrip() for line in lines)
 
     def plain(self) -> dict[str, Any]:
         """The content of ``report.json``."""
@@ -118,3 +168,15 @@ class Report:
         if table.empty:
             return head
         return head + table.to_html(index=False, float_format="{:.4g}".format, border=0)
+
+
+def _table(title: str, rows: list[tuple[str, float, float, float, str]]) -> list[str]:
+    """Estimates with intervals of 95 %, under a title; nothing without rows."""
+    if not rows:
+        return []
+    heads = "".join(f"{head:>12}" for head in ("estimate", "[0.025", "0.975]"))
+    lines = ["", title, f"{'':<28}{heads}  unit"]
+    for name, *values, unit in rows:
+        cells = "".join(f"{amount(value, 4):>12}" for value in values)
+        lines.append(f"{name:<28}{cells}  {unit}")
+    return lines

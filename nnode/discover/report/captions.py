@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
@@ -25,6 +26,7 @@ from nnode.discover.report.figures.marks import (
 from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.discover.report.files import amount, individual, interval
 from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
+from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.pages.page import FigureBlock
 from nnode.pages.replay import ReplayBlock
@@ -89,6 +91,24 @@ def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
         )
     drawn.paths += _paths(found, options)
     return drawn
+
+
+def figure(which: str, inputs: Inputs, found: Found, options: DiscoverOptions) -> Figure:
+    """One figure of a diagnosis by its name on the page.
+
+    Args:
+        which: ``map`` of the deviations before and after, ``sealed`` for the errors of the held-back
+            sequences, ``coefficients`` of the effects, or ``where`` for deviations by variable.
+
+    Raises:
+        ConfigError: the diagnosis has no such figure; names those that it has.
+    """
+    drawn = figures(inputs, found, replace(options, replay=False))
+    blocks = [*drawn.map, *drawn.gap, *drawn.effects, *drawn.places, *drawn.unknown]
+    every = {block.name: block.figure for block in blocks}
+    if which not in every:
+        raise ConfigError(f"there is no figure {which!r}; this diagnosis has {', '.join(every)}")
+    return every[which]
 
 
 def _sealed(found: Found) -> FigureBlock:
