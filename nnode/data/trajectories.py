@@ -11,6 +11,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,8 @@ class Trajectories:
         time: ``(R,)`` s.
         x: ``(R, D)`` m, along the lane (growing as vehicles drive on) or in the plane; NaN where
             a sample is missing.
-        v: ``(R, D)`` m/s, NaN where a sample is missing, or None.
+        v: ``(R, D)`` m/s, or ``(R, 1)`` of speeds whose direction is unknown; NaN where a sample is
+            missing; or None.
         recording: ``(R,)`` names, or None: all rows are of one.
         sequence: ``(R,)`` names of the sequences or pairs that the source is cut into, or None.
         lane: ``(R,)`` names, or None: there is one.
@@ -82,6 +84,52 @@ class Trajectories:
             name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)
         }
         return replace(self, where=lambda i: self.where(int(rows[i])), **own)
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """``(S,)`` s from each row of an agent to its next one in time."""
+        names = [n for n in ("recording", "sequence", "agent") if getattr(self, n) is not None]
+        columns = pd.DataFrame({n: getattr(self, n) for n in names})
+        code = columns.groupby(names, sort=False).ngroup().to_numpy()
+        order = np.lexsort((self.time, code))
+        return np.asarray(np.diff(self.time[order])[np.diff(code[order]) == 0])
+
+    @cached_property
+    def dt(self) -> float:
+        """The sampling interval (s) of agents' rows; NaN where no agent has two.
+
+        It is the mean of steps and of the parts of multiple ones, so that times which were rounded
+        do not drift; of uneven times it is rounded to two or three digits.
+        """
+        step = self.steps[self.steps > 0]
+        if not step.size:
+            return float("nan")
+        usual = float(np.median(step))
+        step = step[step < LATEST * usual]
+        number = np.maximum(np.round(step / usual), 1)
+        # whatever the order of rows
+        mean = math.fsum(step) / float(number.sum())
+        if (np.abs(step - number * usual) <= UNEVEN * usual).all():
+            return mean
+        short = float(f"{mean:.2g}")
+        return short if abs(short - mean) <= 2 * UNEVEN * mean else float(f"{mean:.3g}")
+
+    def in_order(self) -> Trajectories:
+        """The rows with an agent, a time and a position, in the order of agents and, of each, of
+        time; no time twice."""
+        code = pd.factorize(self.agent)[0]
+        known = np.isfinite(self.time) & np.isfinite(self.x).all(axis=1) & (code >= 0)
+        order = np.flatnonzero(known)
+        order = order[np.lexsort((self.time[order], code[order]))]
+        repeated = (np.diff(code[order]) == 0) & (np.diff(self.time[order]) == 0)
+        return self.at(np.delete(order, np.flatnonzero(repeated) + 1))
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(N,)`` first and last row of every agent of rows :meth:`in_order`."""
+        begins = np.ones(len(self), dtype=bool)
+        begins[1:] = self.agent[1:] != self.agent[:-1]
+        start = np.flatnonzero(begins)
+        return start, np.append(start[1:], len(self)) - 1
 
     def parts(self, *names: str) -> Iterator[tuple[tuple[str, ...], Trajectories]]:
         """The rows of every combination of names, such as ``recording``, in order of first rows."""
@@ -130,34 +178,6 @@ class Record:
     def last(self) -> int:
         """Number of the last time."""
         return self.first + len(self.x) - 1
-
-
-def usual_step(table: Trajectories) -> float:
-    """The sampling interval (s) of agents' rows; NaN where no agent has two.
-
-    It is the mean of steps and of the parts of multiple ones, so that times which were rounded do
-    not drift; of uneven times it is rounded to two or three digits.
-    """
-    names = [n for n in ("recording", "sequence", "agent") if getattr(table, n) is not None]
-    code = pd.DataFrame({n: getattr(table, n) for n in names}).groupby(names, sort=False).ngroup()
-    order = np.lexsort((table.time, code))
-    return usual_interval(np.diff(table.time[order])[np.diff(code.to_numpy()[order]) == 0])
-
-
-def usual_interval(step: np.ndarray) -> float:
-    """The sampling interval (s) that steps are multiples of, see :func:`usual_step`."""
-    step = step[step > 0]
-    if not step.size:
-        return float("nan")
-    usual = float(np.median(step))
-    step = step[step < LATEST * usual]
-    number = np.maximum(np.round(step / usual), 1)
-    # whatever the order of rows
-    mean = math.fsum(step) / float(number.sum())
-    if (np.abs(step - number * usual) <= UNEVEN * usual).all():
-        return mean
-    short = float(f"{mean:.2g}")
-    return short if abs(short - mean) <= 2 * UNEVEN * mean else float(f"{mean:.3g}")
 
 
 def measured_times(table: Trajectories, grid: Grid, first: int, last: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,6 +165,11 @@ class Meaning:
     unit: str
     sure: str
     rivals: tuple[str, ...] = ()
+
+
+def clock_of(found: Mapping[str, Meaning]) -> str:
+    """The meaning of the column that times are from, ``time`` or ``frame``."""
+    return "time" if "time" in found else "frame"
 
 
 def plain(name: str) -> tuple[str, str]:

@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from nnode.data.check import findings as find
-from nnode.data.check.columns import Meaning, in_seconds, meanings
+from nnode.data.check.columns import Meaning, clock_of, in_seconds, meanings
 from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.rows import scaled
 from nnode.data.check.scale import Medians, Scale, medians
 from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
-from nnode.data.check.tracks import Tracks, tracks_from
 from nnode.data.cut import Reading
 from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
@@ -21,6 +22,7 @@ from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
+from nnode.data.trajectories import Trajectories
 from nnode.errors import NNodeError
 
 #: Sequences in which faults are looked for.
@@ -47,7 +49,7 @@ class Examination:
         meanings: column by meaning; empty where the format fixes them.
         scales: combinations of units, the most probable first; one where the format fixes them.
         known: medians in the file's own units.
-        tracks: rows in SI units, by the most probable units.
+        rows: in order and in SI units, by the most probable units.
         findings: errors first.
         source: what reads it, with its options.
         sequences: that the reader makes, at most :data:`MOST`.
@@ -59,7 +61,7 @@ class Examination:
     meanings: dict[str, Meaning]
     scales: list[Scale]
     known: Medians
-    tracks: Tracks
+    rows: Trajectories
     findings: list[Finding]
     source: Source
     sequences: list[Sequence] = field(default_factory=list)
@@ -105,12 +107,49 @@ def _native(raw: Raw) -> Examination:
     """A format whose reader knows its units."""
     source = source_of(raw)
     sequences = _read(source)
-    tracks = tracks_from(sequences, cut=raw.native in _CUT)
-    domain: Domain = "crowd" if tracks.x.shape[1] == 2 else "traffic"
-    known = medians(tracks, domain)
+    rows = _rows_of(raw, sequences)
+    domain: Domain = "crowd" if rows.x.shape[1] == 2 else "traffic"
     scale = replace(_SI, domain=domain)
-    found = Examination(raw.path, raw, {}, [scale], known, tracks, [], source)
+    found = Examination(raw.path, raw, {}, [scale], medians(rows, domain), rows, [], source)
     return _judged(found, sequences, None)
+
+
+def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
+    """Sequences that a reader made, as rows in order.
+
+    An agent without an identifier is one of its own, and so is everyone in sequences whose
+    positions begin anew.
+    """
+    parts: list[tuple[np.ndarray, ...]] = []
+    for s in sequences:
+        n, k = s.n_agents, s.n_samples
+        whose = s.name if raw.native in _CUT or not s.agents else s.recording
+        names = [f"{whose} {name}" for name in s.agents or range(n)]
+        v = np.full((k, n), np.nan) if s.v is None else np.linalg.norm(s.v, axis=2)
+        length = np.full(n, np.nan) if s.length is None else s.length
+        parts.append(
+            (
+                np.tile(np.array(names, dtype=object), k),
+                np.repeat(s.time, n),
+                s.x.reshape(k * n, -1),
+                v.reshape(-1, 1),
+                np.tile(length, k),
+                np.full(k * n, s.recording, dtype=object),
+            )
+        )
+    agent, time, x, v, length, recording = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return Trajectories(
+        path=raw.path,
+        name=raw.path.stem,
+        where=str,
+        agent=agent,
+        time=time,
+        x=x,
+        v=None if np.isnan(v).all() else v,
+        recording=recording,
+        lane=recording,
+        length=None if np.isnan(length).all() else length,
+    ).in_order()
 
 
 def _table(
@@ -122,17 +161,18 @@ def _table(
     found = seen.meanings
     rate = rate or raw.rate
     every = seen.scales
-    source = source_of(raw, found, seen.scale, seen.tracks)
-    examined = Examination(raw.path, raw, found, every, seen.known, seen.tracks, [], source)
+    source = source_of(raw, found, seen.scale, seen.rows)
+    examined = Examination(raw.path, raw, found, every, seen.known, seen.rows, [], source)
     needed: dict[str, str] = {
         m: found[m].column
-        for m in ("agent", seen.clock, "x", "y", "x_follower", "x_leader")
+        for m in ("agent", clock_of(found), "x", "y", "x_follower", "x_leader")
         if m in found
     }
     if is_spaced(found):
         needed |= {m: found[m].column for m in ("spacing", "v_follower", "v_leader")}
     examined.findings += find.cells(table, needed)
-    examined.findings += find.rows(table, seen.agent[: len(table)], seen.time[: len(table)])
+    stand = seen.table.at(np.arange(len(table)))
+    examined.findings += find.order(stand, int(table.frame.duplicated().sum()))
     examined.findings += _unsure(every, rate)
     examined.findings += _rivals(found)
     sequences = _tried(source, examined.findings)
@@ -202,13 +242,13 @@ def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:
 
 def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -> Examination:
     """With everything that rows and sequences show."""
-    tracks, domain = found.tracks, found.scale.domain
-    found.findings += find.sampling(tracks)
+    rows, domain = found.rows, found.scale.domain
+    found.findings += find.sampling(rows)
     found.findings += find.time_scale(found.known, found.scale, rate)
-    found.findings += find.extremes(tracks, domain)
-    found.findings += find.direction(tracks, domain)
+    found.findings += find.extremes(rows, domain)
+    found.findings += find.direction(rows, domain)
     whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
-    found.findings += find.coming_and_going(tracks, domain, whole)
+    found.findings += find.coming_and_going(rows, domain, whole)
     found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
     noise = measured_noise(found.sequences)
     known = 0.0 if found.source.options.published else noise.position

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nnode.data.check.tracks import Tracks
+from nnode.data.trajectories import Trajectories
 
 #: Records of fewer samples say too little, and no more of them are looked at.
 LEAST, MOST = 48, 150
@@ -17,8 +17,8 @@ STRAIGHT = 0.95
 CLEAR = 6.0
 
 
-def sway(tracks: Tracks) -> float:
-    """Frequency of people's lateral sway, in cycles per unit of the tracks' time.
+def sway(rows: Trajectories) -> float:
+    """Frequency of people's lateral sway, in cycles per unit of the time of rows in order.
 
     The spectrum of velocities across everyone's way, a mean over people, times the frequency, as
     slow turns would hide a sway of some centimetres. NaN where no peak stands out: in records
@@ -28,16 +28,15 @@ def sway(tracks: Tracks) -> float:
     Applied Physiology 99), 1.8 to 2.0 in shops and on bridges (Pachi & Ji 2005, The Structural
     Engineer 83); a sway takes two steps.
     """
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks))
-    even = np.abs(np.diff(tracks.time) - tracks.dt) < 0.01 * tracks.dt
+    start, last = rows.ends()
+    even = np.abs(np.diff(rows.time) - rows.dt) < 0.01 * rows.dt
     total, number = np.zeros(len(BAND)), 0
-    for a, b in zip(start.tolist(), end.tolist(), strict=True):
-        way = tracks.x[b - 1] - tracks.x[a]
+    for a, b in zip(start.tolist(), (last + 1).tolist(), strict=True):
+        way = rows.x[b - 1] - rows.x[a]
         far = np.hypot(*way)
-        if b - a < LEAST or not even[a : b - 1].all() or far <= STRAIGHT * _length(tracks.x[a:b]):
+        if b - a < LEAST or not even[a : b - 1].all() or far <= STRAIGHT * _length(rows.x[a:b]):
             continue
-        across = tracks.x[a:b] @ np.array([-way[1], way[0]]) / far
+        across = rows.x[a:b] @ np.array([-way[1], way[0]]) / far
         v = np.diff(across)
         v = (v - v.mean()) * np.hanning(len(v))
         power = np.abs(np.exp(-2j * np.pi * np.outer(BAND, np.arange(len(v)))) @ v) ** 2
@@ -53,7 +52,7 @@ def sway(tracks: Tracks) -> float:
     top = inner[np.argmax(power[inner])]
     if power[top] < CLEAR * np.median(power):
         return float("nan")
-    return float(BAND[top] / tracks.dt)
+    return float(BAND[top] / rows.dt)
 
 
 def _length(x: np.ndarray) -> float:

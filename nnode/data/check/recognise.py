@@ -112,7 +112,7 @@ def _of_table(
     elif told or _si(seen.scale) or _share(seen) < SURE:
         return _by_name(raw, exact, given)
     found = seen.meanings
-    read = source_of(raw, found, seen.scale, seen.tracks)
+    read = source_of(raw, found, seen.scale, seen.rows)
     line = _line(raw, found, seen, read.group)
     if not memory:
         return Recognised(read.group, read.options, None, line)

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import pandas as pd
 from scipy.spatial import cKDTree
 
 from nnode.data.check.gait import sway
-from nnode.data.check.tracks import Moves, Tracks
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
 from nnode.data.sequence import TIME_UNITS, Domain
+from nnode.data.trajectories import Trajectories
 
 #: Frame rates of cameras and of published files, 1/s, the usual ones first: they win ties.
 RATES = (25.0, 30.0, 10.0, 16.0, 15.0, 50.0, 60.0, 20.0, 24.0, 29.97, 12.5, 5.0, 2.5)
@@ -112,6 +113,43 @@ _OTHER = 0.1
 _AGAINST = 0.002
 
 
+#: Samples over which displacements are taken: the noise of single positions is small in them.
+LAG = 10
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Displacements.
+
+    Attributes:
+        first, last: ``(M,)`` rows between which they are.
+        size, took: ``(M,)`` their lengths and times.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    size: np.ndarray
+    took: np.ndarray
+
+
+def moves_of(rows: Trajectories, lag: int = LAG) -> Moves:
+    """Displacements over ``lag`` unbroken samples of rows in order; over fewer where no agent has
+    so many."""
+
+    def unbroken(lag: int) -> np.ndarray:
+        took = rows.time[lag:] - rows.time[: len(rows) - lag]
+        same = rows.agent[lag:] == rows.agent[: len(rows) - lag]
+        return np.flatnonzero(same & (took < 1.5 * lag * rows.dt))
+
+    first = unbroken(min(lag, len(rows)))
+    while lag > 1 and not first.size:
+        lag //= 2
+        first = unbroken(min(lag, len(rows)))
+    last = first + lag
+    size = np.linalg.norm(rows.x[last] - rows.x[first], axis=1)
+    return Moves(first, last, size, rows.time[last] - rows.time[first])
+
+
 @dataclass(frozen=True)
 class Medians:
     """What is known in the file's own units; NaN where it is not.
@@ -167,50 +205,51 @@ class Scale:
         return SPEED_UNITS[self.speed]
 
 
-def medians(tracks: Tracks, domain: Domain) -> Medians:
-    """What the scale is told by."""
-    moves = tracks.moves()
+def medians(rows: Trajectories, domain: Domain) -> Medians:
+    """What the scale is told by, of rows in order."""
+    moves = moves_of(rows)
     speed = ratio = float("nan")
-    if len(moves):
+    if moves.size.size:
         each = moves.size / moves.took
         moving = each > 0.1 * np.percentile(each, 90)
         if moving.any():
             speed = float(np.median(each[moving]))
-            ratio = _ratio(tracks, moves, moving)
+            ratio = _ratio(rows, moves, moving)
     length = float("nan")
-    if tracks.length is not None and np.isfinite(tracks.length).any():
+    if rows.length is not None:
         # each agent once: standing ones have most rows
-        _, row = np.unique(tracks.agent, return_index=True)
-        own = tracks.length[row]
-        length = float(np.nanmedian(own)) if np.isfinite(own).any() else length
-    clock = sway(tracks) if domain == "crowd" else float("nan")
-    return Medians(speed, nearest(tracks, domain), length, tracks.dt, ratio, clock)
+        lengths = rows.length[rows.ends()[0]]
+        length = float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else length
+    clock = sway(rows) if domain == "crowd" else float("nan")
+    return Medians(speed, _nearest(rows, domain), length, rows.dt, ratio, clock)
 
 
-def _ratio(tracks: Tracks, moves: Moves, moving: np.ndarray) -> float:
+def _ratio(rows: Trajectories, moves: Moves, moving: np.ndarray) -> float:
     """Median over displacements of how far it was, by how far speed times time says."""
-    if tracks.speed is None:
+    if rows.v is None:
         return float("nan")
-    mean = (tracks.speed[1:] + tracks.speed[:-1]) / 2
-    gone = np.concatenate([[0.0], np.nancumsum(mean * np.diff(tracks.time))])
+    speed = np.linalg.norm(rows.v, axis=1)
+    mean = (speed[1:] + speed[:-1]) / 2
+    gone = np.concatenate([[0.0], np.nancumsum(mean * np.diff(rows.time))])
     said = (gone[moves.last] - gone[moves.first])[moving]
     known = said > 0
     return float(np.median(moves.size[moving][known] / said[known])) if known.any() else np.nan
 
 
-def nearest(tracks: Tracks, domain: Domain, moments: int = 100) -> float:
+def _nearest(rows: Trajectories, domain: Domain, moments: int = 100) -> float:
     """Median distance to the nearest agent at the same time, or to the next one in its lane."""
-    every, at = np.unique(tracks.time, return_inverse=True)
+    every, at = np.unique(rows.time, return_inverse=True)
+    lanes = np.zeros(len(rows)) if rows.lane is None else pd.factorize(rows.lane)[0]
     found = []
     for k in np.unique(np.linspace(0, len(every) - 1, moments).astype(int)):
-        rows = np.flatnonzero(at == k)
+        there = np.flatnonzero(at == k)
         if domain == "traffic":
-            lane = np.zeros(len(rows)) if tracks.lane is None else tracks.lane[rows]
-            order = np.lexsort((tracks.x[rows, 0], lane))
-            gaps = np.diff(tracks.x[rows, 0][order])[np.diff(lane[order]) == 0]
+            lane = lanes[there]
+            order = np.lexsort((rows.x[there, 0], lane))
+            gaps = np.diff(rows.x[there, 0][order])[np.diff(lane[order]) == 0]
             found.append(gaps[gaps > 0])
-        elif len(rows) > 1:
-            found.append(cKDTree(tracks.x[rows]).query(tracks.x[rows], k=2)[0][:, 1])
+        elif len(there) > 1:
+            found.append(cKDTree(rows.x[there]).query(rows.x[there], k=2)[0][:, 1])
     each = np.concatenate(found) if found else np.empty(0)
     return float(np.median(each)) if each.size else float("nan")
 

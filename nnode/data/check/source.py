@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.check.columns import Meaning
+from nnode.data.check.columns import Meaning, clock_of
 from nnode.data.check.raw import Raw
 from nnode.data.check.scale import Scale
-from nnode.data.check.tracks import Tracks
 from nnode.data.options import (
     Agents,
     DataOptions,
@@ -27,7 +27,7 @@ from nnode.data.options import (
     WalkwayOptions,
 )
 from nnode.data.readers.highd import TRACKS
-from nnode.data.trajectories import usual_interval
+from nnode.data.trajectories import Trajectories
 
 _NGSIM = {"Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID"}
 
@@ -77,14 +77,14 @@ def source_of(
     raw: Raw,
     found: Mapping[str, Meaning] | None = None,
     scale: Scale | None = None,
-    tracks: Tracks | None = None,
+    rows: Trajectories | None = None,
 ) -> Source:
     """The source of a file.
 
     Args:
         found: column by meaning, where the format does not fix them.
         scale: units.
-        tracks: the rows in SI units.
+        rows: in order and in SI units.
     """
     path = str(raw.path.absolute())
     if raw.native == "esimas":
@@ -101,12 +101,12 @@ def source_of(
         return Source(raw.native, natives[raw.native])
     assert found is not None
     assert scale is not None
-    assert tracks is not None
+    assert rows is not None
     if are_pairs(found):
         return _pairs(raw, found, scale, path)
     if scale.domain == "crowd":
-        return _people(raw, found, scale, tracks, path)
-    return _vehicles(raw, found, scale, tracks, path)
+        return _people(raw, found, scale, rows, path)
+    return _vehicles(raw, found, scale, rows, path)
 
 
 def _esimas(path: Path) -> Source:
@@ -118,19 +118,19 @@ def _esimas(path: Path) -> Source:
 
 
 def _people(
-    raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
+    raw: Raw, found: Mapping[str, Meaning], scale: Scale, rows: Trajectories, path: str
 ) -> Source:
     columns = {meaning: one.column for meaning, one in found.items()}
     if "sequence" in columns and "frame" not in columns:
         return _tidy(raw, found, scale, path)
-    dt = usual_interval(tracks.steps)
+    dt = rows.dt
     if scale.rate is not None and raw.rate is not None:  # what the file tells is taken
         dt *= scale.rate / raw.rate
         scale = replace(scale, rate=raw.rate)
     steps = max(2, round(1 / dt))
     whole = abs(1 / dt - steps) < 1e-3
     own: dict[str, Any] = {} if whole else {"t_seq": float(f"{steps * dt:.9g}")}
-    if np.ptp(tracks.x[:, 1]) > np.ptp(tracks.x[:, 0]):
+    if np.ptp(rows.x[:, 1]) > np.ptp(rows.x[:, 0]):
         own["walking_axis"] = "y"
     order = [raw.table.frame.columns.get_loc(columns[m]) for m in columns] if raw.table else []
     ordered = list(columns) == ["agent", "frame", "x", "y"] and order == [0, 1, 2, 3]
@@ -143,30 +143,26 @@ def _people(
             own["unit"] = scale.position
         return Source("pedpy", WalkwayOptions(path=path, **own))
     meant = {name: name for name in ("agent", "x", "y", "recording", "sequence")}
-    meant["time"] = "time" if "time" in columns else "frame"
+    meant["time"] = clock_of(found)
     own |= {"columns": _named(raw, columns, meant), "frame_rate": scale.rate}
     own |= {"position_unit": scale.position, "time_unit": scale.time}
     return Source("pedpy", WalkwayOptions(path=path, **own))
 
 
-def _together(tracks: Tracks) -> bool:
+def _together(rows: Trajectories) -> bool:
     """Whether most agents are in their part of the table from its first to its last time."""
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks)) - 1
-    part = np.zeros(len(tracks), dtype=int) if tracks.part is None else tracks.part
-    first, last = np.full(part.max() + 1, np.inf), np.full(part.max() + 1, -np.inf)
-    np.minimum.at(first, part, tracks.time)
-    np.maximum.at(last, part, tracks.time)
-    near = tracks.dt / 2
-    begins = tracks.time[start] - first[part[start]] < near
-    ends = last[part[end]] - tracks.time[end] < near
+    start, end = rows.ends()
+    part = np.zeros(len(rows)) if rows.recording is None else rows.recording
+    clock = pd.Series(rows.time).groupby(part)
+    begins = (rows.time - clock.transform("min").to_numpy())[start] < rows.dt / 2
+    ends = (clock.transform("max").to_numpy() - rows.time)[end] < rows.dt / 2
     return bool((begins & ends).mean() > 0.5)
 
 
 def _tidy(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:
     """Sequences that are cut already."""
     columns = {meaning: one.column for meaning, one in found.items()}
-    meant = {"time": "time" if "time" in columns else "frame"}
+    meant = {"time": clock_of(found)}
     axes = ("x", "y") if scale.domain == "crowd" else ("x",)
     meant |= {name: name for name in ("sequence", "agent", *axes, "length", "kind", "recording")}
     named = _named(raw, columns, meant)
@@ -191,17 +187,16 @@ def _named(raw: Raw, columns: Mapping[str, str], meant: Mapping[str, str]) -> di
 
 
 def _vehicles(
-    raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
+    raw: Raw, found: Mapping[str, Meaning], scale: Scale, rows: Trajectories, path: str
 ) -> Source:
     columns = {meaning: one.column for meaning, one in found.items()}
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks)) - 1
-    back = bool(np.median(tracks.x[end, 0] - tracks.x[start, 0]) < 0)
+    start, end = rows.ends()
+    back = bool(np.median(rows.x[end, 0] - rows.x[start, 0]) < 0)
     exact = all(columns.get(name) == name for name in _TABLE)
     cut = "sequence" in columns and "lane" not in columns
-    if cut and not back and (exact or _together(tracks)):
+    if cut and not back and (exact or _together(rows)):
         return _tidy(raw, found, scale, path)
-    clock = "time" if "time" in columns else "frame"
+    clock = clock_of(found)
     meant = {"vehicle": "agent", "time": clock} | {
         name: name for name in ("x", "lane", "speed", "length", "kind", "recording", "sequence")
     }
@@ -212,21 +207,20 @@ def _vehicles(
     own |= {"time_unit": scale.time}
     if scale.rate is not None:
         own["frame_rate"] = scale.rate
-    if tracks.dt > VehicleTableOptions.dt:
-        own["dt"] = float(f"{tracks.dt:.6g}")
+    if rows.dt > VehicleTableOptions.dt:
+        own["dt"] = float(f"{rows.dt:.6g}")
     if back:
         own["direction"] = -1
-    if _most(tracks) < VehicleTableOptions.min_vehicles:
-        own["min_vehicles"] = max(_most(tracks), 1)
+    if _most(rows) < VehicleTableOptions.min_vehicles:
+        own["min_vehicles"] = max(_most(rows), 1)
     return Source("vehicles", VehicleTableOptions(path=path, **own))
 
 
-def _most(tracks: Tracks) -> int:
+def _most(rows: Trajectories) -> int:
     """The greatest number of vehicles in one lane at one time."""
-    where = np.zeros(len(tracks)) if tracks.lane is None else tracks.lane
-    part = np.zeros(len(tracks)) if tracks.part is None else tracks.part
-    each = np.stack([np.round(tracks.time / tracks.dt), where, part])
-    return int(np.unique(each, axis=1, return_counts=True)[1].max())
+    each = {"time": np.round(rows.time / rows.dt)}
+    each |= {n: getattr(rows, n) for n in ("lane", "recording") if getattr(rows, n) is not None}
+    return int(pd.DataFrame(each).groupby(list(each)).size().max())
 
 
 def _pairs(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:

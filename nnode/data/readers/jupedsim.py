@@ -24,7 +24,7 @@ from nnode.data.readers.juelich import People, cut_people, load_people, people_o
 from nnode.data.readers.recordings import table_path
 from nnode.data.readers.vehicles import LENGTH_UNITS, recordings, seconds_per_unit
 from nnode.data.sequence import check_interval
-from nnode.data.trajectories import Trajectories, usual_step
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: First bytes of every SQLite database.
@@ -108,7 +108,7 @@ def _of_table(table: Table, options: WalkwayOptions) -> People:
         time=table.times(names["time"], seconds_per_unit(options))[1],
         x=np.stack([table.measured(names[axis]) for axis in ("x", "y")], -1) * metres,
     )
-    dt = usual_step(rows)
+    dt = rows.dt
     if not np.isfinite(dt):
         raise DataError(f"{table.path}: nobody has rows at two times; nothing moves here")
     check_interval(dt, f"{table.path}: rows of a person")

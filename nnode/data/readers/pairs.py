@@ -39,7 +39,6 @@ from nnode.data.trajectories import (
     Trajectories,
     measured_times,
     records,
-    usual_step,
 )
 from nnode.errors import ConfigError, DataError
 
@@ -179,7 +178,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
 
 def _usual(tables: list[Trajectories]) -> float:
     """The sampling interval (s) of most pairs."""
-    steps = [step for table in tables if np.isfinite(step := usual_step(table))]
+    steps = [table.dt for table in tables if np.isfinite(table.dt)]
     return float(np.median(steps)) if steps else 1.0
 
 
@@ -412,7 +411,7 @@ def _sequences(
     name: str, rows: Trajectories, words: dict[str, str], dt: float, options: PairOptions
 ) -> tuple[list[Sequence], list[Record]]:
     """A pair's sequences, one for every part without a gap or every window, and its records."""
-    usual = usual_step(rows)
+    usual = rows.dt
     if options.dt is not None and dt < usual * (1 - UNEVEN):
         raise ConfigError(
             f"data.dt={dt:g} s is finer than the {usual:g} s of {rows.path}: pair "

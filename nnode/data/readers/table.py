@@ -15,7 +15,7 @@ from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, table_path
 from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
 from nnode.data.sequence import Sequence
-from nnode.data.trajectories import Grid, Record, Trajectories, measured_times, records, usual_step
+from nnode.data.trajectories import Grid, Record, Trajectories, measured_times, records
 from nnode.errors import ConfigError, DataError
 
 #: A sequence's times times its agents, present or not.
@@ -69,7 +69,7 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
     if asked is not None:
         check_known(asked, () if rows.recording is None else rows.recording)
     segments = None if walls is None else _segments(walls)
-    dt = usual_step(rows)
+    dt = rows.dt
     found: list[Sequence] = []
     notes: list[str] = []
     every: list[Record] = []

@@ -20,7 +20,7 @@ from nnode.data.options import (
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import table_path
 from nnode.data.sequence import TIME_UNITS, check_interval
-from nnode.data.trajectories import Trajectories, usual_step
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError
 
 #: Metres per unit of length.
@@ -55,7 +55,7 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> Reading
     check_cutting(options)
     table = opened(source)
     rows = _rows(table, options)
-    check_interval(usual_step(rows), f"{table.path}: rows of a vehicle")
+    check_interval(rows.dt, f"{table.path}: rows of a vehicle")
     return by_lane(rows, options)
 
 

@@ -43,7 +43,7 @@ def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) ->
     (platoon,) = kind.read(kind.files(options), options)
     assert platoon.n_agents == 12
     assert platoon.agents[-1] == "0"  # the leader
-    assert found.tracks.dt == pytest.approx(0.1)
+    assert found.rows.dt == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("speeds", [True, False])
@@ -53,7 +53,7 @@ def test_feet_for_metres(tmp_path: Path, speeds: bool) -> None:
     found = examine(saved(table if speeds else table.drop(columns="v"), tmp_path))
     assert vehicles(found).position_unit == "ft"
     assert said(found) == {}
-    assert np.ptp(found.tracks.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
+    assert np.ptp(found.rows.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
 
 
 def test_speeds_in_kilometres_an_hour(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_the_rate_of_frames_follows_from_speeds_in_the_file(tmp_path: Path) -> N
     assert (options.time_unit, options.frame_rate) == ("frame", 25.0)
     assert options.columns["time"] == "frame"
     assert said(found) == {}
-    assert found.tracks.dt == pytest.approx(0.04)
+    assert found.rows.dt == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.5, 0.25])
@@ -334,7 +334,7 @@ def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) 
     assert found.source.group == group
     assert found.scale.time == (kind if kind in ("ms", "us", "ns") else "s")
     assert found.source.options.time_unit == found.scale.time
-    assert found.tracks.dt == pytest.approx(0.1, abs=1e-6)
+    assert found.rows.dt == pytest.approx(0.1, abs=1e-6)
     assert found.sequences
 
 
