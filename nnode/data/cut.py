@@ -7,17 +7,48 @@ dropped, and sequences in which the same vehicles are in view. All ways end in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.options import Agents, LaneOptions, check_known, positive, wanted
+from nnode.data.options import (
+    Agents,
+    DataOptions,
+    LaneOptions,
+    OpenAccOptions,
+    check_known,
+    positive,
+    wanted,
+)
 from nnode.data.sequence import Sequence
-from nnode.data.trajectories import Grid, Record, Trajectories, records
+from nnode.data.smooth import smooth
+from nnode.data.trajectories import (
+    Grid,
+    Record,
+    Trajectories,
+    driven,
+    measured_times,
+    records,
+)
 from nnode.errors import ConfigError, DataError
+
+log = logging.getLogger(__name__)
+
+#: A sequence's times times its agents, present or not.
+MOST_CELLS = 10**8
+#: Fewest times of a part of a sequence.
+LEAST = 3
+#: Sequences that notes list.
+LISTED = 3
+#: Times of a run, with those that no row stands for.
+MOST_TIMES = 10**6
+#: Times and places of a run may be so many, or so many times the rows that stand there.
+_CELLS, _SPARSE = 10**7, 10
 
 
 class Reading(list[Sequence]):
@@ -208,6 +239,120 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
     return Reading(found, notes=notes)
 
 
+def by_sequence(
+    table: Trajectories,
+    options: DataOptions,
+    key: Callable[[str], Any],
+    *,
+    ordered: bool = False,
+    named: bool = True,
+) -> Reading:
+    """Cut rows as the source does, by recordings and sequences.
+
+    A platoon is cut into the parts in which all its vehicles are there, with a number behind the
+    name where there are several; where these are never there together, a vehicle without a
+    position is NaN. A crowd is cut where nobody is there; a person who is absent at other times is
+    NaN there.
+
+    Args:
+        options: ``fill`` and ``smooth`` are read.
+        key: sorts names of recordings, sequences and agents.
+        ordered: whether vehicles are in the order of their names, not of their positions.
+        named: whether names of agents are identifiers.
+
+    Returns:
+        Sequences named ``recording/sequence``, in the order of their names.
+
+    Raises:
+        DataError: one agent twice at one time, or times that are too many.
+    """
+    reading, notes = Reading(), list[str]()
+    every: list[Record] = []
+    parts = table.parts("recording", "sequence")
+    for (run, number), rows in sorted(parts, key=lambda part: [*map(key, part[0])]):
+        dt = table.dt if np.isfinite(table.dt) else 1.0  # of single samples
+        grid = Grid(dt, float(rows.time.min()))
+        found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+        every += found
+        of = sorted(members(rows, found), key=lambda member: key(member.agent))
+        name = number if number.startswith(f"{run}/") else f"{run}/{number}"
+        spans, note = _parts_of(name, rows, found, of, grid, options.fill)
+        notes += note
+        for i, (a, b) in enumerate(spans):
+            crowd = ordered or table.x.shape[1] == 2
+            reading.append(
+                sequence_of(
+                    name if len(spans) == 1 else f"{name}_{i:03d}",
+                    rows,
+                    of if crowd else sorted(of, key=lambda member: _place(member, a)),
+                    a,
+                    b,
+                    grid,
+                    recording=run,
+                    time=measured_times(rows, grid, a, b),
+                    **({} if named else {"agents": ()}),
+                )
+            )
+    reading.notes = told_uneven(every, table.dt) + notes[:LISTED]
+    if len(notes) > LISTED:
+        reading.notes.append(f"and {len(notes) - LISTED} more such sequences")
+    return reading
+
+
+def _parts_of(
+    name: str,
+    rows: Trajectories,
+    found: list[Record],
+    of: list[Member],
+    grid: Grid,
+    fill: float,
+) -> tuple[list[tuple[int, int]], list[str]]:
+    """First and last times of the parts of a sequence, and what was cut, in words."""
+    times = 1 + round((float(rows.time.max()) - grid.origin) / grid.dt)
+    if times * len(of) > MOST_CELLS:
+        raise DataError(
+            f"{rows.path}: sequence {name} has {times} times and {len(of)} agents in "
+            f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
+            "shorter sequences"
+        )
+    crowd = rows.x.shape[1] == 2
+    parts = _occupied(found) if crowd else spans(of)
+    if crowd and any(record.uneven.any() for record in found):
+        # people begin and end between two times of the grid
+        parts = [(a + 1, b - 1) for a, b in parts]
+    parts = [(a, b) for a, b in parts if b - a + 1 >= LEAST]
+    lost = times - sum(b - a + 1 for a, b in parts)
+    if not parts:
+        return [(0, times - 1)], []
+    if lost * grid.dt <= fill + grid.dt / 2:
+        return parts, []
+    who = "nobody is" if crowd else "not all vehicles are"
+    return parts, [
+        f"sequence {name}: {who} there at {lost} of {times} times, for longer than "
+        f"data.fill={fill:g} s; cut into {len(parts)} sequence{'s' * (len(parts) > 1)} without "
+        "these times"
+    ]
+
+
+def _occupied(found: list[Record]) -> list[tuple[int, int]]:
+    """First and last times of the intervals in which anybody is there."""
+    parts: list[tuple[int, int]] = []
+    for record in sorted(found, key=lambda r: r.first):
+        if parts and record.first <= parts[-1][1] + 1:
+            parts[-1] = parts[-1][0], max(parts[-1][1], record.last)
+        else:
+            parts.append((record.first, record.last))
+    return parts
+
+
+def _place(member: Member, at: int) -> float:
+    """m, where a vehicle is at a time, or first."""
+    for record in member.records:
+        if record.last >= at:
+            return float(record.x[max(at - record.first, 0), 0])
+    return np.inf
+
+
 def by_presence(
     every: list[Record],
     steps: int,
@@ -248,6 +393,180 @@ def by_presence(
             yield there, first, last
 
 
+def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
+    """Cut a platoon whose vehicles are known by their speeds and spacings.
+
+    The foremost vehicle of a sequence is where its integrated speed brings it, those behind it are
+    the spacings and lengths further back. Where the speed or the spacing of a vehicle has a hole
+    longer than ``fill``, the platoon is cut in two at its place.
+
+    Args:
+        rows: of one run, the first vehicle in front; ``x`` is not looked at.
+        options: ``dt``, ``fill``, ``max_error`` and the way of cutting.
+
+    Returns:
+        Sequences named ``run/number``, in order of time, the leader last.
+
+    Raises:
+        ConfigError: a ``dt`` or ``window`` that is no whole number of steps.
+        DataError: times that are not equally spaced, or a vehicle twice at one time.
+    """
+    start, step, (speed, spacing) = _equally_spaced(rows, rows.v, rows.spacing)
+    most = int(options.fill / step + 1e-6)  # samples that may be missing
+    v = _filled(speed, most)
+    sound = _sound(rows, spacing, np.diff(v, axis=1), step, options.max_error)
+    gap = _filled(sound, most)
+    added = (np.isfinite(v) & np.isnan(speed)) | (np.isfinite(gap) & np.isnan(sound))
+    way = np.stack([driven(step * np.arange(len(v)), column) for column in v.T], 1)
+    every = 1 if options.dt is None else whole_steps("dt", options.dt, step)
+    v, gap, way, added = v[::every], gap[::every], way[::every], added[::every]
+    grid = Grid(step * every, start)
+    # with the vehicle in front; the first has nobody there
+    linked = np.isfinite(v) & np.isfinite(gap)
+    linked[:, 1:] &= np.isfinite(v[:, :-1])
+    linked[:, 0] = False
+    first_row = pd.Series(np.arange(len(rows))).groupby(rows.agent, sort=False).first()
+    table = replace(rows, x=rows.x[:, :1])
+    found: list[Sequence] = []
+    for first, last in _linked_intervals(linked, grid.dt, options):
+        part = slice(first, last + 1)
+        heads = np.flatnonzero(~linked[part].all(axis=0))
+        for i, end in pairwise([*heads.tolist(), linked.shape[1]]):
+            if end - i < options.min_vehicles or not np.isfinite(v[part, i]).all():
+                continue
+            front, own = way[part, i], []
+            for n in range(i, end):
+                front = front - (gap[part, n] + (options.length or 0.0) if n > i else 0.0)
+                x, speeds = front, v[part, n]
+                if options.smooth is not None:
+                    x, speeds = smooth(grid.dt * np.arange(len(x)), x, options.smooth)
+                    speeds = np.maximum(speeds, 0.0)
+                record = Record(
+                    str(first_row.index[n]),
+                    int(first_row.iloc[n]),
+                    first,
+                    x[:, None],
+                    speeds[:, None],
+                    added[part, n],
+                    np.zeros(len(x), dtype=bool),
+                )
+                own.append(Member(record.agent, record.row, [record]))
+            name = f"{rows.name}/{len(found):03d}"
+            found.append(sequence_of(name, table, own[::-1], first, last, grid))
+    return found
+
+
+def _equally_spaced(
+    rows: Trajectories, *columns: np.ndarray | None
+) -> tuple[float, float, list[np.ndarray]]:
+    """Time of the first sample, step (s), and columns ``(K, N)``, NaN where there is no row."""
+    time, at = np.unique(np.round(rows.time, 6), return_inverse=True)
+    agent, names = pd.factorize(rows.agent)
+    if len(time) < 2:
+        raise DataError(f"{rows.path}: all rows of {rows.name} stand at one time")
+    step = round(float(np.median(np.diff(time))), 9)
+    number = (time - time[0]) / step
+    if not number[-1] < MOST_TIMES:
+        raise DataError(
+            f"{rows.path}: times go from {time[0]:g} to {time[-1]:g} s in steps of {step:g} s; "
+            f"expected at most {MOST_TIMES:.0e} steps: look for a time that is wrong"
+        )
+    k = np.round(number).astype(int)
+    odd = np.flatnonzero(np.abs(number - k) > 0.1)
+    if odd.size:
+        raise DataError(
+            f"{rows.path}: the time {time[odd[0]]:g} s is no whole number of steps of {step:g} s "
+            f"from the first, {time[0]:g} s"
+        )
+    shape = (int(k[-1]) + 1, len(names))
+    if shape[0] * shape[1] > max(_CELLS, _SPARSE * len(rows)):
+        raise DataError(
+            f"{rows.path}: {len(rows)} rows stand at {shape[0]} equally spaced times of {shape[1]} "
+            "vehicles; look for a time or a position that is wrong, or cut the file"
+        )
+    cell = k[at] * shape[1] + agent
+    if len(np.unique(cell)) < len(cell):
+        raise DataError(
+            f"{rows.path}: run {rows.name} has two rows of one position at one time; expected one "
+            "row per vehicle and time"
+        )
+    found = []
+    for column in columns:
+        wide = np.full(shape, np.nan)
+        if column is not None:
+            wide.ravel()[cell] = column.ravel()
+        found.append(wide)
+    return float(time[0]), step, found
+
+
+def _filled(values: np.ndarray, most: int) -> np.ndarray:
+    """``(K, N)`` values with holes of at most ``most`` samples interpolated."""
+    full = values.copy()
+    for column in full.T:
+        missing, known = (np.flatnonzero(np.isnan(column) == where) for where in (True, False))
+        after = np.searchsorted(known, missing)
+        inside = (after > 0) & (after < len(known))
+        missing, after = missing[inside], after[inside]
+        short = missing[known[after] - known[after - 1] <= most + 1]
+        column[short] = np.interp(short, known, column[known]) if short.size else 0.0
+    return full
+
+
+def _sound(
+    rows: Trajectories, spacing: np.ndarray, faster: np.ndarray, dt: float, most: float | None
+) -> np.ndarray:
+    """``(K, N)`` spacings without those that are none: not above 0, or between samples of which
+    one contradicts the speeds by more than ``most`` m.
+
+    Args:
+        faster: ``(K, N - 1)`` m/s, how much faster each follower is than the vehicle in front.
+    """
+    found = np.where(spacing > 0, spacing, np.nan)
+    if most is not None:
+        told = -(faster[1:] + faster[:-1]) / 2 * dt
+        off = np.abs(np.diff(found[:, 1:], axis=0) - told) > most
+        found[1:, 1:][off] = np.nan
+        found[:-1, 1:][off] = np.nan
+    names = list(dict.fromkeys(rows.agent))
+    bad = np.isfinite(spacing) & np.isnan(found)
+    for i in np.flatnonzero(bad.any(axis=0)):
+        log.info(
+            "%s: %d of %d gaps of %s to %s are not above 0, or change otherwise than their speeds "
+            "tell (data.max_error); they count as unknown",
+            rows.name,
+            bad[:, i].sum(),
+            np.isfinite(spacing[:, i]).sum(),
+            names[i],
+            names[i - 1],
+        )
+    return found
+
+
+def _linked_intervals(
+    linked: np.ndarray, dt: float, options: OpenAccOptions
+) -> Iterator[tuple[int, int]]:
+    """First and last sample of windows, or of maximal intervals with the same links."""
+    if options.window is not None:
+        yield from windows(0, len(linked) - 1, whole_steps("window", options.window, dt))
+        return
+    changes = np.flatnonzero((linked[1:] != linked[:-1]).any(axis=1)) + 1
+    for first, after in pairwise([0, *changes.tolist(), len(linked)]):
+        if (after - 1 - first) * dt >= options.min_duration - 1e-6:
+            yield first, after - 1
+
+
+def whole_steps(option: str, seconds: float, dt: float) -> int:
+    """How many steps of ``dt`` s an option is long.
+
+    Raises:
+        ConfigError: no whole number of them.
+    """
+    steps = round(seconds / dt)
+    if steps < 1 or abs(seconds / dt - steps) > 1e-6 * steps:
+        raise ConfigError(f"data.{option}={seconds:g} s is no whole number of steps of {dt:g} s")
+    return steps
+
+
 def check_cutting(options: LaneOptions) -> None:
     """Refuse options of the cutting that are out of their range.
 
@@ -258,15 +577,10 @@ def check_cutting(options: LaneOptions) -> None:
     if options.min_vehicles < 1 or options.min_samples < 1:
         raise ConfigError("data.min_vehicles and data.min_samples must be at least 1")
     if options.window is not None:
-        samples = positive("window", options.window) / options.dt
-        if abs(samples - round(samples)) > 1e-6:
+        steps = whole_steps("window", positive("window", options.window), options.dt)
+        if steps + 1 < options.min_samples:
             raise ConfigError(
-                f"data.window={options.window:g} s is no whole number of steps of "
-                f"data.dt={options.dt:g} s"
-            )
-        if round(samples) + 1 < options.min_samples:
-            raise ConfigError(
-                f"data.window={options.window:g} s has {round(samples) + 1} samples, fewer than "
+                f"data.window={options.window:g} s has {steps + 1} samples, fewer than "
                 f"data.min_samples={options.min_samples}"
             )
 

@@ -56,6 +56,8 @@ class Trajectories:
         length: ``(R,)`` m, NaN where unknown, or None.
         kind, group, split: ``(R,)`` names, or None.
         destination: ``(R, D)`` m, or None.
+        spacing: ``(R,)`` m from bumper to bumper to the vehicle in front, NaN where unknown, or
+            None.
     """
 
     path: Path
@@ -73,6 +75,7 @@ class Trajectories:
     group: np.ndarray | None = None
     split: np.ndarray | None = None
     destination: np.ndarray | None = None
+    spacing: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -180,6 +183,18 @@ class Record:
         return self.first + len(self.x) - 1
 
 
+def driven(time: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """``(K,)`` m that are covered at the speeds ``v`` from the first time on.
+
+    The trapezium rule; over holes (NaN) by the line between their ends.
+    """
+    known = np.isfinite(v)
+    if not known.any():
+        return np.zeros(len(v))
+    whole = np.interp(time, time[known], v[known])
+    return np.concatenate([[0.0], np.cumsum((whole[1:] + whole[:-1]) / 2 * np.diff(time))])
+
+
 def measured_times(table: Trajectories, grid: Grid, first: int, last: int) -> np.ndarray:
     """``(K,)`` s: the times of a grid as the table writes them, where its times are those."""
     k = (table.time - grid.origin) / grid.dt
@@ -225,9 +240,10 @@ def records(
     code, ids = pd.factorize(table.agent, sort=True)
     order = np.lexsort((table.time, code))
     _once(table, order, code[order])
-    known = np.isfinite(table.x).all(axis=1)
+    # infinite ones are no holes, but a fault
+    known = ~np.isnan(table.x).any(axis=1)
     if table.v is not None:
-        known &= np.isfinite(table.v).all(axis=1)
+        known &= ~np.isnan(table.v).any(axis=1)
     order = order[known[order]]
     if not len(order):
         return []

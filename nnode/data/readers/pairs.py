@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.cut import (
     Member,
@@ -25,6 +24,7 @@ from nnode.data.cut import (
     sequence_of,
     spans,
     told_uneven,
+    whole_steps,
     windows,
 )
 from nnode.data.options import Gaps, PairOptions, check_known, one_of, positive, wanted
@@ -37,6 +37,7 @@ from nnode.data.trajectories import (
     Grid,
     Record,
     Trajectories,
+    driven,
     measured_times,
     records,
 )
@@ -318,7 +319,7 @@ def _integrated(
     time: np.ndarray, v_leader: np.ndarray, spacing: np.ndarray, length: float
 ) -> np.ndarray:
     """``(K, 2)`` m, fronts of follower and leader, see :func:`read_pairs`."""
-    leader = cumulative_trapezoid(v_leader, time, initial=0.0)
+    leader = driven(time, v_leader)
     return np.stack([leader - np.nan_to_num(length) - spacing, leader], -1)
 
 
@@ -432,11 +433,7 @@ def _sequences(
             "data.gaps=cut cuts the pair there"
         )
     if options.window is not None:
-        steps = round(options.window / dt)
-        if steps < 1 or abs(options.window / dt - steps) > 1e-6 * steps:
-            raise ConfigError(
-                f"data.window={options.window:g} s is no whole number of steps of {dt:g} s"
-            )
+        steps = whole_steps("window", options.window, dt)
         parts = [piece for part in parts for piece in windows(*part, steps)]
     parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
     split = words.get("split", "").lower()

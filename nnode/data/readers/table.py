@@ -8,20 +8,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, Reading, members, sequence_of, spans, told_uneven
+from nnode.data.cut import Reading, by_sequence
 from nnode.data.exits import destinations, exits_of, read_exits
 from nnode.data.options import TableOptions, check_known, one_of, wanted
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, table_path
 from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
-from nnode.data.sequence import Sequence
-from nnode.data.trajectories import Grid, Record, Trajectories, measured_times, records
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
-
-#: A sequence's times times its agents, present or not.
-MOST_CELLS = 10**8
-#: Fewest times of a part of a sequence.
-LEAST = 3
 
 _REQUIRED = ("sequence", "time", "agent", "x")
 _OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
@@ -67,27 +61,13 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
     rows = _rows(opened(source), options)
     asked = wanted(options.recording)
     if asked is not None:
-        check_known(asked, () if rows.recording is None else rows.recording)
+        assert rows.recording is not None
+        check_known(asked, rows.recording)
+        rows = rows.at(np.flatnonzero(np.isin(rows.recording, asked)))
     segments = None if walls is None else _segments(walls)
-    dt = rows.dt
-    found: list[Sequence] = []
-    notes: list[str] = []
-    every: list[Record] = []
-    parts = sorted(rows.parts("recording", "sequence"), key=lambda p: [*map(natural, p[0])])
-    for (run, number), own in parts:
-        if asked is None or run in asked:
-            name = number if number.startswith(f"{run}/") else f"{run}/{number}"
-            made, its, note = _sequences(name, own, dt, options)
-            found += [replace(s, recording=run, walls=segments) for s in made]
-            every += its
-            notes += note
-    return Reading(found, notes=[*told_uneven(every, dt), *told_parts(notes)])
-
-
-def told_parts(notes: list[str], most: int = 3) -> list[str]:
-    """The first of some sentences, and how many more there are."""
-    more = [f"and {len(notes) - most} more such sequences"] if len(notes) > most else []
-    return notes[:most] + more
+    found = by_sequence(rows, options, natural)
+    found[:] = [replace(s, walls=segments) for s in found]
+    return found
 
 
 def _rows(table: Table, options: TableOptions) -> Trajectories:
@@ -134,65 +114,6 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
             )
         rows = replace(rows, destination=_goals(rows, options))
     return rows
-
-
-def _sequences(
-    name: str, rows: Trajectories, dt: float, options: TableOptions
-) -> tuple[list[Sequence], list[Record], list[str]]:
-    """One sequence of the table, or its parts; its records; and what was cut, in words."""
-    if not np.isfinite(dt):  # of single samples
-        dt = 1.0
-    grid = Grid(dt, float(rows.time.min()))
-    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    of = sorted(members(rows, found), key=lambda member: natural(member.agent))
-    first, last = 0, round((float(rows.time.max()) - grid.origin) / dt)
-    if (last + 1) * len(of) > MOST_CELLS:
-        raise DataError(
-            f"{rows.path}: sequence {name} has {last + 1} times and {len(of)} agents in "
-            f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
-            "shorter sequences"
-        )
-    crowd = rows.x.shape[1] == 2
-    parts = _occupied(found) if crowd else spans(of)
-    if crowd and any(record.uneven.any() for record in found):
-        # people begin and end between two times of the grid
-        parts = [(a + 1, b - 1) for a, b in parts]
-    whole = [(a, b) for a, b in parts if b - a + 1 >= LEAST]
-    lost = last + 1 - sum(b - a + 1 for a, b in whole)
-    note = []
-    if whole and lost * dt > options.fill + dt / 2:
-        who = "nobody is" if crowd else "not all vehicles are"
-        note = [
-            f"sequence {name}: {who} there at {lost} of {last + 1} times, for longer than "
-            f"data.fill={options.fill:g} s; cut into {len(whole)} "
-            f"sequence{'s' * (len(whole) > 1)} without these times"
-        ]
-    made = []
-    for number, (a, b) in enumerate(whole or [(first, last)]):
-        called = name if len(whole) < 2 else f"{name}_{number:03d}"
-        ordered = of if crowd else sorted(of, key=lambda member: _place(member, a))
-        time = measured_times(rows, grid, a, b)
-        made.append(sequence_of(called, rows, ordered, a, b, grid, time=time))
-    return made, found, note
-
-
-def _occupied(found: list[Record]) -> list[tuple[int, int]]:
-    """First and last times of the intervals in which anybody is there."""
-    parts: list[tuple[int, int]] = []
-    for record in sorted(found, key=lambda r: r.first):
-        if parts and record.first <= parts[-1][1] + 1:
-            parts[-1] = parts[-1][0], max(parts[-1][1], record.last)
-        else:
-            parts.append((record.first, record.last))
-    return parts
-
-
-def _place(member: Member, at: int) -> float:
-    """m, where a vehicle is at a time, or first."""
-    for record in member.records:
-        if record.last >= at:
-            return float(record.x[max(at - record.first, 0), 0])
-    return np.inf
 
 
 def _goals(rows: Trajectories, options: TableOptions) -> np.ndarray:

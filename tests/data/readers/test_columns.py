@@ -95,7 +95,7 @@ def test_a_place_in_the_platoon_that_is_none(tmp_path: Path, position: str) -> N
 
 
 def test_a_time_that_asks_for_a_table_of_its_own(tmp_path: Path) -> None:
-    path = platoon(tmp_path, "r,1000,90000.0,10,15")
+    path = platoon(tmp_path, "\n".join(f"r,{p},90000.0,10,15" for p in range(4, 16)))
     with pytest.raises(DataError, match=r"wrong, or cut the file"):
         read_openacc({path.name: path}, OpenAccOptions(path=str(path), min_duration=0.3))
 
