@@ -16,7 +16,8 @@ import pandas as pd
 from platformdirs import user_cache_path
 
 from nnode.data._arrow import to_table
-from nnode.data.check.recognise import Recognised, recognised
+from nnode.data.check.recognise import recognised
+from nnode.data.check.source import Recognised
 from nnode.data.clusters import clusters, index_of
 from nnode.data.options import (
     DataOptions,

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from nnode.data.check import findings as find
-from nnode.data.check.columns import Meaning, clock_of, in_seconds, meanings
+from nnode.data.check.columns import (
+    Meaning,
+    are_pairs,
+    clock_of,
+    in_seconds,
+    is_spaced,
+    meanings,
+    rivals,
+)
 from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.rows import scaled
-from nnode.data.check.scale import Medians, Scale, medians
-from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
+from nnode.data.check.scale import LIKELY, SURE, Medians, Scale, medians
+from nnode.data.check.source import Recognised, native_source, source_of, source_of_native
 from nnode.data.cut import Reading
 from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
@@ -27,11 +35,6 @@ from nnode.errors import NNodeError
 
 #: Sequences in which faults are looked for.
 MOST = 400
-#: How sure something is, by its probability.
-SURE, LIKELY = 0.95, 0.7
-#: A rate that is no less probable than this fits.
-FAIR = 0.05
-
 #: Formats whose records are cut: where one begins or ends, nobody comes or goes.
 _CUT = ("esimas", "openacc", "astazero")
 
@@ -63,7 +66,7 @@ class Examination:
     known: Medians
     rows: Trajectories
     findings: list[Finding]
-    source: Source
+    source: Recognised
     sequences: list[Sequence] = field(default_factory=list)
     faults: dict[str, list[Fault]] = field(default_factory=dict)
 
@@ -105,7 +108,7 @@ def examine(path: Path, domain: Domain | None = None, rate: float | None = None)
 
 def _native(raw: Raw) -> Examination:
     """A format whose reader knows its units."""
-    source = source_of(raw)
+    source = source_of_native(raw)
     sequences = _read(source)
     rows = _rows_of(raw, sequences)
     domain: Domain = "crowd" if rows.x.shape[1] == 2 else "traffic"
@@ -160,9 +163,8 @@ def _table(
     seen = scaled(raw, found, domain, rate)
     found = seen.meanings
     rate = rate or raw.rate
-    every = seen.scales
-    source = source_of(raw, found, seen.scale, seen.rows)
-    examined = Examination(raw.path, raw, found, every, seen.known, seen.rows, [], source)
+    source = source_of(raw, seen)
+    examined = Examination(raw.path, raw, found, seen.scales, seen.known, seen.rows, [], source)
     needed: dict[str, str] = {
         m: found[m].column
         for m in ("agent", clock_of(found), "x", "y", "x_follower", "x_leader")
@@ -173,58 +175,19 @@ def _table(
     examined.findings += find.cells(table, needed)
     stand = seen.table.at(np.arange(len(table)))
     examined.findings += find.order(stand, int(table.frame.duplicated().sum()))
-    examined.findings += _unsure(every, rate)
-    examined.findings += _rivals(found)
+    doubts = [("units", text) for text in seen.doubts(rate).values()]
+    doubts += [("columns", text) for text in rivals(found).values()]
+    examined.findings += [Finding(kind, "warning", text) for kind, text in doubts]
     sequences = _tried(source, examined.findings)
     return _judged(examined, sequences, rate)
 
 
-def _rivals(found: Mapping[str, Meaning]) -> Iterator[Finding]:
-    """Meanings that more than one column may have."""
-    for meaning, one in found.items():
-        if one.rivals:
-            yield Finding(
-                "columns",
-                "warning",
-                f"{meaning} may be {one.column} or {' or '.join(one.rivals)}, which hold different "
-                f"values; {one.column} is taken",
-            )
-
-
-def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:
-    """What is known too little: the frame rate, or units."""
-    best = every[0]
-    same = [one for one in every if unit_names(one) == unit_names(best)]
-    if sum(one.probability for one in same) < LIKELY:
-        others = "; ".join(f"{_words(one)} ({one.probability:.0%})" for one in every[:3])
-        yield Finding("units", "warning", f"units are a guess: {others}; say what you know")
-    if rate is None and best.rate is not None:
-        rates = sorted(one.rate for one in same if one.rate and one.probability > FAIR)
-        yield Finding(
-            "units",
-            "warning",
-            f"times are frames of a rate that the file does not tell; of the usual ones "
-            f"{', '.join(f'{one:g}' for one in rates)} frames/s fit, {best.rate:g} is taken: tell "
-            "the right one with frame_rate=",
-        )
-
-
-def unit_names(scale: Scale) -> tuple[str, ...]:
-    """Domain and units, whatever the rate of frames."""
-    return scale.domain, scale.position, scale.time, scale.speed
-
-
-def _words(scale: Scale) -> str:
-    clock = f"{scale.rate:g} frames/s" if scale.rate else scale.time
-    return f"{scale.domain}, {scale.position}, {clock}, {scale.speed}"
-
-
-def _read(source: Source) -> list[Sequence]:
+def _read(source: Recognised) -> list[Sequence]:
     kind = FORMATS[type(source.options)]
     return kind.sequences(kind.files(source.options), source.options)
 
 
-def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:
+def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
     """The sequences that the reader makes of the file; what it refuses is a finding."""
     try:
         made = _read(source)

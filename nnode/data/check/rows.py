@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from nnode.data.check.columns import Meaning, clock_of, numbers
+from nnode.data.check.columns import Meaning, are_pairs, clock_of, is_spaced, numbers
 from nnode.data.check.raw import Raw
-from nnode.data.check.scale import LAG, Medians, Scale, medians, scales
-from nnode.data.check.source import are_pairs, is_spaced
+from nnode.data.check.scale import FAIR, LAG, LIKELY, Medians, Scale, medians, scales
 from nnode.data.sequence import Domain
 from nnode.data.trajectories import Trajectories
 from nnode.errors import DataError
@@ -43,6 +42,39 @@ class Scaled:
     def scale(self) -> Scale:
         """The units that are taken."""
         return self.scales[0]
+
+    @property
+    def share(self) -> float:
+        """Probability of the units, whatever the rate of frames."""
+        return sum(s.probability for s in self.scales if s.units == self.scale.units)
+
+    def rates(self, told: float | None) -> list[float]:
+        """Frames per second that fit, where times are frames and nothing tells their rate."""
+        if told is not None or self.scale.rate is None:
+            return []
+        same = (s for s in self.scales if s.units == self.scale.units and s.probability > FAIR)
+        return sorted({s.rate for s in same if s.rate})
+
+    def doubts(self, told: float | None) -> dict[str, str]:
+        """What may be two things, ``units`` and ``rate``, in words.
+
+        Args:
+            told: frames per second as the file or the user tells.
+        """
+        found, best = {}, self.scale
+        if self.share < LIKELY:
+            other = next(s for s in self.scales if s.units != best.units)
+            found["units"] = (
+                f"its numbers may be {best} or {other}; say which, with {best.options} or "
+                f"{other.options}"
+            )
+        if rates := self.rates(told):
+            found["rate"] = (
+                "times are frames of a rate that the file does not tell; "
+                f"{' or '.join(f'{rate:g}' for rate in rates)} frames/s fit: say the right one, as in "
+                f"data.frame_rate={best.rate:g}"
+            )
+        return found
 
 
 def scaled(

@@ -49,6 +49,11 @@ class Range:
         return max(-0.5 * away**2, -12.0)
 
 
+#: How sure something is, by its probability.
+SURE, LIKELY = 0.95, 0.7
+#: A rate that is no less probable than this fits.
+FAIR = 0.05
+
 #: What is usual, by domain and quantity.
 USUAL: dict[Domain, dict[str, Range]] = {
     "crowd": {
@@ -188,6 +193,23 @@ class Scale:
     speed: str
     rate: float | None
     probability: float = 1.0
+
+    def __str__(self) -> str:
+        clock = f"frames of 1/{self.rate:g} s" if self.rate else self.time
+        who = "people" if self.domain == "crowd" else "vehicles"
+        return f"{who}, positions in {self.position}, times in {clock}, speeds in {self.speed}"
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Domain and units, whatever the rate of frames."""
+        return self.domain, self.position, self.time, self.speed
+
+    @property
+    def options(self) -> str:
+        """Options that say units."""
+        said = [f"data.position_unit={self.position}", f"data.time_unit={self.time}"]
+        said += [f"data.frame_rate={self.rate:g}"] if self.rate else []
+        return " ".join(said)
 
     @property
     def metres(self) -> float:

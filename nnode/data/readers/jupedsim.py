@@ -42,6 +42,9 @@ _WHOLE = 2**53
 #: Endings of files that are tables.
 TABLES = (".csv", ".parquet", ".pq")
 
+#: Columns of a table.
+REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
+
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
@@ -97,7 +100,7 @@ def read_walkway(
 
 def _of_table(table: Table, options: WalkwayOptions) -> People:
     """Rows agent, time, x, y of any table, and their sampling interval."""
-    names = table.choose(("agent", "time", "x", "y"), ("recording", "sequence"), options.columns)
+    names = table.choose(REQUIRED, OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     rows = Trajectories(
         path=table.path,

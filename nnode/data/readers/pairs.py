@@ -45,14 +45,15 @@ from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
 
-_REQUIRED = ("time", "x_follower", "x_leader")
+REQUIRED = ("time", "x_follower", "x_leader")
 #: What positions follow from where there are none.
-_INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
+INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
 _METRES = ("leader_length", "follower_length", "spacing")
 _SPEEDS = ("v_follower", "v_leader")
 _WHO = ("follower", "leader")
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
+OPTIONAL = (*_METRES, *_SPEEDS, *_WORDS)
 
 #: Key of the table that lists the files.
 INDEX = "index"
@@ -189,8 +190,7 @@ def _check(options: PairOptions) -> None:
             positive(name, getattr(options, name))
     if options.min_samples < 2:
         raise ConfigError(f"data.min_samples={options.min_samples}: expected at least 2")
-    columns = (*_REQUIRED, *_METRES, *_SPEEDS, *_WORDS)
-    for option, known in (("constant", _WORDS), ("columns", columns)):
+    for option, known in (("constant", _WORDS), ("columns", (*REQUIRED, *OPTIONAL))):
         for key in getattr(options, option):
             if key not in known:
                 raise ConfigError(f"data.{option}.{key} is unknown; expected {', '.join(known)}")
@@ -301,13 +301,12 @@ def _rows(
 
 def _columns(table: Table, options: PairOptions) -> tuple[dict[str, str], bool]:
     """Columns by meaning, and whether positions are to be integrated."""
-    further = (*_METRES, *_SPEEDS, *_WORDS)
-    places = _REQUIRED[1:]
-    names = table.choose(_REQUIRED[:1], (*places, *further), options.columns)
-    if set(names) >= _INTEGRATED and not any(place in names for place in places):
+    places = REQUIRED[1:]
+    names = table.choose(REQUIRED[:1], (*places, *OPTIONAL), options.columns)
+    if set(names) >= INTEGRATED and not any(place in names for place in places):
         return names, True
     try:
-        return table.choose(_REQUIRED, further, options.columns), False
+        return table.choose(REQUIRED, OPTIONAL, options.columns), False
     except DataError as error:
         raise DataError(
             f"{error}; without positions, spacing, v_follower and v_leader are needed, from which "

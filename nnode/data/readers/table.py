@@ -17,8 +17,8 @@ from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
 from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
-_REQUIRED = ("sequence", "time", "agent", "x")
-_OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
+REQUIRED = ("sequence", "time", "agent", "x")
+OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
 _WALL = ("x1", "y1", "x2", "y2")
 
 #: Keys of the files of a table.
@@ -74,7 +74,7 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
     """The table's columns, by what they mean."""
     crowd, path = _is_crowd(options), table.path
     axes = ("x", "y") if crowd else ("x",)
-    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
+    names = table.choose(REQUIRED, OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"

@@ -28,8 +28,8 @@ LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
 #: Metres per second per unit of speed.
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 
-_REQUIRED = ("vehicle", "time", "x")
-_OPTIONAL = ("lane", "speed", "length", "kind", "recording", "sequence")
+REQUIRED = ("vehicle", "time", "x")
+OPTIONAL = ("lane", "speed", "length", "kind", "recording", "sequence")
 
 
 def vehicle_files(options: LaneOptions) -> dict[str, Path]:
@@ -90,7 +90,7 @@ def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndar
 
 def _rows(table: Table, options: VehicleTableOptions) -> Trajectories:
     """The table's columns, by what they mean."""
-    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
+    names = table.choose(REQUIRED, OPTIONAL, options.columns)
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     v = length = None
     if "speed" in names:
