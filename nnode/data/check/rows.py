@@ -69,10 +69,10 @@ class Scaled:
                 f"{other.options}"
             )
         if rates := self.rates(told):
+            fit = " or ".join(f"{rate:g}" for rate in rates)
             found["rate"] = (
-                "times are frames of a rate that the file does not tell; "
-                f"{' or '.join(f'{rate:g}' for rate in rates)} frames/s fit: say the right one, as in "
-                f"data.frame_rate={best.rate:g}"
+                f"times are frames of a rate that the file does not tell; {fit} frames/s fit: say "
+                f"the right one, as in data.frame_rate={best.rate:g}"
             )
         return found
 
