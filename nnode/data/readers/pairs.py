@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from nnode.data.cut import (
     Member,
@@ -48,12 +49,12 @@ log = logging.getLogger(__name__)
 REQUIRED = ("time", "x_follower", "x_leader")
 #: What positions follow from where there are none.
 INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
-_METRES = ("leader_length", "follower_length", "spacing")
+_LENGTHS = ("leader_length", "follower_length")
 _SPEEDS = ("v_follower", "v_leader")
 _WHO = ("follower", "leader")
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
-OPTIONAL = (*_METRES, *_SPEEDS, *_WORDS)
+OPTIONAL = (*_LENGTHS, "spacing", *_SPEEDS, *_WORDS)
 
 #: Key of the table that lists the files.
 INDEX = "index"
@@ -61,18 +62,6 @@ INDEX = "index"
 #: m by which a length that follows from spacings may vary within a pair: the error that a single
 #: position may have without being a fault (:mod:`nnode.data.quality`).
 UNSTEADY = 0.5
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A pair's rows in one file, follower and leader, and what belongs to it as a whole.
-
-    Its times count from ``origin`` (ns).
-    """
-
-    words: dict[str, str]
-    origin: int
-    rows: Trajectories
 
 
 def pair_files(options: PairOptions) -> dict[str, Path]:
@@ -125,37 +114,41 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             ``gaps=error``, or no pair at all.
     """
     _check(options)
-    asked = wanted(options.recording)
     listed = _listed(files.get(INDEX))
-    pairs = [
-        pair
+    tables = [
+        _rows(key, opened(path), options, listed.get(key, {}))
         for key, path in files.items()
         if key != INDEX
-        for pair in _pairs(key, opened(path), options, listed.get(key, {}))
     ]
+    start = min((origin for origin, _ in tables), default=0)
+    pairs: list[tuple[str, str, str, Trajectories]] = [
+        (*names, pair)  # type: ignore[misc]
+        for origin, rows in tables
+        for names, pair in replace(rows, time=rows.time + (origin - start) / 1e9).parts(
+            "recording", "sequence", "lane"
+        )
+    ]
+    asked = wanted(options.recording)
     if asked is not None:
-        check_known(asked, [pair.words["run"] for pair in pairs])
-    lanes = _lanes(options, pairs)
-    start = min((pair.origin for pair in pairs), default=0)
-    dt = options.dt or _usual([pair.rows for pair in pairs])
+        check_known(asked, [run for run, *_ in pairs])
+    lanes = chosen_lanes(options.lane, {lane for _, _, lane, _ in pairs}, "the pairs have")
+    steps = [rows.dt for *_, rows in pairs if np.isfinite(rows.dt)]
+    dt = options.dt or (float(np.median(steps)) if steps else 1.0)
     found: list[Sequence] = []
     taken: dict[str, Path] = {}
     short: list[dict[str, str]] = []
     every: list[Record] = []
-    for pair in sorted(pairs, key=lambda p: (natural(p.words["run"]), natural(p.words["pair"]))):
-        run, lane = pair.words["run"], pair.words.get("lane", "")
-        if (asked is not None and run not in asked) or (lanes and lane not in lanes):
+    for run, number, lane, rows in sorted(pairs, key=lambda p: (natural(p[0]), natural(p[1]))):
+        if (asked is not None and run not in asked) or lane not in lanes:
             continue
-        name = f"{run}/{pair.words['pair']}"
+        name = f"{run}/{number}"
         if name in taken:
             raise DataError(
-                f"{pair.rows.path}: pair {pair.words['pair']} of run {run} stands in {taken[name]} "
-                "as well; give pairs names of their own (data.columns.pair, data.pattern)"
+                f"{rows.path}: pair {number} of run {run} stands in {taken[name]} as well; give "
+                "pairs names of their own (data.columns.pair, data.pattern)"
             )
-        taken[name] = pair.rows.path
-        late = (pair.origin - start) / 1e9
-        rows = replace(pair.rows, time=pair.rows.time + late)
-        made, own = _sequences(name, rows, pair.words, dt, options)
+        taken[name] = rows.path
+        made, own = _sequences(name, rows, dt, options)
         every += own
         if not made:
             short.append({"name": name, "why": _too_short(rows, options)})
@@ -167,7 +160,9 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             + (f" or lasts for {options.window:g} s" if options.window else "")
             + "; lower data.min_samples or data.window"
         )
-    anonymous = sum(not (p.words.get("follower") or p.words.get("leader")) for p in pairs)
+    anonymous = sum(
+        all(f"{number} {who}" in rows.agent for who in _WHO) for _, number, _, rows in pairs
+    )
     if anonymous:
         log.info(
             "%d of %d pairs name neither follower nor leader and are taken as independent of each "
@@ -176,12 +171,6 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             len(pairs),
         )
     return Reading(found, short, told_uneven(every, dt))
-
-
-def _usual(tables: list[Trajectories]) -> float:
-    """The sampling interval (s) of most pairs."""
-    steps = [table.dt for table in tables if np.isfinite(table.dt)]
-    return float(np.median(steps)) if steps else 1.0
 
 
 def _check(options: PairOptions) -> None:
@@ -230,72 +219,82 @@ def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
     }
 
 
-def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[_Pair]:
+def _rows(
+    key: str, table: Table, options: PairOptions, listed: dict[str, str]
+) -> tuple[int, Trajectories]:
+    """The rows of a file's followers and then those of their leaders; times count from an origin
+    (ns)."""
     names, integrated = _columns(table, options)
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
     origin, time = table.times(names["time"], seconds_per_unit(options))
-    x = v = None
+    x, v = np.full((len(table), 2), np.nan), None
     if not integrated:
         x = np.stack([table.measured(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
     if all(name in names for name in _SPEEDS):
         speed = table.numbers if integrated else table.measured
         v = np.stack([speed(names[name]) for name in _SPEEDS], -1) * speeds
-    own = {n: table.positive(names[n]) * metres for n in _METRES[:2] if n in names}
-    if "spacing" in names:
-        own["spacing"] = table.numbers(names["spacing"], empty=not integrated) * metres
     words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
-    everywhere = _everywhere(key, table.path, options, listed, set(words))
-    label = np.array(["\0".join(cells) for cells in zip(*_keys(words), strict=True)], dtype=object)
-    codes = np.unique(label, return_inverse=True)[1] if len(label) else np.zeros(len(table), int)
-    first = [int(np.flatnonzero(codes == code)[0]) for code in range(codes.max() + 1)]
-    for code in np.argsort(first):
-        rows = np.flatnonzero(codes == code)
-        rows = rows[np.argsort(time[rows], kind="stable")]
-        said = dict(everywhere)
-        for name, cells in words.items():
-            _steady(table, names[name], cells, rows)
-            said[name] = str(cells[rows[0]])
-        if x is None:
+    same = _everywhere(key, table.path, options, listed, set(words))
+    for name, value in same.items():
+        words.setdefault(name, np.full(len(table), value, dtype=object))
+    unknown = np.full(len(table), np.nan)
+    follower = table.positive(names[_LENGTHS[1]]) * metres if _LENGTHS[1] in names else unknown
+    leader, spacing = unknown.copy(), unknown
+    if _LENGTHS[0] in names:
+        leader = table.positive(names[_LENGTHS[0]]) * metres
+    if "spacing" in names:
+        spacing = table.numbers(names["spacing"], empty=not integrated) * metres
+    pair = pd.DataFrame({n: words[n] for n in ("run", "pair")}).groupby(["run", "pair"], sort=False)
+    for place in pair.indices.values():
+        rows = np.asarray(place)[np.argsort(time[place], kind="stable")]
+        for name in words.keys() & names.keys():
+            _steady(table, names[name], words[name], rows)
+        length = float(leader[rows[0]])
+        if integrated:
             assert v is not None
-            leader = float(own["leader_length"][rows[0]]) if "leader_length" in own else np.nan
-            leader = float(options.length or np.nan) if np.isnan(leader) else leader
-            place = _integrated(time[rows], v[rows, 1], own["spacing"][rows], leader)
-        else:
-            place, leader = x[rows], _leader(table, own, x, rows)
-        lengths = np.array([_follower(own, rows), leader])
-        yield _Pair(said, origin, _rows(table, rows, said, options, time, place, v, lengths))
+            length = float(options.length or np.nan) if np.isnan(length) else length
+            x[rows] = _integrated(time[rows], v[rows, 1], spacing[rows], length)
+        elif _LENGTHS[0] not in names:
+            length = _leader(table, x[rows, 1] - x[rows, 0] - spacing[rows], rows)
+        leader[rows] = length
+    return origin, _both(
+        table,
+        options,
+        words,
+        time=np.tile(time, 2),
+        x=x.T.reshape(-1, 1),
+        v=None if v is None else v.T.reshape(-1, 1),
+        length=np.concatenate([follower, leader]),
+    )
 
 
-def _rows(
-    table: Table,
-    rows: np.ndarray,
-    words: dict[str, str],
-    options: PairOptions,
-    time: np.ndarray,
-    x: np.ndarray,
-    v: np.ndarray | None,
-    length: np.ndarray,
+def _both(
+    table: Table, options: PairOptions, words: dict[str, np.ndarray], **columns: Any
 ) -> Trajectories:
-    """The rows of a pair's follower, and then those of its leader."""
-    n = len(rows)
+    """Rows of followers and leaders, with what belongs to a pair as a whole.
+
+    Args:
+        words: ``(R,)`` by their meaning.
+        columns: ``(2 R, ...)`` further ones.
+    """
     kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
-    codes = [words.get(f"{who}_kind", "") for who in _WHO]
-    # one without an identifier is in no other pair
-    agents = [words.get(who) or f"{words['pair']} {who}" for who in _WHO]
+    none = np.full(len(table), "", dtype=object)
+    codes = np.concatenate([words.get(f"{who}_kind", none) for who in _WHO])
+    agents = []
+    for who in _WHO:
+        # one without an identifier is in no other pair
+        own = words.get(who, none)
+        agents.append(np.where(own == "", words["pair"] + f" {who}", own))
+    names = {"recording": "run", "sequence": "pair", "lane": "lane", "split": "split"}
+    columns |= {field: np.tile(words[n], 2) for field, n in names.items() if n in words}
     return Trajectories(
         path=table.path,
-        name=words["run"],
-        where=lambda i: table.row(int(rows[i % n])),
-        agent=np.repeat(np.array(agents, dtype=object), n),
-        sequence=np.full(2 * n, words["pair"], dtype=object),
-        time=np.tile(time[rows], 2),
-        x=x.T.reshape(-1, 1),
-        v=None if v is None else v[rows].T.reshape(-1, 1),
-        length=np.repeat(length, n),
-        kind=np.repeat(np.array([kinds.get(c, c) for c in codes], dtype=object), n)
-        if any(codes)
-        else None,
+        name=options.name,
+        where=lambda i: table.row(i % len(table)),
+        agent=np.concatenate(agents),
+        kind=np.array([kinds.get(c, c) for c in codes], dtype=object) if any(codes) else None,
+        **columns,
     )
 
 
@@ -320,13 +319,6 @@ def _integrated(
     """``(K, 2)`` m, fronts of follower and leader, see :func:`read_pairs`."""
     leader = driven(time, v_leader)
     return np.stack([leader - np.nan_to_num(length) - spacing, leader], -1)
-
-
-def _keys(words: dict[str, np.ndarray]) -> list[np.ndarray]:
-    """The columns that tell pairs apart: their names, else the two vehicles."""
-    if "pair" in words:
-        return [words[n] for n in ("run", "pair") if n in words]
-    return [words[n] for n in ("run", "follower", "leader") if n in words]
 
 
 def _everywhere(
@@ -359,17 +351,12 @@ def _steady(table: Table, column: str, cells: np.ndarray, rows: np.ndarray) -> N
         )
 
 
-def _follower(own: dict[str, np.ndarray], rows: np.ndarray) -> float:
-    return float(own["follower_length"][rows[0]]) if "follower_length" in own else float("nan")
+def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
+    """The leader's length (m): what is left of the distance without the spacing.
 
-
-def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.ndarray) -> float:
-    """The leader's length (m): given, or what is left of the distance without the spacing."""
-    if "leader_length" in own:
-        return float(own["leader_length"][rows[0]])
-    if "spacing" not in own:
-        return float("nan")
-    length = x[rows, 1] - x[rows, 0] - own["spacing"][rows]
+    Args:
+        length: ``(K,)`` m by the row, NaN where it is unknown.
+    """
     if np.isnan(length).all():
         return float("nan")
     usual = float(np.nanmedian(length))
@@ -391,13 +378,6 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
     return usual
 
 
-def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
-    if options.lane is None:
-        return []
-    present = {pair.words.get("lane", "") for pair in pairs}
-    return chosen_lanes(options.lane, present, "the pairs have")
-
-
 def _too_short(rows: Trajectories, options: PairOptions) -> str:
     """Why there is no sequence of a pair."""
     if len(rows) // 2 < options.min_samples:
@@ -408,14 +388,16 @@ def _too_short(rows: Trajectories, options: PairOptions) -> str:
 
 
 def _sequences(
-    name: str, rows: Trajectories, words: dict[str, str], dt: float, options: PairOptions
+    name: str, rows: Trajectories, dt: float, options: PairOptions
 ) -> tuple[list[Sequence], list[Record]]:
     """A pair's sequences, one for every part without a gap or every window, and its records."""
-    usual = rows.dt
-    if options.dt is not None and dt < usual * (1 - UNEVEN):
+    assert rows.recording is not None
+    assert rows.sequence is not None
+    number = str(rows.sequence[0])
+    if options.dt is not None and dt < rows.dt * (1 - UNEVEN):
         raise ConfigError(
-            f"data.dt={dt:g} s is finer than the {usual:g} s of {rows.path}: pair "
-            f"{words['pair']}; expected no more times than were measured"
+            f"data.dt={dt:g} s is finer than the {rows.dt:g} s of {rows.path}: pair {number}; "
+            "expected no more times than were measured"
         )
     grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
     found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
@@ -425,9 +407,9 @@ def _sequences(
     parts = spans(both)
     if len(parts) > 1 and options.gaps is Gaps.error:
         end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
-        row = int(np.flatnonzero(rows.time >= start - dt / 2)[0])
+        row = int(np.argmin(np.where(rows.time >= start - dt / 2, rows.time, np.inf)))
         raise DataError(
-            f"{rows.path}: pair {words['pair']} steps from {end:g} s to {start:g} s "
+            f"{rows.path}: pair {number} steps from {end:g} s to {start:g} s "
             f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
             "data.gaps=cut cuts the pair there"
         )
@@ -435,18 +417,19 @@ def _sequences(
         steps = whole_steps("window", options.window, dt)
         parts = [piece for part in parts for piece in windows(*part, steps)]
     parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
-    split = words.get("split", "").lower()
+    split = "" if rows.split is None else str(rows.split[0]).lower()
     made = [
         sequence_of(
-            name if len(parts) == 1 else f"{name}_{number:03d}",
+            name if len(parts) == 1 else f"{name}_{i:03d}",
             rows,
             both,
             first,
             last,
             grid,
             time=measured_times(rows, grid, first, last),
+            recording=str(rows.recording[0]),
             split=split,
         )
-        for number, (first, last) in enumerate(parts)
+        for i, (first, last) in enumerate(parts)
     ]
     return made, found
