@@ -81,8 +81,9 @@ Draw = Callable[[list[Sequence], dict[str, list[Fault]], Domain, Path], Any]
 class Format:
     """A raw format: which files it needs, and how they become sequences."""
 
-    files: Callable[[Any], _Files]
+    files: Callable[..., _Files]
     read: Callable[[_Files, Any], list[Sequence]]
+    tables: bool = False  # whether ``files`` takes a table in memory as well
 
     def sequences(self, files: _Files, options: Any) -> list[Sequence]:
         """Read the files.
@@ -114,17 +115,20 @@ def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any]
 #: The format that each kind of options stands for; a new format is one more entry.
 FORMATS: dict[type[DataOptions], Format] = {
     EsimasOptions: Format(esimas_files, _each(read_esimas)),
-    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
+    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles), tables=True),
     NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
     JuelichOptions: Format(juelich_files, _each(read_juelich)),
     TableOptions: Format(
-        table_files, lambda files, options: read_table(files[TIDY], options, files.get(WALLS))
+        table_files,
+        lambda files, options: read_table(files[TIDY], options, files.get(WALLS)),
+        tables=True,
     ),
     WalkwayOptions: Format(
         walkway_files,
         lambda files, options: read_walkway(files[PEOPLE], options, files.get(GEOMETRY)),
+        tables=True,
     ),
-    PairOptions: Format(pair_files, read_pairs),
+    PairOptions: Format(pair_files, read_pairs, tables=True),
     OpenAccOptions: Format(openacc_files, read_openacc),
     SumoOptions: Format(sumo_files, _each(read_sumo)),
     HighDOptions: Format(highd_files, read_highd),

@@ -48,9 +48,10 @@ REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
-def walkway_files(options: WalkwayOptions) -> dict[str, Path]:
-    """The trajectories' path, and that of the walkable area where it has a file of its own."""
-    files = {PEOPLE: table_path(options, "path", options.path)}
+def walkway_files(options: WalkwayOptions, table: Table | None = None) -> dict[str, Path | Table]:
+    """The trajectories, or their path, and the path of the walkable area where it has a file of
+    its own."""
+    files = {PEOPLE: table or table_path(options, "path", options.path)}
     if options.geometry is not None:
         files[GEOMETRY] = table_path(options, "geometry", options.geometry)
     return files

@@ -64,25 +64,29 @@ INDEX = "index"
 UNSTEADY = 0.5
 
 
-def pair_files(options: PairOptions) -> dict[str, Path]:
+def pair_files(options: PairOptions, table: Table | None = None) -> dict[str, Path | Table]:
     """The tables by their path below the folder; a single file by its name; and the index.
+
+    Args:
+        table: takes the place of files.
 
     Raises:
         ConfigError: no path, or ``data.source`` is an address.
         DataError: no such file or folder, one without a table, or an index that names a file that
             is not there.
     """
+    if table is not None:
+        return {table.path.stem: table}
     place = place_below(options, options.path)
     listed = place / options.index if options.index is not None and place.is_dir() else None
     if listed is None or not listed.is_file():
-        return tables_below(options, options.path, options.files)
-    table = Table(listed)
-    files = {INDEX: listed}
-    for i, name in enumerate(table.names(table.choose(("path",))["path"])):
-        files[name] = place / name
-        if not files[name].is_file():
-            raise DataError(f"{listed}, {table.row(i)}: there is no file {files[name]}")
-    return files
+        return {**tables_below(options, options.path, options.files)}
+    index = Table(listed)
+    names = index.names(index.choose(("path",))["path"])
+    for i, name in enumerate(names):
+        if not (place / name).is_file():
+            raise DataError(f"{listed}, {index.row(i)}: there is no file {place / name}")
+    return {INDEX: listed, **{name: place / name for name in names}}
 
 
 def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Reading:

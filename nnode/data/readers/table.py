@@ -25,9 +25,9 @@ _WALL = ("x1", "y1", "x2", "y2")
 TABLE, WALLS = "table", "walls"
 
 
-def table_files(options: TableOptions) -> dict[str, Path]:
-    """The table's path, and that of the walls where there are such."""
-    files = {TABLE: table_path(options, "path", options.path)}
+def table_files(options: TableOptions, table: Table | None = None) -> dict[str, Path | Table]:
+    """The table, or its path, and the path of the walls where there are such."""
+    files = {TABLE: table or table_path(options, "path", options.path)}
     if options.walls is not None:
         files[WALLS] = table_path(options, "walls", options.walls)
     return files

@@ -32,8 +32,10 @@ REQUIRED = ("vehicle", "time", "x")
 OPTIONAL = ("lane", "speed", "length", "kind", "recording", "sequence")
 
 
-def vehicle_files(options: LaneOptions) -> dict[str, Path]:
-    """The table's path."""
+def vehicle_files(options: LaneOptions, table: Table | None = None) -> dict[str, Path | Table]:
+    """The table, or its path."""
+    if table is not None:
+        return {table.path.stem: table}
     path = table_path(options, "path", options.path)
     return {path.stem: path}
 
@@ -81,13 +83,6 @@ def seconds_per_unit(
     return scale
 
 
-def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
-    dates = table.instants(column)
-    if dates is None:  # numbers keep their origin, with which the time grid begins
-        return table.numbers(column) * seconds_per_unit(options)
-    return np.asarray((dates - dates.min()) / 1e9)
-
-
 def _rows(table: Table, options: VehicleTableOptions) -> Trajectories:
     """The table's columns, by what they mean."""
     names = table.choose(REQUIRED, OPTIONAL, options.columns)
@@ -104,7 +99,7 @@ def _rows(table: Table, options: VehicleTableOptions) -> Trajectories:
         name=table.path.stem,
         where=table.row,
         agent=table.names(names["vehicle"]),
-        time=_seconds(table, names["time"], options),
+        time=table.times(names["time"], seconds_per_unit(options))[1],
         x=table.numbers(names["x"])[:, None] * metres * options.direction,
         v=v,
         recording=recordings(table, names),
