@@ -8,7 +8,8 @@ condemn noise. And what a fault means for a calibration: see the ``faults`` opti
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -147,6 +148,16 @@ def find_faults(sequence: Sequence, domain: Domain, noise: float = 0.0) -> list[
 def usable(sequence: Sequence, faults: list[Fault]) -> bool:
     """Whether a sequence can be simulated at all, whatever its faults."""
     return sequence.n_samples > 1 and not any(fault.kind in UNUSABLE for fault in faults)
+
+
+def by_kind(found: Iterable[Iterable[str]]) -> dict[str, int]:
+    """Number of sequences with each kind of fault, the most frequent first.
+
+    Args:
+        found: the kinds of the faults of every sequence.
+    """
+    kinds = Counter(kind for own in found for kind in set(own))
+    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
 
 
 class _View:

@@ -208,7 +208,7 @@ def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -
     rows, domain = found.rows, found.scale.domain
     found.findings += find.sampling(rows)
     found.findings += find.time_scale(found.known, found.scale, rate)
-    found.findings += find.extremes(rows, domain)
+    found.findings += find.accelerations(rows)
     found.findings += find.direction(rows, domain)
     whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
     found.findings += find.coming_and_going(rows, domain, whole)
@@ -217,8 +217,7 @@ def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -
     known = 0.0 if found.source.options.published else noise.position
     found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain, known))}
     found.findings += find.measurement(noise, found.sequences, domain)
-    every = [fault for own in found.faults.values() for fault in own]
-    found.findings += find.faults(every, len(found.sequences))
+    found.findings += find.faults(found.faults, len(found.sequences))
     found.findings += _made(found, len(sequences))
     found.findings.sort(key=lambda one: _LEVELS.index(one.level))
     return found

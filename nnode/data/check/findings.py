@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from nnode.data.check.scale import AGREE, INTERVAL, RATES, SWAYS, USUAL, Medians, Scale, moves_of
 from nnode.data.policy import told_filled
-from nnode.data.quality import KINDS, LIMITS, Fault
+from nnode.data.quality import KINDS, LIMITS, Fault, by_kind
 from nnode.data.readers.columns import Table, floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import BEARABLE, Noise, suggested_window
@@ -197,9 +196,11 @@ def measurement(noise: Noise, sequences: list[Sequence], domain: Domain) -> Iter
     yield Finding("noise", "warning", text + cure)
 
 
-def extremes(rows: Trajectories, domain: Domain) -> Iterator[Finding]:
-    """Steps, and accelerations over a second, that nobody can have (m, s)."""
-    yield from _jumps(rows, domain)
+def accelerations(rows: Trajectories) -> Iterator[Finding]:
+    """Accelerations over a second that nobody can have (m, s).
+
+    Steps that are too long, and identifiers that are swapped, are faults of the sequences.
+    """
     moves = moves_of(rows, max(1, round(1.0 / rows.dt)) if rows.dt > 0 else 1)
     if not moves.size.size:
         return
@@ -215,20 +216,6 @@ def extremes(rows: Trajectories, domain: Domain) -> Iterator[Finding]:
             f"{(a > FRICTION).mean():.1%} of the changes of speed over a second exceed "
             f"{FRICTION:g} m/s², what friction can give; 99 % are below "
             f"{np.percentile(a, 99):.3g} m/s²: the time scale or the positions are off",
-        )
-
-
-def _jumps(rows: Trajectories, domain: Domain) -> Iterator[Finding]:
-    """Steps that are too long; the faults of the sequences say where identifiers are swapped."""
-    steps, limits = moves_of(rows, 1), LIMITS[domain]
-    fast = steps.size > limits.max_speed * steps.took + limits.noise
-    if fast.any():
-        who = sorted(set(rows.agent[steps.first[fast]]))
-        yield Finding(
-            "fast",
-            "error",
-            f"{fast.sum()} of {len(fast)} steps are faster than {limits.max_speed:g} m/s, of "
-            f"{_some(who)}",
         )
 
 
@@ -349,13 +336,12 @@ def _continued(
     return sorted(set(found))
 
 
-def faults(found: list[Fault], sequences: int) -> Iterator[Finding]:
+def faults(found: dict[str, list[Fault]], sequences: int) -> Iterator[Finding]:
     """What no vehicle and no person can have done, as :mod:`nnode.data.quality` finds it."""
-    counts = Counter(kind for kind, _ in {(f.kind, f.sequence) for f in found})
-    for kind, number in counts.most_common():
+    for kind, number in by_kind([f.kind for f in own] for own in found.values()).items():
         if kind == "too_short":
             continue
-        first = next(f for f in found if f.kind == kind)
+        first = next(f for own in found.values() for f in own if f.kind == kind)
         level = "error" if number > 0.1 * sequences else "warning"
         yield Finding(
             kind,

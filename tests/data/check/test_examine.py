@@ -118,7 +118,8 @@ def test_swapped_identifiers_are_seen(tmp_path: Path) -> None:
     assert "the path of car" in said(found)["identity_swap"]
     assert "at 20" in said(found)["identity_swap"]
     assert "(id 4) carries on as car 8 (id 3)" in said(found)["identity_swap"]
-    assert said(found)["fast"] == "2 of 4800 steps are faster than 60 m/s, of 3, 4"
+    # one detector says so
+    assert set(said(found)) == {"identity_swap"}
 
 
 def test_identifiers_that_change_along_the_way_are_seen(tmp_path: Path) -> None:
