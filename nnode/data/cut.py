@@ -1,4 +1,4 @@
-"""Sequences cut from agents' records: by lane, by pair or sequence of the source, by presence.
+"""Sequences cut from trajectories: by lane, by sequence of the source, by spacing, by presence.
 
 By lane follows Section 4.2 of the calibration paper: every lane by itself, the lateral coordinate
 dropped, and sequences in which the same vehicles are in view. All ways end in
