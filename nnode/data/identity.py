@@ -30,8 +30,8 @@ from nnode.data.options import Agents
 from nnode.data.quality import LIMITS
 from nnode.data.sequence import Domain, Sequence
 
-#: Greatest number of a sampling time that adds up without rounding.
-_LATEST = 2.0**52
+#: Sampling times are counted up to this number: it is exact, and adding to it as well.
+LATEST = 2.0**52
 
 
 def numbered(name: str, number: int, taken: frozenset[str] | set[str] = frozenset()) -> str:
@@ -149,7 +149,7 @@ def _tracks(sequences: list[Sequence]) -> list[_Track | None]:
 def _track(s: Sequence, step: float) -> _Track | None:
     if s.n_samples < 2 or not (step > 0 and np.isclose(s.dt, step, rtol=1e-2)):
         return None
-    if not abs(s.time).max() < _LATEST * step:
+    if not abs(s.time).max() < LATEST * step:
         return None
     first = int(np.ceil(s.time[0] / step - 1e-6))
     last = max(int(np.floor(s.time[-1] / step + 1e-6)), first)

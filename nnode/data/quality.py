@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequence import UNEVEN, Domain, Sequence
 
 #: Every kind of fault, with what it means.
 KINDS: dict[str, str] = {
@@ -92,7 +92,6 @@ class Limits:
         reach: m within which a position continues a path extrapolated at constant velocity:
             5, a car's length, or 0.4, a person's depth. Decides between swap and jump.
         min_agents, min_samples: needed for an interaction and for an acceleration.
-        uneven: share of the sampling interval by which a time step may deviate.
     """
 
     max_speed: float
@@ -102,7 +101,6 @@ class Limits:
     reach: float
     min_agents: int
     min_samples: int = 3
-    uneven: float = 0.01
     scatter: float = 0.0
 
 
@@ -211,7 +209,7 @@ def _times(view: _View) -> Iterator[Fault]:
     if not np.isfinite(view.time).all():
         yield view.fault("non_finite", (), None, "a sampling time is no number")
         return
-    uneven = np.flatnonzero(~(np.abs(steps - view.dt) <= view.limits.uneven * abs(view.dt)))
+    uneven = np.flatnonzero(~(np.abs(steps - view.dt) <= UNEVEN * abs(view.dt)))
     if uneven.size or (steps.size and view.dt <= 0):
         k = int(uneven[0]) if uneven.size else 0
         text = f"a step of {steps[k]:g} s among steps of {view.dt:g} s"

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.data.identity import given_anew, numbered
+from nnode.data.identity import LATEST, given_anew, numbered
 from nnode.data.options import positive
+from nnode.data.sequence import UNEVEN
 from nnode.data.smooth import across, smooth
 from nnode.errors import DataError
 
@@ -27,10 +28,6 @@ log = logging.getLogger(__name__)
 
 #: A step longer than so many usual ones is a hole.
 HOLE = 1.5
-#: Share of the sampling interval by which a time may miss the grid without being interpolated.
-UNEVEN = 0.01
-#: Steps are counted up to this number: it is exact, and adding to it as well.
-LATEST = 2.0**52
 
 
 @dataclass(frozen=True, kw_only=True)

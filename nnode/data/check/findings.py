@@ -13,9 +13,9 @@ from nnode.data.check.scale import AGREE, INTERVAL, RATES, SWAYS, USUAL, Medians
 from nnode.data.policy import told_filled
 from nnode.data.quality import KINDS, LIMITS, Fault, by_kind
 from nnode.data.readers.columns import Table, floats, quoted
-from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequence import UNEVEN, Domain, Sequence
 from nnode.data.smooth import BEARABLE, Noise, suggested_window
-from nnode.data.trajectories import HOLE, UNEVEN, Trajectories
+from nnode.data.trajectories import HOLE, Trajectories
 
 #: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
 #: over a second: that of gravity, m/s².

@@ -64,14 +64,23 @@ def recognised(
     """
     if domain not in (None, "traffic", "crowd"):
         raise ConfigError(f"data.domain={domain}: expected traffic or crowd")
-    memory = isinstance(source, pd.DataFrame)
-    if isinstance(source, pd.DataFrame):
-        raw = Raw(Path("table"), table=Table(source), separator="")
-    else:
-        raw = read_raw(Path(source).expanduser())
+    raw, memory = _raw(source), isinstance(source, pd.DataFrame)
     if raw.table is None:
         return _native(raw)
-    return _of_table(in_seconds(raw), memory, domain, dict(given or {}))
+    found = _of_table(in_seconds(raw), memory, domain, dict(given or {}))
+    if not memory:
+        return found
+    return replace(
+        found,
+        options=replace(found.options, path=""),  # type: ignore[call-arg]
+        table=raw.table,
+    )
+
+
+def _raw(source: pd.DataFrame | str | Path) -> Raw:
+    if isinstance(source, pd.DataFrame):
+        return Raw(Path("table"), table=Table(source), separator="")
+    return read_raw(Path(source).expanduser())
 
 
 def _of_table(
@@ -102,11 +111,7 @@ def _of_table(
         return _by_name(raw, exact, given)
     found = seen.meanings
     read = source_of(raw, seen)
-    line = _line(raw, found, seen, read.group)
-    if not memory:
-        return replace(read, line=line)
-    options = replace(read.options, path="")  # type: ignore[call-arg]
-    return replace(read, options=options, table=raw.table, line=line)
+    return replace(read, line=_line(raw, found, seen, read.group))
 
 
 def _native(raw: Raw) -> Recognised:
@@ -117,10 +122,8 @@ def _native(raw: Raw) -> Recognised:
 
 def _by_name(raw: Raw, group: str, given: Mapping[str, Any]) -> Recognised:
     """A table with the columns of a format, in the units that the format has by default."""
-    memory = raw.path == Path("table")
-    options = NEEDED[group][0](path="" if memory else str(raw.path))  # type: ignore[call-arg]
-    options = replace(options, columns=dict(given.get("columns") or {}))  # type: ignore[call-arg]
-    return Recognised(group, options, raw.table if memory else None, "")
+    columns = dict(given.get("columns") or {})
+    return Recognised(group, NEEDED[group][0](path=str(raw.path), columns=columns))  # type: ignore[call-arg]
 
 
 def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[str, Any]) -> bool:
@@ -128,27 +131,26 @@ def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[st
 
     What is no table, or no file, has them: its reader says what is wrong.
     """
-    if isinstance(source, pd.DataFrame):
-        names = {str(name).strip() for name in source.columns}
-    else:
-        path = Path(source).expanduser()
-        if not path.is_file():
-            return True
-        try:
-            raw = read_raw(path)
-        except NNodeError:
-            return True
-        if raw.table is None:
-            return True
-        names = set(map(str, raw.table.frame.columns))
-    names |= set(given.get("columns") or {})
+    try:
+        raw = _raw(source)
+    except NNodeError:
+        return True
+    return raw.table is None or _fits(group, _names(raw, given))
+
+
+def _names(raw: Raw, given: Mapping[str, Any]) -> set[str]:
+    """Columns under their own names, and the meanings of those that are given."""
+    assert raw.table is not None
+    return set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+
+
+def _fits(group: str, names: set[str]) -> bool:
     return names >= NEEDED[group][1] or (group == "pairs" and names >= SPACED)
 
 
 def _exact(raw: Raw, given: Mapping[str, Any]) -> str | None:
     """The format whose columns a table has under their own names, or under those given."""
-    assert raw.table is not None
-    names = set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+    names = _names(raw, given)
     if names >= SPACED and not names & {"x", "x_follower", "x_leader"}:
         return "pairs"
     if "vehicle" in names and "sequence" not in names and "x_follower" not in names:
@@ -158,8 +160,7 @@ def _exact(raw: Raw, given: Mapping[str, Any]) -> str | None:
 
 def _tidy(raw: Raw, domain: Domain | None, given: Mapping[str, Any]) -> Recognised:
     """A tidy table: its units are those that are documented, or given."""
-    assert raw.table is not None
-    names = set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+    names = _names(raw, given)
     chosen: Domain = domain or ("crowd" if "y" in names else "traffic")
     read, line = _by_name(raw, "table", given), ""
     if not any(key in given for key in UNIT.values()):

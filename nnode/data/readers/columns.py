@@ -17,7 +17,7 @@ from nnode.errors import ConfigError, DataError
 from nnode.files import csv_cell
 
 #: Whole numbers below this are exact as floating-point numbers.
-_EXACT = 2.0**53
+EXACT = 2.0**53
 #: s; times beyond this (three years) count from a calendar's origin. Float64 resolves them to
 #: 1e-8 s and less, which is a relative error of 1e-6 in intervals of 0.02 s.
 EPOCH = 1e8
@@ -387,7 +387,7 @@ class Table:
                 f"{self.path}, {self.row(i)}: column {column!r} is empty; expected a name or number"
             )
         whole = pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all()
-        if whole and (cells.dropna().abs() < _EXACT).all():
+        if whole and (cells.dropna().abs() < EXACT).all():
             cells = cells.astype("Int64")
         try:
             text = cells.astype("string").fillna("")

@@ -19,7 +19,7 @@ from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
 from nnode.data.options import WalkwayOptions, one_of
-from nnode.data.readers.columns import Table, opened
+from nnode.data.readers.columns import EXACT, Table, opened
 from nnode.data.readers.juelich import People, cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
 from nnode.data.readers.vehicles import LENGTH_UNITS, recordings, seconds_per_unit
@@ -35,9 +35,6 @@ PEOPLE, GEOMETRY = "trajectories", "geometry"
 
 #: Rows that are converted together.
 _AT_ONCE = 100_000
-
-#: Whole numbers below this are exact as floating-point numbers.
-_WHOLE = 2**53
 
 #: Endings of files that are tables.
 TABLES = (".csv", ".parquet", ".pq")
@@ -240,7 +237,7 @@ def _numbers(path: Path, rows: list[tuple[object, ...]]) -> np.ndarray:
     whole = values[:, :2]
     good = np.isfinite(values).all(axis=1)
     with np.errstate(invalid="ignore"):
-        good &= ((whole % 1 == 0) & (np.abs(whole) < _WHOLE)).all(axis=1)
+        good &= ((whole % 1 == 0) & (np.abs(whole) < EXACT)).all(axis=1)
     if not good.all():
         i = int(np.flatnonzero(~good)[0])
         raise DataError(

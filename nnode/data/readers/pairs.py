@@ -32,9 +32,8 @@ from nnode.data.options import Gaps, PairOptions, check_known, one_of, positive,
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, place_below, tables_below
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS, seconds_per_unit
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import UNEVEN, Sequence
 from nnode.data.trajectories import (
-    UNEVEN,
     Grid,
     Record,
     Trajectories,
