@@ -1,4 +1,4 @@
-"""Sequences cut from trajectories: by lane, by sequence of the source, by spacing, by presence.
+"""Sequences cut from trajectories: by lane, sequence, pair, spacing or presence.
 
 By lane follows Section 4.2 of the calibration paper: every lane by itself, the lateral coordinate
 dropped, and sequences in which the same vehicles are in view. All ways end in
@@ -19,13 +19,15 @@ import pandas as pd
 from nnode.data.options import (
     Agents,
     DataOptions,
+    Gaps,
     LaneOptions,
     OpenAccOptions,
+    PairOptions,
     check_known,
     positive,
     wanted,
 )
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import UNEVEN, Sequence
 from nnode.data.smooth import smooth
 from nnode.data.trajectories import (
     Grid,
@@ -131,6 +133,7 @@ def sequence_of(
         "kind": None if table.kind is None else tuple(table.kind[rows]),
         "group": None if table.group is None else tuple(table.group[rows]),
         "destination": None if table.destination is None else table.destination[rows],
+        "split": "" if table.split is None else str(table.split[rows[0]]).lower(),
         "v": None if np.isnan(v).all() else v,
         "filled": filled,
         "time": grid.origin + grid.dt * np.arange(first, last + 1),
@@ -268,35 +271,106 @@ def by_sequence(
     """
     reading, notes = Reading(), list[str]()
     every: list[Record] = []
-    parts = table.parts("recording", "sequence")
-    for (run, number), rows in sorted(parts, key=lambda part: [*map(key, part[0])]):
+    every_part = table.parts("recording", "sequence")
+    for (run, number), rows in sorted(every_part, key=lambda part: [*map(key, part[0])]):
         dt = table.dt if np.isfinite(table.dt) else 1.0  # of single samples
         grid = Grid(dt, float(rows.time.min()))
         found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
         every += found
         of = sorted(members(rows, found), key=lambda member: key(member.agent))
         name = number if number.startswith(f"{run}/") else f"{run}/{number}"
-        spans, note = _parts_of(name, rows, found, of, grid, options.fill)
+        parts, note = _parts_of(name, rows, found, of, grid, options.fill)
         notes += note
-        for i, (a, b) in enumerate(spans):
-            crowd = ordered or table.x.shape[1] == 2
-            reading.append(
-                sequence_of(
-                    name if len(spans) == 1 else f"{name}_{i:03d}",
-                    rows,
-                    of if crowd else sorted(of, key=lambda member: _place(member, a)),
-                    a,
-                    b,
-                    grid,
-                    recording=run,
-                    time=measured_times(rows, grid, a, b),
-                    **({} if named else {"agents": ()}),
-                )
-            )
+        more = {"recording": run} | ({} if named else {"agents": ()})
+        lane = not ordered and table.x.shape[1] == 1
+        orders = [_in_lane(of, first) if lane else of for first, _ in parts]
+        reading += _numbered(name, rows, orders, parts, grid, **more)
     reading.notes = told_uneven(every, table.dt) + notes[:LISTED]
     if len(notes) > LISTED:
         reading.notes.append(f"and {len(notes) - LISTED} more such sequences")
     return reading
+
+
+def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Reading, list[Record]]:
+    """Cut a pair where either is not there, or into windows without such a gap.
+
+    Args:
+        rows: of one pair, the follower's and then as many of the leader's.
+        dt: s, of the time grid; it begins at 0 where ``options.dt`` says it, otherwise with the
+            pair.
+
+    Returns:
+        Sequences named ``recording/sequence``, with a number behind where there are several, and
+        both records.
+
+    Raises:
+        ConfigError: a ``dt`` finer than the rows, or a ``window`` that is no whole number of steps.
+        DataError: a gap, where ``gaps=error``; or one agent twice at one time.
+    """
+    ((run, number), _), *_ = rows.parts("recording", "sequence")
+    name = f"{run}/{number}"
+    if options.dt is not None and dt < rows.dt * (1 - UNEVEN):
+        raise ConfigError(
+            f"data.dt={dt:g} s is finer than the {rows.dt:g} s of {rows.path}: pair {number}; "
+            "expected no more times than were measured"
+        )
+    grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
+    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+    both = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
+    for record in found:
+        both[record.row >= len(rows) // 2].records.append(record)
+    parts = spans(both)
+    if len(parts) > 1 and options.gaps is Gaps.error:
+        end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
+        row = int(np.argmin(np.where(rows.time >= start - dt / 2, rows.time, np.inf)))
+        raise DataError(
+            f"{rows.path}: pair {number} steps from {end:g} s to {start:g} s "
+            f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
+            "data.gaps=cut cuts the pair there"
+        )
+    if options.window is not None:
+        steps = whole_steps("window", options.window, dt)
+        parts = [piece for part in parts for piece in windows(*part, steps)]
+    parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
+    made = Reading(_numbered(name, rows, [both] * len(parts), parts, grid, recording=run))
+    if not made:
+        times = f"data.min_samples={options.min_samples} times"
+        if len(rows) // 2 < options.min_samples:
+            why = f"fewer than {times}"
+        elif options.window is not None:
+            why = f"no data.window={options.window:g} s without a gap"
+        else:
+            why = f"no {times} without a gap"
+        made.left_out.append({"name": name, "why": why})
+    return made, found
+
+
+def _numbered(
+    name: str,
+    rows: Trajectories,
+    of: list[list[Member]],
+    parts: list[tuple[int, int]],
+    grid: Grid,
+    **more: Any,
+) -> list[Sequence]:
+    """Parts of one sequence, with a number behind its name where there are several.
+
+    Args:
+        of: agents of every part, in their order.
+    """
+    return [
+        sequence_of(
+            name if len(parts) == 1 else f"{name}_{i:03d}",
+            rows,
+            own,
+            first,
+            last,
+            grid,
+            time=measured_times(rows, grid, first, last),
+            **more,
+        )
+        for i, (own, (first, last)) in enumerate(zip(of, parts, strict=True))
+    ]
 
 
 def _parts_of(
@@ -345,12 +419,16 @@ def _occupied(found: list[Record]) -> list[tuple[int, int]]:
     return parts
 
 
-def _place(member: Member, at: int) -> float:
-    """m, where a vehicle is at a time, or first."""
-    for record in member.records:
-        if record.last >= at:
-            return float(record.x[max(at - record.first, 0), 0])
-    return np.inf
+def _in_lane(of: list[Member], at: int) -> list[Member]:
+    """Vehicles in the order of where they are at a time, or first."""
+
+    def place(member: Member) -> float:
+        for record in member.records:
+            if record.last >= at:
+                return float(record.x[max(at - record.first, 0), 0])
+        return np.inf
+
+    return sorted(of, key=place)
 
 
 def by_presence(

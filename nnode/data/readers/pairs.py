@@ -18,29 +18,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import (
-    Member,
-    Reading,
-    chosen_lanes,
-    sequence_of,
-    spans,
-    told_uneven,
-    whole_steps,
-    windows,
-)
-from nnode.data.options import Gaps, PairOptions, check_known, one_of, positive, wanted
+from nnode.data.cut import Reading, by_pair, chosen_lanes, told_uneven
+from nnode.data.options import PairOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, place_below, tables_below
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS, seconds_per_unit
-from nnode.data.sequence import UNEVEN, Sequence
-from nnode.data.trajectories import (
-    Grid,
-    Record,
-    Trajectories,
-    driven,
-    measured_times,
-    records,
-)
+from nnode.data.trajectories import Record, Trajectories, driven
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -137,9 +120,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
     lanes = chosen_lanes(options.lane, {lane for _, _, lane, _ in pairs}, "the pairs have")
     steps = [rows.dt for *_, rows in pairs if np.isfinite(rows.dt)]
     dt = options.dt or (float(np.median(steps)) if steps else 1.0)
-    found: list[Sequence] = []
+    found = Reading()
     taken: dict[str, Path] = {}
-    short: list[dict[str, str]] = []
     every: list[Record] = []
     for run, number, lane, rows in sorted(pairs, key=lambda p: (natural(p[0]), natural(p[1]))):
         if (asked is not None and run not in asked) or lane not in lanes:
@@ -151,11 +133,9 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
                 "pairs names of their own (data.columns.pair, data.pattern)"
             )
         taken[name] = rows.path
-        made, own = _sequences(name, rows, dt, options)
-        every += own
-        if not made:
-            short.append({"name": name, "why": _too_short(rows, options)})
-        found += made
+        made, records = by_pair(rows, dt, options)
+        every += records
+        found.add(made)
     if not found:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
@@ -173,7 +153,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             anonymous,
             len(pairs),
         )
-    return Reading(found, short, told_uneven(every, dt))
+    found.notes = told_uneven(every, dt)
+    return found
 
 
 def _check(options: PairOptions) -> None:
@@ -379,60 +360,3 @@ def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
             "data.columns.spacing=null, or correct it"
         )
     return usual
-
-
-def _too_short(rows: Trajectories, options: PairOptions) -> str:
-    """Why there is no sequence of a pair."""
-    if len(rows) // 2 < options.min_samples:
-        return f"fewer than data.min_samples={options.min_samples} times"
-    if options.window is not None:
-        return f"no data.window={options.window:g} s without a gap"
-    return f"no data.min_samples={options.min_samples} times without a gap"
-
-
-def _sequences(
-    name: str, rows: Trajectories, dt: float, options: PairOptions
-) -> tuple[list[Sequence], list[Record]]:
-    """A pair's sequences, one for every part without a gap or every window, and its records."""
-    assert rows.recording is not None
-    assert rows.sequence is not None
-    number = str(rows.sequence[0])
-    if options.dt is not None and dt < rows.dt * (1 - UNEVEN):
-        raise ConfigError(
-            f"data.dt={dt:g} s is finer than the {rows.dt:g} s of {rows.path}: pair {number}; "
-            "expected no more times than were measured"
-        )
-    grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
-    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    both = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
-    for record in found:
-        both[record.row >= len(rows) // 2].records.append(record)
-    parts = spans(both)
-    if len(parts) > 1 and options.gaps is Gaps.error:
-        end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
-        row = int(np.argmin(np.where(rows.time >= start - dt / 2, rows.time, np.inf)))
-        raise DataError(
-            f"{rows.path}: pair {number} steps from {end:g} s to {start:g} s "
-            f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
-            "data.gaps=cut cuts the pair there"
-        )
-    if options.window is not None:
-        steps = whole_steps("window", options.window, dt)
-        parts = [piece for part in parts for piece in windows(*part, steps)]
-    parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
-    split = "" if rows.split is None else str(rows.split[0]).lower()
-    made = [
-        sequence_of(
-            name if len(parts) == 1 else f"{name}_{i:03d}",
-            rows,
-            both,
-            first,
-            last,
-            grid,
-            time=measured_times(rows, grid, first, last),
-            recording=str(rows.recording[0]),
-            split=split,
-        )
-        for i, (first, last) in enumerate(parts)
-    ]
-    return made, found
