@@ -92,17 +92,23 @@ class Member:
     records: list[Record] = field(default_factory=list)
 
 
-def members(table: Trajectories, found: Iterable[Record]) -> list[Member]:
+def members(table: Trajectories, agent_records: Iterable[Record]) -> list[Member]:
     """Every agent that the rows name, in order of names as text, with its records."""
     names, rows = np.unique(table.agent.astype(str), return_index=True)
-    own = {name: Member(name, int(row)) for name, row in zip(names, rows, strict=True)}
-    for record in found:
-        own[record.agent].records.append(record)
-    return list(own.values())
+    by_name = {name: Member(name, int(row)) for name, row in zip(names, rows, strict=True)}
+    for record in agent_records:
+        by_name[record.agent].records.append(record)
+    return list(by_name.values())
 
 
 def sequence_of(
-    name: str, table: Trajectories, of: list[Member], first: int, last: int, grid: Grid, **more: Any
+    name: str,
+    table: Trajectories,
+    of: list[Member],
+    first: int,
+    last: int,
+    grid: Grid,
+    **further: Any,
 ) -> Sequence:
     """The sequence of some agents from one time of the grid to another one.
 
@@ -110,7 +116,7 @@ def sequence_of(
         name: of the sequence.
         table: that the records are from.
         of: its agents, in their order; NaN where one has no record.
-        more: further fields of :class:`~nnode.data.sequence.Sequence`.
+        further: further fields of :class:`~nnode.data.sequence.Sequence`.
     """
     shape = (last - first + 1, len(of), table.x.shape[1])
     x, v = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -126,7 +132,7 @@ def sequence_of(
                 filled += int(record.filled[part].sum())
     rows = np.array([member.row for member in of], dtype=int)
     length = None if table.length is None else table.length[rows]
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "recording": table.name,
         "agents": tuple(member.agent for member in of),
         "length": None if length is None or np.isnan(length).all() else length,
@@ -138,12 +144,12 @@ def sequence_of(
         "filled": filled,
         "time": grid.origin + grid.dt * np.arange(first, last + 1),
     }
-    return Sequence(name=name, x=x, **(told | more))
+    return Sequence(name=name, x=x, **(fields | further))
 
 
-def told_uneven(found: Iterable[Record], dt: float) -> list[str]:
+def told_uneven(agent_records: Iterable[Record], dt: float) -> list[str]:
     """A sentence about records whose times are uneven, if there are such."""
-    every = list(found)
+    every = list(agent_records)
     number = sum(int(r.uneven.sum()) for r in every)
     total = sum(len(r.x) for r in every)
     if not number:
@@ -203,21 +209,21 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
         notes += [f"{stem}: {text}" for text in told_uneven(every, grid.dt)]
         present = {""} if rows.lane is None else set(rows.lane)
         for lane in (name for name in chosen if name in present):
-            own = [r for r in every if rows.lane is None or rows.lane[r.row] == lane]
-            lanes[f"{stem}_{lane_word}{lane}" if lane else stem] = stem, rows, own
+            lane_records = [r for r in every if rows.lane is None or rows.lane[r.row] == lane]
+            lanes[f"{stem}_{lane_word}{lane}" if lane else stem] = stem, rows, lane_records
     asked = wanted(options.recording)
     if asked is not None:
         check_known(asked, lanes)
         lanes = {name: lanes[name] for name in asked}
-    found = []
-    for name, (stem, rows, own) in lanes.items():
-        for number, (platoon, first, last) in enumerate(_platoons(own, options)):
+    sequences = []
+    for name, (stem, rows, lane_records) in lanes.items():
+        for number, (platoon, first, last) in enumerate(_platoons(lane_records, options)):
             of = [Member(record.agent, record.row, [record]) for record in platoon]
             kinds = None
             if rows.kind is not None:
                 codes = (str(rows.kind[record.row]) for record in platoon)
                 kinds = tuple(names_of_kinds.get(code, code) for code in codes)
-            found.append(
+            sequences.append(
                 sequence_of(
                     f"{name}/{number:03d}",
                     rows,
@@ -230,8 +236,10 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
                     kind=kinds,
                 )
             )
-    if not found:
-        vehicles = {record.agent for _, _, own in lanes.values() for record in own}
+    if not sequences:
+        vehicles = {
+            record.agent for _, _, lane_records in lanes.values() for record in lane_records
+        }
         raise DataError(
             f"{table.path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
             f"lane for {options.min_samples} samples of {options.dt:g} s"
@@ -239,7 +247,7 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
             + f" ({len(vehicles)} vehicles, {len(lanes)} lanes); lower data.min_vehicles, "
             "data.min_samples or data.window"
         )
-    return Reading(found, notes=notes)
+    return Reading(sequences, notes=notes)
 
 
 def by_sequence(
@@ -275,16 +283,16 @@ def by_sequence(
     for (run, number), rows in sorted(every_part, key=lambda part: [*map(key, part[0])]):
         dt = table.dt if np.isfinite(table.dt) else 1.0  # of single samples
         grid = Grid(dt, float(rows.time.min()))
-        found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-        every += found
-        of = sorted(members(rows, found), key=lambda member: key(member.agent))
+        agent_records = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+        every += agent_records
+        of = sorted(members(rows, agent_records), key=lambda member: key(member.agent))
         name = number if number.startswith(f"{run}/") else f"{run}/{number}"
-        parts, note = _parts_of(name, rows, found, of, grid, options.fill)
+        parts, note = _parts_of(name, rows, agent_records, of, grid, options.fill)
         notes += note
-        more = {"recording": run} | ({} if named else {"agents": ()})
+        fields = {"recording": run} | ({} if named else {"agents": ()})
         lane = not ordered and table.x.shape[1] == 1
         orders = [_in_lane(of, first) if lane else of for first, _ in parts]
-        reading += _numbered(name, rows, orders, parts, grid, **more)
+        reading += _numbered(name, rows, orders, parts, grid, **fields)
     reading.notes = told_uneven(every, table.dt) + notes[:LISTED]
     if len(notes) > LISTED:
         reading.notes.append(f"and {len(notes) - LISTED} more such sequences")
@@ -315,11 +323,11 @@ def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Readin
             "expected no more times than were measured"
         )
     grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
-    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    both = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
-    for record in found:
-        both[record.row >= len(rows) // 2].records.append(record)
-    parts = spans(both)
+    pair_records = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+    vehicles = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
+    for record in pair_records:
+        vehicles[record.row >= len(rows) // 2].records.append(record)
+    parts = spans(vehicles)
     if len(parts) > 1 and options.gaps is Gaps.error:
         end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
         row = int(np.argmin(np.where(rows.time >= start - dt / 2, rows.time, np.inf)))
@@ -332,7 +340,7 @@ def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Readin
         steps = whole_steps("window", options.window, dt)
         parts = [piece for part in parts for piece in windows(*part, steps)]
     parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
-    made = Reading(_numbered(name, rows, [both] * len(parts), parts, grid, recording=run))
+    made = Reading(_numbered(name, rows, [vehicles] * len(parts), parts, grid, recording=run))
     if not made:
         times = f"data.min_samples={options.min_samples} times"
         if len(rows) // 2 < options.min_samples:
@@ -342,7 +350,7 @@ def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Readin
         else:
             why = f"no {times} without a gap"
         made.left_out.append({"name": name, "why": why})
-    return made, found
+    return made, pair_records
 
 
 def _numbered(
@@ -351,7 +359,7 @@ def _numbered(
     of: list[list[Member]],
     parts: list[tuple[int, int]],
     grid: Grid,
-    **more: Any,
+    **fields: Any,
 ) -> list[Sequence]:
     """Parts of one sequence, with a number behind its name where there are several.
 
@@ -362,21 +370,21 @@ def _numbered(
         sequence_of(
             name if len(parts) == 1 else f"{name}_{i:03d}",
             rows,
-            own,
+            agents,
             first,
             last,
             grid,
             time=measured_times(rows, grid, first, last),
-            **more,
+            **fields,
         )
-        for i, (own, (first, last)) in enumerate(zip(of, parts, strict=True))
+        for i, (agents, (first, last)) in enumerate(zip(of, parts, strict=True))
     ]
 
 
 def _parts_of(
     name: str,
     rows: Trajectories,
-    found: list[Record],
+    agent_records: list[Record],
     of: list[Member],
     grid: Grid,
     fill: float,
@@ -390,8 +398,8 @@ def _parts_of(
             "shorter sequences"
         )
     crowd = rows.x.shape[1] == 2
-    parts = _occupied(found) if crowd else spans(of)
-    if crowd and any(record.uneven.any() for record in found):
+    parts = _occupied(agent_records) if crowd else spans(of)
+    if crowd and any(record.uneven.any() for record in agent_records):
         # people begin and end between two times of the grid
         parts = [(a + 1, b - 1) for a, b in parts]
     parts = [(a, b) for a, b in parts if b - a + 1 >= LEAST]
@@ -408,10 +416,10 @@ def _parts_of(
     ]
 
 
-def _occupied(found: list[Record]) -> list[tuple[int, int]]:
+def _occupied(agent_records: list[Record]) -> list[tuple[int, int]]:
     """First and last times of the intervals in which anybody is there."""
     parts: list[tuple[int, int]] = []
-    for record in sorted(found, key=lambda r: r.first):
+    for record in sorted(agent_records, key=lambda r: r.first):
         if parts and record.first <= parts[-1][1] + 1:
             parts[-1] = parts[-1][0], max(parts[-1][1], record.last)
         else:
@@ -460,15 +468,15 @@ def by_presence(
     }
     for first in sorted(starts):
         last = first + steps
-        there = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
+        present = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
         if view is not None:
-            paths = [record.x[first - record.first : last - record.first + 1] for record in there]
+            paths = [record.x[first - record.first : last - record.first + 1] for record in present]
             inside = [
                 (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
             ]
-            there = [record for record, good in zip(there, inside, strict=True) if good]
-        if len(there) >= least:
-            yield there, first, last
+            present = [record for record, good in zip(present, inside, strict=True) if good]
+        if len(present) >= least:
+            yield present, first, last
 
 
 def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
@@ -505,14 +513,14 @@ def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
     linked[:, 0] = False
     first_row = pd.Series(np.arange(len(rows))).groupby(rows.agent, sort=False).first()
     table = replace(rows, x=rows.x[:, :1])
-    found: list[Sequence] = []
+    sequences: list[Sequence] = []
     for first, last in _linked_intervals(linked, grid.dt, options):
         part = slice(first, last + 1)
         heads = np.flatnonzero(~linked[part].all(axis=0))
         for i, end in pairwise([*heads.tolist(), linked.shape[1]]):
             if end - i < options.min_vehicles or not np.isfinite(v[part, i]).all():
                 continue
-            front, own = way[part, i], []
+            front, platoon = way[part, i], []
             for n in range(i, end):
                 front = front - (gap[part, n] + (options.length or 0.0) if n > i else 0.0)
                 x, speeds = front, v[part, n]
@@ -528,10 +536,10 @@ def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
                     added[part, n],
                     np.zeros(len(x), dtype=bool),
                 )
-                own.append(Member(record.agent, record.row, [record]))
-            name = f"{rows.name}/{len(found):03d}"
-            found.append(sequence_of(name, table, own[::-1], first, last, grid))
-    return found
+                platoon.append(Member(record.agent, record.row, [record]))
+            name = f"{rows.name}/{len(sequences):03d}"
+            sequences.append(sequence_of(name, table, platoon[::-1], first, last, grid))
+    return sequences
 
 
 def _equally_spaced(
@@ -568,25 +576,25 @@ def _equally_spaced(
             f"{rows.path}: run {rows.name} has two rows of one position at one time; expected one "
             "row per vehicle and time"
         )
-    found = []
+    wide_columns = []
     for column in columns:
         wide = np.full(shape, np.nan)
         if column is not None:
             wide.ravel()[cell] = column.ravel()
-        found.append(wide)
-    return float(time[0]), step, found
+        wide_columns.append(wide)
+    return float(time[0]), step, wide_columns
 
 
 def _filled(values: np.ndarray, most: int) -> np.ndarray:
     """``(K, N)`` values with holes of at most ``most`` samples interpolated."""
     full = values.copy()
     for column in full.T:
-        missing, known = (np.flatnonzero(np.isnan(column) == where) for where in (True, False))
-        after = np.searchsorted(known, missing)
-        inside = (after > 0) & (after < len(known))
+        missing, measured = (np.flatnonzero(np.isnan(column) == where) for where in (True, False))
+        after = np.searchsorted(measured, missing)
+        inside = (after > 0) & (after < len(measured))
         missing, after = missing[inside], after[inside]
-        short = missing[known[after] - known[after - 1] <= most + 1]
-        column[short] = np.interp(short, known, column[known]) if short.size else 0.0
+        short = missing[measured[after] - measured[after - 1] <= most + 1]
+        column[short] = np.interp(short, measured, column[measured]) if short.size else 0.0
     return full
 
 
@@ -599,14 +607,14 @@ def _sound(
     Args:
         faster: ``(K, N - 1)`` m/s, how much faster each follower is than the vehicle in front.
     """
-    found = np.where(spacing > 0, spacing, np.nan)
+    sound = np.where(spacing > 0, spacing, np.nan)
     if most is not None:
-        told = -(faster[1:] + faster[:-1]) / 2 * dt
-        off = np.abs(np.diff(found[:, 1:], axis=0) - told) > most
-        found[1:, 1:][off] = np.nan
-        found[:-1, 1:][off] = np.nan
+        expected = -(faster[1:] + faster[:-1]) / 2 * dt
+        off = np.abs(np.diff(sound[:, 1:], axis=0) - expected) > most
+        sound[1:, 1:][off] = np.nan
+        sound[:-1, 1:][off] = np.nan
     names = list(dict.fromkeys(rows.agent))
-    bad = np.isfinite(spacing) & np.isnan(found)
+    bad = np.isfinite(spacing) & np.isnan(sound)
     for i in np.flatnonzero(bad.any(axis=0)):
         log.info(
             "%s: %d of %d gaps of %s to %s are not above 0, or change otherwise than their speeds "
@@ -617,7 +625,7 @@ def _sound(
             names[i],
             names[i - 1],
         )
-    return found
+    return sound
 
 
 def _linked_intervals(
@@ -679,14 +687,14 @@ def chosen_lanes(lane: Any, present: set[str], who: str) -> list[str]:
     Raises:
         ConfigError: an unknown lane; ``who`` has the lanes that it lists.
     """
-    known = sorted(present, key=lambda name: (len(name), name))
+    every_lane = sorted(present, key=lambda name: (len(name), name))
     if lane is None:
-        return known
+        return every_lane
     chosen = [lane] if isinstance(lane, str | int | float) else lane
     names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
     for name in names:
         if name not in present:
-            raise ConfigError(f"data.lane={name}: {who} the lanes {', '.join(known[:20])}")
+            raise ConfigError(f"data.lane={name}: {who} the lanes {', '.join(every_lane[:20])}")
     return names
 
 
@@ -716,16 +724,18 @@ def _intervals(every: list[Record]) -> Iterator[_Platoon]:
 
 def _pairs(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     """Followers with their leaders, as long as nobody comes between them, in order of time."""
-    found: dict[tuple[int, int], list[tuple[Record, Record, int, int]]] = {}
+    stays: dict[tuple[int, int], list[tuple[Record, Record, int, int]]] = {}
     for platoon, first, last in _intervals(lane):
         for follower, leader in pairwise(_in_order(platoon, first)):
-            known = found.setdefault((id(follower), id(leader)), [])
-            if known and known[-1][3] + 1 == first:
-                first_of_all = known.pop()[2]
-                known.append((follower, leader, first_of_all, last))
+            pair_stays = stays.setdefault((id(follower), id(leader)), [])
+            if pair_stays and pair_stays[-1][3] + 1 == first:
+                first_of_all = pair_stays.pop()[2]
+                pair_stays.append((follower, leader, first_of_all, last))
             else:
-                known.append((follower, leader, first, last))
-    every = sorted((span for own in found.values() for span in own), key=lambda span: span[2])
+                pair_stays.append((follower, leader, first, last))
+    every = sorted(
+        (span for every_stay in stays.values() for span in every_stay), key=lambda span: span[2]
+    )
     for follower, leader, first, last in every:
         steps = last - first if options.window is None else round(options.window / options.dt)
         for start, end in windows(first, last, max(steps, 1)):
@@ -744,17 +754,17 @@ def _windows(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     }
     for first in sorted(start + k * steps for k in busy if 0 <= k <= (end - start) // steps - 1):
         last = first + steps
-        seen = [r for r in lane if r.first <= last and r.last >= first]
-        whole = _in_order([r for r in seen if r.first <= first and r.last >= last], first)
+        in_view = [r for r in lane if r.first <= last and r.last >= first]
+        whole = _in_order([r for r in in_view if r.first <= first and r.last >= last], first)
         if not whole:
             continue
         x = np.stack([r.x[first - r.first : last - r.first + 1, 0] for r in whole], axis=1)
         broken: set[int] = set()
-        for r in seen:
+        for r in in_view:
             if r.first > first or r.last < last:
                 a, b = max(first, r.first), min(last, r.last)
-                own = r.x[a - r.first : b - r.first + 1]
-                behind = (x[a - first : b - first + 1] < own).sum(axis=1)
+                place = r.x[a - r.first : b - r.first + 1]
+                behind = (x[a - first : b - first + 1] < place).sum(axis=1)
                 broken.update(int(n) for n in behind)
         borders = sorted({0, len(whole)} | broken)
         for low, high in pairwise(borders):

@@ -80,10 +80,10 @@ class Trajectories:
     def at(self, rows: np.ndarray) -> Trajectories:
         """Some of the rows, by number."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        own: dict[str, Any] = {
+        chosen: dict[str, Any] = {
             name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)
         }
-        return replace(self, where=lambda i: self.where(int(rows[i])), **own)
+        return replace(self, where=lambda i: self.where(int(rows[i])), **chosen)
 
     @cached_property
     def steps(self) -> np.ndarray:
@@ -118,8 +118,8 @@ class Trajectories:
         """The rows with an agent, a time and a position, in the order of agents and, of each, of
         time; no time twice."""
         code = pd.factorize(self.agent)[0]
-        known = np.isfinite(self.time) & np.isfinite(self.x).all(axis=1) & (code >= 0)
-        order = np.flatnonzero(known)
+        usable = np.isfinite(self.time) & np.isfinite(self.x).all(axis=1) & (code >= 0)
+        order = np.flatnonzero(usable)
         order = order[np.lexsort((self.time[order], code[order]))]
         repeated = (np.diff(code[order]) == 0) & (np.diff(self.time[order]) == 0)
         return self.at(np.delete(order, np.flatnonzero(repeated) + 1))
@@ -133,15 +133,15 @@ class Trajectories:
 
     def parts(self, *names: str) -> Iterator[tuple[tuple[str, ...], Trajectories]]:
         """The rows of every combination of names, such as ``recording``, in order of first rows."""
-        known = [column for name in names if (column := getattr(self, name)) is not None]
-        if not known:
+        given = [column for name in names if (column := getattr(self, name)) is not None]
+        if not given:
             yield tuple("" for _ in names), self
             return
-        groups = pd.DataFrame(dict(enumerate(known))).groupby(list(range(len(known))), sort=False)
+        groups = pd.DataFrame(dict(enumerate(given))).groupby(list(range(len(given))), sort=False)
         for rows in sorted(groups.indices.values(), key=min):
-            own = self.at(np.sort(rows))
-            columns = (getattr(own, name) for name in names)
-            yield tuple("" if column is None else str(column[0]) for column in columns), own
+            part = self.at(np.sort(rows))
+            columns = (getattr(part, name) for name in names)
+            yield tuple("" if column is None else str(column[0]) for column in columns), part
 
 
 @dataclass(frozen=True)
@@ -185,10 +185,10 @@ def driven(time: np.ndarray, v: np.ndarray) -> np.ndarray:
 
     The trapezium rule; over holes (NaN) by the line between their ends.
     """
-    known = np.isfinite(v)
-    if not known.any():
+    measured = np.isfinite(v)
+    if not measured.any():
         return np.zeros(len(v))
-    whole = np.interp(time, time[known], v[known])
+    whole = np.interp(time, time[measured], v[measured])
     return np.concatenate([[0.0], np.cumsum((whole[1:] + whole[:-1]) / 2 * np.diff(time))])
 
 
@@ -238,33 +238,33 @@ def records(
     order = np.lexsort((table.time, code))
     _once(table, order, code[order])
     # infinite ones are no holes, but a fault
-    known = ~np.isnan(table.x).any(axis=1)
+    measured = ~np.isnan(table.x).any(axis=1)
     if table.v is not None:
-        known &= ~np.isnan(table.v).any(axis=1)
-    order = order[known[order]]
+        measured &= ~np.isnan(table.v).any(axis=1)
+    order = order[measured[order]]
     if not len(order):
         return []
-    time, x, own = table.time[order], table.x[order], code[order]
+    time, x, agent_code = table.time[order], table.x[order], code[order]
     v = None if table.v is None else table.v[order]
-    step, other = np.diff(time), np.diff(own) != 0
+    step, other = np.diff(time), np.diff(agent_code) != 0
     usual = float(np.median(step[~other])) if (~other).any() else grid.dt
     hole = ~other & (step > HOLE * usual) & (step - usual > fill + 1e-6)
     number = np.ones(len(order), dtype=int)
     if reused:
-        number = _numbers(ids[own], time, x[:, 0], other, hole, reused)
+        number = _numbers(ids[agent_code], time, x[:, 0], other, hole, reused)
     if smoothing is not None:
         positive("smooth", smoothing)
         x, v = _smoothed(time, x, other | hole, smoothing)
     ends = other | hole
     if table.lane is not None:
         ends |= table.lane[order][1:] != table.lane[order][:-1]
-    taken, found = set(map(str, ids)), []
+    taken, agent_records = set(map(str, ids)), []
     for rows in np.split(np.arange(len(order)), np.flatnonzero(ends) + 1):
-        agent = numbered(str(ids[own[rows[0]]]), int(number[rows[0]]), taken)
+        agent = numbered(str(ids[agent_code[rows[0]]]), int(number[rows[0]]), taken)
         made = _on_grid(time[rows], x[rows], None if v is None else v[rows], grid, usual)
         if made is not None:
-            found.append(Record(agent, int(order[rows[0]]), *made))
-    return found
+            agent_records.append(Record(agent, int(order[rows[0]]), *made))
+    return agent_records
 
 
 def _once(table: Trajectories, order: np.ndarray, code: np.ndarray) -> None:

@@ -61,60 +61,60 @@ class Scaled:
         Args:
             told: frames per second as the file or the user tells.
         """
-        found, best = {}, self.scale
+        sentences, best = {}, self.scale
         if self.share < LIKELY:
             other = next(s for s in self.scales if s.units != best.units)
-            found["units"] = (
+            sentences["units"] = (
                 f"its numbers may be {best} or {other}; say which, with {best.options} or "
                 f"{other.options}"
             )
         if rates := self.rates(told):
             fit = " or ".join(f"{rate:g}" for rate in rates)
-            found["rate"] = (
+            sentences["rate"] = (
                 f"times are frames of a rate that the file does not tell; {fit} frames/s fit: say "
                 f"the right one, as in data.frame_rate={best.rate:g}"
             )
-        return found
+        return sentences
 
 
 def scaled(
     raw: Raw,
-    found: Mapping[str, Meaning],
+    meanings: Mapping[str, Meaning],
     domain: Domain | None,
     rate: float | None,
-    told: Mapping[str, str] | None = None,
+    told_units: Mapping[str, str] | None = None,
 ) -> Scaled:
     """Rows of a table, and its units.
 
     Args:
-        found: column by meaning.
+        meanings: column by meaning.
         domain, rate: see :func:`examine`.
-        told: units by ``position``, ``time``, ``speed``, as the user tells them.
+        told_units: units by ``position``, ``time``, ``speed``, as the user tells them.
 
     Raises:
         DataError: a column that is needed was not recognised, or nothing moves.
     """
-    found = _counted(raw, _of_pairs(raw, dict(found)))
-    table = _rows(raw, found)
-    clock = clock_of(found)
+    meanings = _counted(raw, _of_pairs(raw, dict(meanings)))
+    table = _rows(raw, meanings)
+    clock = clock_of(meanings)
     rows = table.in_order()
     if len(rows) < 2 or not rows.steps.size:
         number = len(_cells(raw))
         raise DataError(
             f"{raw.path}: {number} row{'s' * (number != 1)}, in which no agent of column "
-            f"{found.get('agent', found[clock]).column!r} has numbers at two times; "
+            f"{meanings.get('agent', meanings[clock]).column!r} has numbers at two times; "
             "nothing moves that could be looked at"
         )
-    units = {"time": "s" if found[clock].column in raw.dated else found[clock].unit}
+    units = {"time": "s" if meanings[clock].column in raw.dated else meanings[clock].unit}
     for what, tellers in _TELL.items():
-        units[what] = next((u for m in tellers if m in found and (u := found[m].unit)), "")
+        units[what] = next((u for m in tellers if m in meanings and (u := meanings[m].unit)), "")
     units |= {"position": raw.unit} if raw.unit else {}
-    units |= told or {}
+    units |= told_units or {}
     if clock == "frame":
         units["time"] = "frame"
-    known = {d: medians(rows, d) for d in _domains(found, rows, domain)}
+    domain_medians = {d: medians(rows, d) for d in _domains(meanings, rows, domain)}
     every = scales(
-        known,
+        domain_medians,
         {what: unit for what, unit in units.items() if unit},
         frames=clock == "frame" or bool((rows.time % 1 == 0).all()),
         rate=rate or raw.rate,
@@ -128,7 +128,7 @@ def scaled(
         v=None if rows.v is None else rows.v * scale.per_second,
         length=None if rows.length is None else rows.length * scale.metres,
     )
-    return Scaled(found, every, known[scale.domain], table, si)
+    return Scaled(meanings, every, domain_medians[scale.domain], table, si)
 
 
 def _cells(raw: Raw) -> pd.DataFrame:
@@ -136,28 +136,28 @@ def _cells(raw: Raw) -> pd.DataFrame:
     return raw.table.frame
 
 
-def _counted(raw: Raw, found: dict[str, Meaning]) -> dict[str, Meaning]:
+def _counted(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
     """Meanings without a time that is nothing but the number of the frame."""
     assert raw.table is not None
-    if not {"time", "frame"} <= set(found):
-        return found
-    time, frame = (numbers(raw.table.frame, found[m].column) for m in ("time", "frame"))
+    if not {"time", "frame"} <= set(meanings):
+        return meanings
+    time, frame = (numbers(raw.table.frame, meanings[m].column) for m in ("time", "frame"))
     if not np.array_equal(time, frame, equal_nan=True):
-        return found
-    return {m: one for m, one in found.items() if m != "time"}
+        return meanings
+    return {m: meaning for m, meaning in meanings.items() if m != "time"}
 
 
 def _domains(
-    found: Mapping[str, Meaning], rows: Trajectories, asked: Domain | None
+    meanings: Mapping[str, Meaning], rows: Trajectories, asked: Domain | None
 ) -> list[Domain]:
     if rows.x.shape[1] == 1:
         return ["traffic"]
     if asked:
         return [asked]
-    names = {m.column.lower() for m in found.values()}
+    names = {m.column.lower() for m in meanings.values()}
     if any(word in name for name in names for word in ("ped", "person")):
         return ["crowd"]
-    return ["traffic"] if "lane" in found else ["crowd", "traffic"]
+    return ["traffic"] if "lane" in meanings else ["crowd", "traffic"]
 
 
 def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
@@ -212,14 +212,14 @@ def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
     )
 
 
-def _check_needed(raw: Raw, found: Mapping[str, Meaning], pairs: bool) -> None:
+def _check_needed(raw: Raw, meanings: Mapping[str, Meaning], pairs: bool) -> None:
     """Refuse a table without the columns that are needed."""
-    lacking = [] if {"time", "frame"} & set(found) else ["a time or a frame"]
-    lacking += [] if pairs or "x" in found else ["a position x"]
-    lacking += [] if pairs or "agent" in found else ["an agent"]
+    lacking = [] if {"time", "frame"} & set(meanings) else ["a time or a frame"]
+    lacking += [] if pairs or "x" in meanings else ["a position x"]
+    lacking += [] if pairs or "agent" in meanings else ["an agent"]
     if lacking:
         listed = ", ".join(map(str, _cells(raw).columns[:20]))
-        taken = ", ".join(f"{m.column} as {meaning}" for meaning, m in found.items())
+        taken = ", ".join(f"{m.column} as {meaning}" for meaning, m in meanings.items())
         raise DataError(
             f"{raw.path}: no column was recognised as {' nor as '.join(lacking)}; it has {listed} "
             f"(taken: {taken or 'none'}); name the columns agent, time, x (and y), see docs/data.md"
@@ -230,41 +230,45 @@ def _joined(columns: list[np.ndarray]) -> np.ndarray:
     return np.array([" ".join(cells) for cells in zip(*columns, strict=True)], dtype=object)
 
 
-def _pairs(raw: Raw, found: Mapping[str, Meaning]) -> np.ndarray:
+def _pairs(raw: Raw, meanings: Mapping[str, Meaning]) -> np.ndarray:
     """``(rows,)`` names of the pairs that rows are of."""
     assert raw.table is not None
-    who = ("pair",) if "pair" in found else ("follower", "leader")
-    told = [m for m in ("recording", "sequence", *who) if m in found]
-    parts = [raw.table.names(found[m].column, empty=m not in ("follower", "leader")) for m in told]
-    if not set(who) & set(found):
+    who = ("pair",) if "pair" in meanings else ("follower", "leader")
+    whose = [m for m in ("recording", "sequence", *who) if m in meanings]
+    parts = [
+        raw.table.names(meanings[m].column, empty=m not in ("follower", "leader")) for m in whose
+    ]
+    if not set(who) & set(meanings):
         parts.append(np.full(len(raw.table), "pair", dtype=object))
     return _joined(parts)
 
 
-def _of_pairs(raw: Raw, found: dict[str, Meaning]) -> dict[str, Meaning]:
+def _of_pairs(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
     """Meanings with those that columns have only beside a leader's."""
     assert raw.table is not None
-    if {"spacing", "v_leader", "speed"} <= set(found) and "v_follower" not in found:
-        changed = {"v_follower" if m == "speed" else m: one for m, one in found.items()}
-        found = changed if is_spaced(changed) else found
-    if are_pairs(found) and {"pair", "split"} <= set(found) and "recording" not in found:
-        both = [raw.table.names(found[m].column, empty=True) for m in ("pair", "split")]
-        names = set(zip(*both, strict=True))
+    if {"spacing", "v_leader", "speed"} <= set(meanings) and "v_follower" not in meanings:
+        changed = {"v_follower" if m == "speed" else m: meaning for m, meaning in meanings.items()}
+        meanings = changed if is_spaced(changed) else meanings
+    if are_pairs(meanings) and {"pair", "split"} <= set(meanings) and "recording" not in meanings:
+        columns = [raw.table.names(meanings[m].column, empty=True) for m in ("pair", "split")]
+        names = set(zip(*columns, strict=True))
         if len({pair for pair, _ in names}) < len(names):  # counted anew on either side
-            found = {**found, "recording": found["split"]}
-    return found
+            meanings = {**meanings, "recording": meanings["split"]}
+    return meanings
 
 
-def _integrated(raw: Raw, found: Mapping[str, Meaning]) -> list[np.ndarray]:
+def _integrated(raw: Raw, meanings: Mapping[str, Meaning]) -> list[np.ndarray]:
     """Positions of followers and leaders in the unit of the spacing, by the reader's rule.
 
     What distance a unit of speed times time is follows from how spacings change with the speeds:
     the ratio of root mean squares of both changes.
     """
     assert raw.table is not None
-    columns = [found[m].column for m in (clock_of(found), "spacing", "v_follower", "v_leader")]
+    columns = [
+        meanings[m].column for m in (clock_of(meanings), "spacing", "v_follower", "v_leader")
+    ]
     time, spacing, follower, leader = (numbers(raw.table.frame, c) for c in columns)
-    pair = pd.factorize(_pairs(raw, found))[0]
+    pair = pd.factorize(_pairs(raw, meanings))[0]
     order = np.lexsort((time, pair))
     same = np.diff(pair[order]) == 0
 
@@ -276,9 +280,9 @@ def _integrated(raw: Raw, found: Mapping[str, Meaning]) -> list[np.ndarray]:
     whole = pair[order][lag:] == pair[order][:-lag]
     change = (spacing[order][lag:] - spacing[order][:-lag])[whole]
     said = (relative[lag:] - relative[:-lag])[whole]
-    known = np.isfinite(change)
-    unit = float(np.sqrt((change[known] ** 2).sum() / max((said[known] ** 2).sum(), 1e-300)))
-    if not (known.any() and 0 < unit < 1e6):
+    finite = np.isfinite(change)
+    unit = float(np.sqrt((change[finite] ** 2).sum() / max((said[finite] ** 2).sum(), 1e-300)))
+    if not (finite.any() and 0 < unit < 1e6):
         unit = 1.0
     x = np.empty(len(time))
     x[order] = unit * gone(leader)

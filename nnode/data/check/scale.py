@@ -254,31 +254,31 @@ def _ratio(rows: Trajectories, moves: Moves, moving: np.ndarray) -> float:
     mean = (speed[1:] + speed[:-1]) / 2
     gone = np.concatenate([[0.0], np.nancumsum(mean * np.diff(rows.time))])
     said = (gone[moves.last] - gone[moves.first])[moving]
-    known = said > 0
-    return float(np.median(moves.size[moving][known] / said[known])) if known.any() else np.nan
+    moved = said > 0
+    return float(np.median(moves.size[moving][moved] / said[moved])) if moved.any() else np.nan
 
 
 def _nearest(rows: Trajectories, domain: Domain, moments: int = 100) -> float:
     """Median distance to the nearest agent at the same time, or to the next one in its lane."""
     every, at = np.unique(rows.time, return_inverse=True)
     lanes = np.zeros(len(rows)) if rows.lane is None else pd.factorize(rows.lane)[0]
-    found = []
+    distances = []
     for k in np.unique(np.linspace(0, len(every) - 1, moments).astype(int)):
-        there = np.flatnonzero(at == k)
+        present = np.flatnonzero(at == k)
         if domain == "traffic":
-            lane = lanes[there]
-            order = np.lexsort((rows.x[there, 0], lane))
-            gaps = np.diff(rows.x[there, 0][order])[np.diff(lane[order]) == 0]
-            found.append(gaps[gaps > 0])
-        elif len(there) > 1:
-            found.append(cKDTree(rows.x[there]).query(rows.x[there], k=2)[0][:, 1])
-    each = np.concatenate(found) if found else np.empty(0)
+            lane = lanes[present]
+            order = np.lexsort((rows.x[present, 0], lane))
+            gaps = np.diff(rows.x[present, 0][order])[np.diff(lane[order]) == 0]
+            distances.append(gaps[gaps > 0])
+        elif len(present) > 1:
+            distances.append(cKDTree(rows.x[present]).query(rows.x[present], k=2)[0][:, 1])
+    each = np.concatenate(distances) if distances else np.empty(0)
     return float(np.median(each)) if each.size else float("nan")
 
 
 def scales(
-    known: Mapping[Domain, Medians],
-    told: Mapping[str, str],
+    measured: Mapping[Domain, Medians],
+    stated: Mapping[str, str],
     *,
     frames: bool,
     rate: float | None = None,
@@ -287,30 +287,32 @@ def scales(
     """All combinations of units, the most probable first.
 
     Args:
-        known: medians by the domains that come into question.
-        told: units by ``position``, ``time``, ``speed`` as the file tells them.
+        measured: medians by the domains that come into question.
+        stated: units by ``position``, ``time``, ``speed`` as the file tells them.
         frames: whether times may be frames; then they are where ``told`` says so.
         rate: frames per second as the file or the user tells.
         speeds: whether the file has speeds.
     """
-    found = []
-    for domain, values in known.items():
-        for position, (time, own), speed in product(
+    scored = []
+    for domain, values in measured.items():
+        for position, (time, frame_rate), speed in product(
             LENGTH_UNITS, _times(frames, rate), SPEED_UNITS if speeds else ("m/s",)
         ):
-            one = Scale(domain, position, time, speed, own)
-            score = _expected(position, told.get("position")) + _expected(time, told.get("time"))
-            score += _expected(speed, told.get("speed")) if speeds else 0.0
-            score += math.log(_UNNAMED) if len(known) > 1 and domain == "traffic" else 0.0
-            if own is not None and own != rate:
+            candidate = Scale(domain, position, time, speed, frame_rate)
+            score = _expected(position, stated.get("position")) + _expected(
+                time, stated.get("time")
+            )
+            score += _expected(speed, stated.get("speed")) if speeds else 0.0
+            score += math.log(_UNNAMED) if len(measured) > 1 and domain == "traffic" else 0.0
+            if frame_rate is not None and frame_rate != rate:
                 score += math.log((_OTHER if rate else 1.0) / len(RATES))
-            found.append((score + _likely(one, values), one))
-    top = max(score for score, _ in found)
-    weights = np.array([math.exp(score - top) for score, _ in found])
+            scored.append((score + _likely(candidate, values), candidate))
+    top = max(score for score, _ in scored)
+    weights = np.array([math.exp(score - top) for score, _ in scored])
     weights /= weights.sum()
     order = np.argsort(-weights, kind="stable")
     return [
-        Scale(**{**vars(found[i][1]), "probability": float(weights[i])}) for i in order.tolist()
+        Scale(**{**vars(scored[i][1]), "probability": float(weights[i])}) for i in order.tolist()
     ]
 
 
@@ -322,20 +324,20 @@ def _times(frames: bool, rate: float | None) -> Iterator[tuple[str, float | None
             yield "frame", each
 
 
-def _expected(unit: str, told: str | None) -> float:
-    if told is None:
+def _expected(unit: str, stated: str | None) -> float:
+    if stated is None:
         return math.log(_BEFORE[unit])
-    return 0.0 if unit == told else math.log(_AGAINST * _BEFORE[unit])
+    return 0.0 if unit == stated else math.log(_AGAINST * _BEFORE[unit])
 
 
-def _likely(scale: Scale, known: Medians) -> float:
+def _likely(scale: Scale, measured: Medians) -> float:
     usual = USUAL[scale.domain]
     metres, seconds = scale.metres, scale.seconds
-    score = usual["speed"].score(known.speed * metres / seconds)
-    score += usual["nearest"].score(known.nearest * metres)
-    score += INTERVAL.score(known.dt * seconds)
+    score = usual["speed"].score(measured.speed * metres / seconds)
+    score += usual["nearest"].score(measured.nearest * metres)
+    score += INTERVAL.score(measured.dt * seconds)
     if "length" in usual:
-        score += usual["length"].score(known.length * metres)
-    if "sway" in usual and known.dt * seconds <= SWAYS:
-        score += usual["sway"].score(known.sway / seconds)
-    return score + AGREE.score(known.ratio * metres / (scale.per_second * seconds))
+        score += usual["length"].score(measured.length * metres)
+    if "sway" in usual and measured.dt * seconds <= SWAYS:
+        score += usual["sway"].score(measured.sway / seconds)
+    return score + AGREE.score(measured.ratio * metres / (scale.per_second * seconds))

@@ -62,7 +62,7 @@ class Recognised:
     line: str = ""
 
 
-def native_source(raw: Raw, found: Mapping[str, Meaning]) -> str | None:
+def native_source(raw: Raw, meanings: Mapping[str, Meaning]) -> str | None:
     """The source with a reader for exactly these columns."""
     assert raw.table is not None
     names = {str(name) for name in raw.table.frame.columns}
@@ -70,7 +70,7 @@ def native_source(raw: Raw, found: Mapping[str, Meaning]) -> str | None:
         return "ngsim"
     if raw.path.name.endswith(TRACKS):
         return "highd"
-    if names >= _RUNS and "agent" not in found:
+    if names >= _RUNS and "agent" not in meanings:
         return "astazero"
     return None
 
@@ -97,25 +97,25 @@ def source_of_native(raw: Raw) -> Recognised:
     return Recognised(raw.native, natives[raw.native])
 
 
-def source_of(raw: Raw, seen: Scaled) -> Recognised:
+def source_of(raw: Raw, scaled_table: Scaled) -> Recognised:
     """What reads a table.
 
     Args:
-        seen: its columns and units.
+        scaled_table: its columns and units.
     """
-    found, scale, rows = seen.meanings, seen.scale, seen.rows
-    cut = "sequence" in found
-    if are_pairs(found):
-        return _of_table("pairs", raw, seen)
+    columns, scale, rows = scaled_table.meanings, scaled_table.scale, scaled_table.rows
+    cut = "sequence" in columns
+    if are_pairs(columns):
+        return _of_table("pairs", raw, scaled_table)
     if scale.domain == "crowd":
-        if cut and "frame" not in found:
-            return _of_table("table", raw, seen, domain=scale.domain)
-        return _people(raw, seen)
+        if cut and "frame" not in columns:
+            return _of_table("table", raw, scaled_table, domain=scale.domain)
+        return _people(raw, scaled_table)
     start, end = rows.ends()
     back = bool(np.median(rows.x[end, 0] - rows.x[start, 0]) < 0)
-    exact = all(name in found and found[name].column == name for name in table.REQUIRED)
-    if cut and "lane" not in found and not back and (exact or _together(rows)):
-        return _of_table("table", raw, seen, domain=scale.domain)
+    exact = all(name in columns and columns[name].column == name for name in table.REQUIRED)
+    if cut and "lane" not in columns and not back and (exact or _together(rows)):
+        return _of_table("table", raw, scaled_table, domain=scale.domain)
     options: dict[str, Any] = {}
     if rows.dt > VehicleTableOptions.dt:
         options["dt"] = float(f"{rows.dt:.6g}")
@@ -127,15 +127,15 @@ def source_of(raw: Raw, seen: Scaled) -> Recognised:
     most = int(pd.DataFrame(each).groupby(list(each)).size().max())
     if most < VehicleTableOptions.min_vehicles:
         options["min_vehicles"] = max(most, 1)
-    return _of_table("vehicles", raw, seen, **options)
+    return _of_table("vehicles", raw, scaled_table, **options)
 
 
-def _of_table(group: str, raw: Raw, seen: Scaled, **options: Any) -> Recognised:
+def _of_table(group: str, raw: Raw, scaled_table: Scaled, **options: Any) -> Recognised:
     """A table's reader, its columns where they have other names than it gives them, and units."""
     assert raw.table is not None
     kind, reader = _TABLES[group]
-    columns = {m: one.column for m, one in seen.meanings.items()}
-    if seen.scale.domain == "traffic":
+    columns = {m: recognised.column for m, recognised in scaled_table.meanings.items()}
+    if scaled_table.scale.domain == "traffic":
         columns.pop("y", None)
     held = set(map(str, raw.table.frame.columns))
     named: dict[str, str | None] = {}
@@ -145,16 +145,16 @@ def _of_table(group: str, raw: Raw, seen: Scaled, **options: Any) -> Recognised:
         other = name in held and meaning in NAMES
         if columns.get(meaning) != name and (meaning in columns or other):
             named[name] = columns.get(meaning)
-    options |= {"columns": named, "position_unit": seen.scale.position}
-    options |= {"time_unit": seen.scale.time, "frame_rate": seen.scale.rate}
+    options |= {"columns": named, "position_unit": scaled_table.scale.position}
+    options |= {"time_unit": scaled_table.scale.time, "frame_rate": scaled_table.scale.rate}
     if {"speed", "v_follower"} & set(columns) and hasattr(kind, "speed_unit"):
-        options["speed_unit"] = seen.scale.speed
+        options["speed_unit"] = scaled_table.scale.speed
     return Recognised(group, kind(path=str(raw.path.absolute()), **options))  # type: ignore[call-arg]
 
 
-def _people(raw: Raw, seen: Scaled) -> Recognised:
-    scale, rows = seen.scale, seen.rows
-    columns = {meaning: one.column for meaning, one in seen.meanings.items()}
+def _people(raw: Raw, scaled_table: Scaled) -> Recognised:
+    scale, rows = scaled_table.scale, scaled_table.rows
+    columns = {meaning: recognised.column for meaning, recognised in scaled_table.meanings.items()}
     dt = rows.dt
     if scale.rate is not None and raw.rate is not None:  # what the file tells is taken
         dt *= scale.rate / raw.rate
@@ -175,7 +175,7 @@ def _people(raw: Raw, seen: Scaled) -> Recognised:
         if raw.unit is None:
             options["unit"] = scale.position
         return Recognised("pedpy", WalkwayOptions(path=str(raw.path.absolute()), **options))
-    return _of_table("pedpy", raw, replace(seen, scales=[scale]), **options)
+    return _of_table("pedpy", raw, replace(scaled_table, scales=[scale]), **options)
 
 
 def _together(rows: Trajectories) -> bool:

@@ -26,17 +26,17 @@ def check_laps(run: Trajectories) -> None:
     Args:
         run: rows with coordinates (east and north, m) as positions.
     """
-    known = np.flatnonzero(np.isfinite(run.x).all(axis=1))
-    if not len(known) or run.v is None:
+    located = np.flatnonzero(np.isfinite(run.x).all(axis=1))
+    if not len(located) or run.v is None:
         return
-    rows = np.flatnonzero(run.agent == run.agent[known[0]])
+    rows = np.flatnonzero(run.agent == run.agent[located[0]])
     rows = rows[np.argsort(run.time[rows], kind="stable")]
     with np.errstate(over="ignore", invalid="ignore"):  # of coordinates that are none
         laps = find_laps(driven(run.time[rows], run.v[rows, 0]), run.x[rows])
     if not len(laps.driven):
         return
     text = (
-        f"{run.name}: complete laps of {run.agent[known[0]]}: {len(laps.driven)}, "
+        f"{run.name}: complete laps of {run.agent[located[0]]}: {len(laps.driven)}, "
         f"{laps.driven.min():.1f} to {laps.driven.max():.1f} m by its speed, "
         f"{laps.path.min():.1f} to {laps.path.max():.1f} m by its coordinates"
     )
@@ -77,10 +77,10 @@ def find_laps(driven: np.ndarray, place: np.ndarray) -> Laps:
         driven: ``(K,)`` m, integrated speed.
         place: ``(K, 2)`` m, coordinates; NaN where they are unknown.
     """
-    known = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(driven))
-    if not len(known):
+    located = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(driven))
+    if not len(located):
         return Laps(np.empty(0), np.empty(0))
-    driven, place = driven[known], place[known]
+    driven, place = driven[located], place[located]
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     start = int(np.argmax(driven - driven[0] > BACK))  # not while it stands before it starts
     apart = np.linalg.norm(place - place[start], axis=1)

@@ -81,18 +81,18 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Seq
     if asked is not None and options.path is not None:
         check_known(asked, [run.name for run in runs])
         runs = [run for run in runs if run.name in asked]
-    found: list[Sequence] = []
+    sequences: list[Sequence] = []
     for run in runs:
         check_laps(run)
-        found += by_spacing(run, options)
-    if not found:
+        sequences += by_spacing(run, options)
+    if not sequences:
         raise DataError(
             f"{next(iter(files.values()))}: no sequence; in {len(runs)} runs there are nowhere "
             f"{options.min_vehicles} vehicles behind each other for "
             f"{options.window or options.min_duration:g} s; lower data.min_vehicles and "
             f"data.{'window' if options.window else 'min_duration'}"
         )
-    return found
+    return sequences
 
 
 def _check(options: OpenAccOptions) -> None:
@@ -218,8 +218,8 @@ def _run(
     words |= {"make": make, "order": [str(i + 1) for i in range(len(make))]}
 
     def column(what: str | None) -> np.ndarray | None:
-        known = words[what] if what is not None else []
-        return np.array(known, dtype=object)[place] if any(known) else None
+        values = words[what] if what is not None else []
+        return np.array(values, dtype=object)[place] if any(values) else None
 
     return Trajectories(
         path=path,
@@ -234,12 +234,12 @@ def _run(
 
 def _positions(table: Table) -> np.ndarray:
     """Places in the platoon, counted from 1."""
-    found = table.numbers("position")
-    odd = np.flatnonzero(~((found >= 1) & (found <= MOST_VEHICLES) & (found % 1 == 0)))
+    positions = table.numbers("position")
+    odd = np.flatnonzero(~((positions >= 1) & (positions <= MOST_VEHICLES) & (positions % 1 == 0)))
     if odd.size:
         i = int(odd[0])
         raise DataError(
-            f"{table.path}, {table.row(i)}: position is {found[i]:g}; expected the place in the "
-            f"platoon, a whole number from 1 to {MOST_VEHICLES}"
+            f"{table.path}, {table.row(i)}: position is {positions[i]:g}; expected the place in "
+            f"the platoon, a whole number from 1 to {MOST_VEHICLES}"
         )
-    return found.astype(int)
+    return positions.astype(int)

@@ -120,7 +120,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
     lanes = chosen_lanes(options.lane, {lane for _, _, lane, _ in pairs}, "the pairs have")
     steps = [rows.dt for *_, rows in pairs if np.isfinite(rows.dt)]
     dt = options.dt or (float(np.median(steps)) if steps else 1.0)
-    found = Reading()
+    reading = Reading()
     taken: dict[str, Path] = {}
     every: list[Record] = []
     for run, number, lane, rows in sorted(pairs, key=lambda p: (natural(p[0]), natural(p[1]))):
@@ -135,8 +135,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         taken[name] = rows.path
         made, records = by_pair(rows, dt, options)
         every += records
-        found.add(made)
-    if not found:
+        reading.add(made)
+    if not reading:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
             f"{options.min_samples} equally spaced times"
@@ -153,8 +153,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             anonymous,
             len(pairs),
         )
-    found.notes = told_uneven(every, dt)
-    return found
+    reading.notes = told_uneven(every, dt)
+    return reading
 
 
 def _check(options: PairOptions) -> None:
@@ -163,10 +163,10 @@ def _check(options: PairOptions) -> None:
             positive(name, getattr(options, name))
     if options.min_samples < 2:
         raise ConfigError(f"data.min_samples={options.min_samples}: expected at least 2")
-    for option, known in (("constant", _WORDS), ("columns", (*REQUIRED, *OPTIONAL))):
+    for option, valid in (("constant", _WORDS), ("columns", (*REQUIRED, *OPTIONAL))):
         for key in getattr(options, option):
-            if key not in known:
-                raise ConfigError(f"data.{option}.{key} is unknown; expected {', '.join(known)}")
+            if key not in valid:
+                raise ConfigError(f"data.{option}.{key} is unknown; expected {', '.join(valid)}")
     try:
         groups = re.compile(options.pattern or "").groupindex
     except re.error as error:
@@ -198,7 +198,7 @@ def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
     cells = {name: table.names(column, empty=True) for name, column in names.items()}
     files = cells.pop("path")
     return {
-        str(file): {name: str(own[i]) for name, own in cells.items() if own[i]}
+        str(file): {name: str(values[i]) for name, values in cells.items() if values[i]}
         for i, file in enumerate(files)
     }
 
@@ -268,8 +268,8 @@ def _both(
     agents = []
     for who in _WHO:
         # one without an identifier is in no other pair
-        own = words.get(who, none)
-        agents.append(np.where(own == "", words["pair"] + f" {who}", own))
+        identifiers = words.get(who, none)
+        agents.append(np.where(identifiers == "", words["pair"] + f" {who}", identifiers))
     names = {"recording": "run", "sequence": "pair", "lane": "lane", "split": "split"}
     columns |= {field: np.tile(words[n], 2) for field, n in names.items() if n in words}
     return Trajectories(
