@@ -13,8 +13,7 @@ import pytest
 from nnode.data import download
 from nnode.data.options import Agents, OpenAccOptions
 from nnode.data.prepare import prepare
-from nnode.data.readers.laps import find_laps
-from nnode.data.readers.openacc import openacc_files, read_openacc
+from nnode.data.readers.openacc import find_laps, openacc_files, read_openacc
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 
