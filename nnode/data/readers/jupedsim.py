@@ -18,13 +18,12 @@ import shapely
 from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
-from nnode.data.options import WalkwayOptions, one_of
+from nnode.data.options import WalkwayOptions
 from nnode.data.readers.columns import EXACT, Table, opened
 from nnode.data.readers.juelich import People, cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
-from nnode.data.readers.vehicles import LENGTH_UNITS, recordings, seconds_per_unit
+from nnode.data.readers.vehicles import table_rows
 from nnode.data.sequence import check_interval
-from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: First bytes of every SQLite database.
@@ -99,16 +98,7 @@ def read_walkway(
 def _of_table(table: Table, options: WalkwayOptions) -> People:
     """Rows agent, time, x, y of any table, and their sampling interval."""
     names = table.choose(REQUIRED, OPTIONAL, options.columns)
-    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
-    rows = Trajectories(
-        path=table.path,
-        name=table.path.stem,
-        where=table.row,
-        recording=recordings(table, names),
-        agent=table.names(names["agent"]),
-        time=table.times(names["time"], seconds_per_unit(options))[1],
-        x=np.stack([table.measured(names[axis]) for axis in ("x", "y")], -1) * metres,
-    )
+    rows = table_rows(table, names, options, ("x", "y"))
     dt = rows.dt
     if not np.isfinite(dt):
         raise DataError(f"{table.path}: nobody has rows at two times; nothing moves here")

@@ -10,10 +10,10 @@ import pandas as pd
 
 from nnode.data.cut import Reading, by_sequence
 from nnode.data.exits import destinations, exits_of, read_exits
-from nnode.data.options import TableOptions, check_known, one_of, wanted
+from nnode.data.options import TableOptions, check_known, wanted
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, table_path
-from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
+from nnode.data.readers.vehicles import LENGTH_UNITS, table_rows
 from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
@@ -75,33 +75,25 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
     crowd, path = _is_crowd(options), table.path
     axes = ("x", "y") if crowd else ("x",)
     names = table.choose(REQUIRED, OPTIONAL, options.columns)
-    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
         raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
     goals = tuple(f"dest_{axis}" for axis in axes)
     if any(goal in names for goal in goals) and not all(goal in names for goal in goals):
         raise DataError(f"{path}: a destination needs the columns {' and '.join(goals)}")
-    sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
-    time = table.times(names["time"], seconds_per_unit(options))[1]
-    x = np.stack([table.measured(names[axis]) for axis in axes], -1) * metres
+    sequence = table.names(names.pop("sequence"))
+    recording = names.pop("recording", "")
+    rows = table_rows(table, names, options, axes)
     destination = None
     if goals[0] in names:
+        metres = LENGTH_UNITS[options.position_unit]
         destination = np.stack([table.numbers(names[goal]) for goal in goals], -1) * metres
-    rows = Trajectories(
-        path=path,
-        name=path.stem,
-        where=table.row,
-        recording=table.names(names["recording"])
-        if "recording" in names
+    rows = replace(
+        rows,
+        recording=table.names(recording)
+        if recording
         else np.full(len(table), path.stem, dtype=object),
         sequence=sequence,
-        agent=agent,
-        time=time,
-        x=x,
-        length=table.positive(names["length"]) * metres if "length" in names else None,
-        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
-        group=table.names(names["group"], empty=True) if "group" in names else None,
         destination=destination,
     )
     for key in ("length", "kind", "group", *goals):

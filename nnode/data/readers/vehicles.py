@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,17 +57,10 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> Reading
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     check_cutting(options)
     table = opened(source)
-    rows = _rows(table, options)
+    rows = table_rows(table, table.choose(REQUIRED, OPTIONAL, options.columns), options)
+    rows = replace(rows, x=options.direction * rows.x)
     check_interval(rows.dt, f"{table.path}: rows of a vehicle")
     return by_lane(rows, options)
-
-
-def recordings(table: Table, names: Mapping[str, str]) -> np.ndarray | None:
-    """``(rows,)`` names of what never meets: recordings, sequences, or both; None: all is one."""
-    known = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
-    if len(known) < 2:
-        return known[0] if known else None
-    return np.array([" ".join(cells) for cells in zip(*known, strict=True)], dtype=object)
 
 
 def seconds_per_unit(
@@ -83,27 +77,51 @@ def seconds_per_unit(
     return scale
 
 
-def _rows(table: Table, options: VehicleTableOptions) -> Trajectories:
-    """The table's columns, by what they mean."""
-    names = table.choose(REQUIRED, OPTIONAL, options.columns)
+def table_rows(
+    table: Table,
+    names: Mapping[str, str],
+    options: VehicleTableOptions | TableOptions | WalkwayOptions,
+    axes: tuple[str, ...] = ("x",),
+) -> Trajectories:
+    """The columns of any table, by what they mean.
+
+    Rows of different recordings, or of different sequences, never meet: both are the name of the
+    recording.
+
+    Args:
+        names: of the columns by their meaning.
+        axes: meanings of the positions' columns.
+
+    Raises:
+        ConfigError: an unknown unit.
+        DataError: cells that are missing or hold no number; names the row.
+    """
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
-    v = length = None
-    if "speed" in names:
-        scale = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
-        v = np.abs(table.numbers(names["speed"]))[:, None] * scale
+
+    def words(key: str) -> np.ndarray | None:
+        return table.names(names[key], empty=True) if key in names else None
+
+    v = length = recording = None
+    if "speed" in names and isinstance(options, VehicleTableOptions):
+        unit = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
+        v = np.abs(table.numbers(names["speed"]))[:, None] * unit
     if "length" in names:
-        unit = options.length_unit or options.position_unit
-        length = table.positive(names["length"]) * one_of("length_unit", unit, LENGTH_UNITS)
+        own_unit = getattr(options, "length_unit", None) or options.position_unit
+        length = table.positive(names["length"]) * one_of("length_unit", own_unit, LENGTH_UNITS)
+    parts = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
+    if parts:
+        recording = np.array([" ".join(cells) for cells in zip(*parts, strict=True)], dtype=object)
     return Trajectories(
         path=table.path,
         name=table.path.stem,
         where=table.row,
-        agent=table.names(names["vehicle"]),
+        agent=table.names(names["vehicle" if "vehicle" in names else "agent"]),
         time=table.times(names["time"], seconds_per_unit(options))[1],
-        x=table.numbers(names["x"])[:, None] * metres * options.direction,
+        x=np.stack([table.measured(names[axis]) for axis in axes], -1) * metres,
         v=v,
-        recording=recordings(table, names),
+        recording=recording,
         lane=table.names(names["lane"]) if "lane" in names else None,
         length=length,
-        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
+        kind=words("kind"),
+        group=words("group"),
     )
