@@ -26,6 +26,10 @@ EDGE = 0.1
 FEW = 0.02
 
 
+#: Meanings of columns with a value for every sample.
+_SAMPLED = ("x", "y", "x_follower", "x_leader")
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing that was found.
@@ -49,6 +53,8 @@ def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
         bad = empty
         if meaning != "agent":
             bad = ~np.isfinite(floats(own))
+        if meaning in _SAMPLED and not bad.all():  # empty ones are missing samples
+            bad &= ~empty
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             shown = "nothing" if empty[i] else quoted(own.iloc[i])[:42]

@@ -404,6 +404,26 @@ class Table:
         text = text.str.rstrip("\0").str.strip()
         return np.asarray(text, dtype=object)
 
+    def check_constant(self, column: str, values: np.ndarray, owner: np.ndarray, rule: str) -> None:
+        """Refuse a value that changes within what it belongs to.
+
+        Args:
+            values: ``(rows,)`` of the column.
+            owner: ``(rows,)`` numbers from 0 of what they belong to.
+            rule: what is expected, in words.
+
+        Raises:
+            DataError: names the row.
+        """
+        first = np.unique(owner, return_index=True)[1][owner]
+        differs = (values != values[first]) & ~(pd.isna(values) & pd.isna(values[first]))
+        if differs.any():
+            i = int(np.flatnonzero(differs)[0])
+            raise DataError(
+                f"{self.path}, {self.row(i)}: column {column!r} holds {values[i]!s}, before it "
+                f"{values[first[i]]!s}; {rule}"
+            )
+
     def row(self, i: int) -> str:
         """Where the i-th row stands in the file, in words."""
         index = int(self.frame.index[i])

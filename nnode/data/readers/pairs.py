@@ -230,10 +230,14 @@ def _rows(
     if "spacing" in names:
         spacing = table.numbers(names["spacing"], empty=not integrated) * metres
     pair = pd.DataFrame({n: words[n] for n in ("run", "pair")}).groupby(["run", "pair"], sort=False)
+    rule = (
+        "it belongs to the pair and must be the same in all its rows: name pairs that are to be "
+        "told apart (data.columns.pair)"
+    )
+    for name in words.keys() & names.keys():
+        table.check_constant(names[name], words[name], pair.ngroup().to_numpy(), rule)
     for place in pair.indices.values():
         rows = np.asarray(place)[np.argsort(time[place], kind="stable")]
-        for name in words.keys() & names.keys():
-            _steady(table, names[name], words[name], rows)
         length = float(leader[rows[0]])
         if integrated:
             assert v is not None
@@ -323,16 +327,6 @@ def _everywhere(
         if match is not None:
             said |= {name: value for name, value in match.groupdict().items() if value}
     return said
-
-
-def _steady(table: Table, column: str, cells: np.ndarray, rows: np.ndarray) -> None:
-    other = rows[cells[rows] != cells[rows[0]]]
-    if other.size:
-        raise DataError(
-            f"{table.path}, {table.row(int(other[0]))}: column {column!r} holds "
-            f"{cells[other[0]]!s}, before it {cells[rows[0]]!s}; it belongs to the pair and must "
-            "be the same in all its rows: name pairs that are to be told apart (data.columns.pair)"
-        )
 
 
 def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:

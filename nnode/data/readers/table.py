@@ -96,9 +96,15 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
         sequence=sequence,
         destination=destination,
     )
-    for key in ("length", "kind", "group", *goals):
-        if key in names:
-            _constant(rows, key, names[key])
+    belongings = {key: getattr(rows, key) for key in ("length", "kind", "group")}
+    if destination is not None:
+        belongings |= dict(zip(goals, destination.T, strict=True))
+    whose = pd.DataFrame({"r": rows.recording, "s": sequence, "a": rows.agent})
+    owner = whose.groupby(["r", "s", "a"], sort=False).ngroup().to_numpy()
+    rule = "it belongs to the agent and must be the same in all its rows of a sequence"
+    for key, values in belongings.items():
+        if values is not None:
+            table.check_constant(names[key], values, owner, rule)
     if options.exits:
         if not crowd or destination is not None:
             raise ConfigError(
@@ -129,28 +135,6 @@ def _is_crowd(options: TableOptions) -> bool:
             f"data.domain={options.domain}: expected traffic (positions x) or crowd (x and y)"
         )
     return options.domain == "crowd"
-
-
-def _constant(rows: Trajectories, key: str, column: str) -> None:
-    """Refuse a property of an agent that changes within a sequence."""
-    values: np.ndarray
-    if key.startswith("dest_"):
-        assert rows.destination is not None
-        values = rows.destination[:, "xy".index(key[-1])]
-    else:
-        values = getattr(rows, key)
-    names = {"r": rows.recording, "s": rows.sequence, "a": rows.agent}
-    owner = pd.DataFrame(names).groupby(["r", "s", "a"], sort=False).ngroup().to_numpy()
-    first = np.unique(owner, return_index=True)[1][owner]
-    differs = values != values[first]
-    if values.dtype.kind == "f":
-        differs &= ~(np.isnan(values) & np.isnan(values[first]))
-    if differs.any():
-        row = int(np.flatnonzero(differs)[0])
-        raise DataError(
-            f"{rows.path}, {rows.where(row)}: column {column!r} holds {values[row]!s}; it belongs "
-            "to the agent and must be the same in all its rows of a sequence"
-        )
 
 
 def _segments(path: Path) -> np.ndarray:

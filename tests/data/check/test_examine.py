@@ -153,7 +153,8 @@ def test_cells_rows_and_holes(tmp_path: Path) -> None:
     table = table.drop(index=range(600, 640))
     found = examine(saved(table, tmp_path))
     wrong = said(found)
-    assert "column 'x' (x) holds no number in 2 of" in wrong["cells"]
+    # the empty one is a missing sample
+    assert "column 'x' (x) holds no number in 1 of" in wrong["cells"]
     assert "first 'oops' in line 102" in wrong["cells"]
     assert (
         "2 rows have an agent and a time that stood there before (2 of them" in wrong["duplicates"]
