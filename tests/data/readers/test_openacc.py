@@ -163,7 +163,7 @@ def test_a_table_of_rows(tmp_path: Path) -> None:
         for p, m in ((3, "C"), (1, "A"), (2, "B"))
     ]
     path = tmp_path / "runs.parquet"
-    pd.concat(rows).to_parquet(path)
+    pd.concat(rows).sample(frac=1.0, random_state=1).to_parquet(path)  # in any order
     (s,) = read(path)
     assert (s.name, s.agents, s.group) == ("p7/000", ("C", "B", "A"), ("min", "min", ""))
     np.testing.assert_allclose(np.diff(s.x[0, :, 0]) - 5, GAP[:2][::-1])
