@@ -234,7 +234,7 @@ def _rows(
         "it belongs to the pair and must be the same in all its rows: name pairs that are to be "
         "told apart (data.columns.pair)"
     )
-    for name in words.keys() & names.keys():
+    for name in (word for word in _WORDS if word in names):
         table.check_constant(names[name], words[name], pair.ngroup().to_numpy(), rule)
     for place in pair.indices.values():
         rows = np.asarray(place)[np.argsort(time[place], kind="stable")]
