@@ -391,17 +391,18 @@ class Table:
             cells = cells.astype("Int64")
         try:
             text = cells.astype("string").fillna("")
+            marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
+            if marked.any():
+                text = text.where(~marked, text[marked].map(csv_cell))
+            # NumPy takes text with zero characters behind it for the same text without them
+            text = text.str.rstrip("\0").str.strip()
         except (TypeError, ValueError):  # bytes that are no text, or lists in cells
-            i = next(i for i, cell in enumerate(cells) if not absent[i] and _no_text(cell))
+            known = map(int, np.flatnonzero(~absent))
+            i = next((i for i in known if not _is_text(cells, i)), 0)
             raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {quoted(cells.iloc[i])}; "
+                f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells, i)}; "
                 "expected a name or number"
             ) from None
-        marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
-        if marked.any():
-            text = text.where(~marked, text[marked].map(csv_cell))
-        # NumPy takes text with zero characters behind it for the same text without them
-        text = text.str.rstrip("\0").str.strip()
         return np.asarray(text, dtype=object)
 
     def check_constant(self, column: str, values: np.ndarray, owner: np.ndarray, rule: str) -> None:
@@ -461,12 +462,19 @@ def _float(cell: Any) -> float:
         return np.nan
 
 
-def _no_text(cell: Any) -> bool:
+def _is_text(cells: pd.Series, i: int) -> bool:
     try:
-        pd.Series([cell], dtype=object).astype("string")
+        pd.Series([cells.iloc[i]], dtype=object).astype("string")
     except (TypeError, ValueError):
-        return True
-    return False
+        return False
+    return True
+
+
+def _quoted(cells: pd.Series, i: int) -> str:
+    try:
+        return quoted(cells.iloc[i])
+    except ValueError:
+        return "bytes that are no text"
 
 
 def quoted(cell: Any) -> str:

@@ -70,6 +70,14 @@ def test_zero_characters_do_not_make_two_names_of_one(tmp_path: Path) -> None:
     assert not any("\0" in name for name in Table(path).names("agent"))
 
 
+def test_names_of_bytes_that_are_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    lane().replace({"agent": {"c1": "zzqq"}}).to_parquet(path, compression=None)
+    path.write_bytes(path.read_bytes().replace(b"zzqq", b"\xffzqq"))
+    with pytest.raises(DataError, match=r"column 'agent' holds .*; expected a name or number"):
+        Table(path).names("agent")
+
+
 def test_what_nobody_thought_of_names_the_file() -> None:
     with (
         pytest.raises(DataError, match=r"a\.csv cannot be read \(KeyError: 'q'\)"),
