@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.model.system import System
 from nnode.population.estimate import (
     STEPS,
@@ -202,7 +202,7 @@ def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Popul
     model, noise, before = found.model, found.noise, found.estimate
     try:
         bias = score_bias(model, noise, before, rng, pairs)
-    except (ValueError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
+    except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return found
     bias = np.clip(bias, -LONGEST, LONGEST)
