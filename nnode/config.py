@@ -47,7 +47,7 @@ from nnode.model.options import (
     SocialForceOptions,
 )
 from nnode.program import configuration
-from nnode.study.options import (
+from studies.options import (
     CrowdStudyOptions,
     FollowingStudyOptions,
     PredictionStudyOptions,

@@ -18,12 +18,12 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from nnode.calibrate.resampling import group_weights
 from nnode.data.paths import noise_variance
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.generate.noise import Noise, sample, takes_drivers
 from nnode.model import System
-from nnode.study.statistics import group_weights
 
 #: s; times of the noise at which motion is sampled, between which moments are interpolated.
 TIMES = np.geomspace(0.25, 128.0, 8)

@@ -30,7 +30,8 @@ LOADED = (
     "scipy.optimize",
     "torch.utils.tensorboard",
     *(f"nnode.app.{name}" for name in ("discover", "drive", "evaluate", "export")),
-    *(f"nnode.app.{name}" for name in ("forces", "prepare", "study", "train")),
+    *(f"nnode.app.{name}" for name in ("forces", "prepare", "train")),
+    "studies.command",
 )
 
 
