@@ -16,7 +16,7 @@ from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Provenance, write_page
 from studies.cluster import on_cluster
-from studies.options import StudyOptions
+from studies.options import StudyOptions, checked
 from studies.runner import KEPT
 
 log = logging.getLogger(__name__)
@@ -67,9 +67,8 @@ def study(config: DictConfig, folder: Path) -> None:
         raise ConfigError(
             f"study.name={options.name} is unknown, expected one of {', '.join(STUDIES)}"
         )
-    options.workers = cores() if options.workers is None else options.workers
-    if options.workers < 1:
-        raise ConfigError(f"study.workers={options.workers} must be at least 1")
+    options = checked(options)
+    options.workers = options.workers or cores()
     folder = folder / QUICK if options.quick else folder
     start, before = time.monotonic(), len(list((folder / KEPT).glob("*.json")))
     with BreakingGuard() as guard:

@@ -111,31 +111,20 @@ def law_panels(
     return figure
 
 
-def descents(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Average cost against simulations, by model and optimiser, above the least one known.
+def descents(curves: Mapping[str, np.ndarray]) -> Figure:
+    """Average cost above the least one known, against simulations, one curve per model.
 
     Args:
-        curves: model to optimiser to ``(P, 2)`` simulations and excess of the average cost over
-            the least one known, m² s.
+        curves: model to ``(P, 2)`` simulations and excess of the average cost, m² s.
     """
-    figure = new_figure(9.6, 2.7)
-    axes = figure.subplots(1, len(curves), sharey=True, squeeze=False)
-    names: list[str] = []
-    for ax, (model, found) in zip(axes.flat, curves.items(), strict=True):
-        names = list(found)
-        for i, values in enumerate(found.values()):
-            style = {**curve_style(i), "marker": ""}
-            ax.plot(values[:, 0], values[:, 1], **style, linewidth=1.3)
-        ax.set(xscale="log", yscale="log")
-        first = ax is axes.flat[0]
-        y = "average J above the least (m² s)" if first else ""
-        dress(ax, x="simulations", y=y, title=model)
-    # what lies lower is rounding
-    axes[0, 0].set_ylim(bottom=1e-3)
-    handles = [
-        Line2D([], [], **{**curve_style(i), "marker": ""}, label=n) for i, n in enumerate(names)
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    figure = new_figure(5.6, 3.2)
+    ax = figure.subplots()
+    for i, (model, values) in enumerate(curves.items()):
+        ax.plot(*values.T, **{**curve_style(i), "marker": ""}, linewidth=1.3, label=model)
+    ax.set(xscale="log", yscale="log")
+    ax.set_ylim(bottom=1e-3)  # what lies lower is rounding
+    dress(ax, x="simulations", y="average J above the least (m² s)")
+    ax.legend(fontsize=SMALL_FONT, frameon=False)
     return figure
 
 

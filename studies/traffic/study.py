@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,12 @@ from nnode.data.prepare import prepare
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.pages.page import Block
+from studies.frame import tidy
 from studies.options import TrafficStudyOptions
+from studies.page import page
 from studies.runner import Task, hash_of, run_tasks
 from studies.traffic import printed, tasks
-from studies.traffic.page import blocks
-from studies.traffic.results import LAWS, NETWORKS, Study
+from studies.traffic.results import LAWS, MODELS, NETWORKS, Study
 
 TITLE = "Traffic: five models on ten recordings"
 SUBTITLE = (
@@ -24,13 +24,10 @@ SUBTITLE = (
     "by neural networks*, on the same recordings, printed numbers beside ours."
 )
 
-MODELS = (*LAWS, *NETWORKS)
 #: Relative time of a gradient.
 _TIMES = {"lin": 1.0, "log": 1.2, "n2": 1.5, "n4": 2.0, "n10": 3.5}
 #: A recording is searched with up to so many times the starts of the largest one.
 _MOST = 12
-#: Keys of searches that were made again, wider, begin so in place of ``fit-``.
-WIDER = "wider-"
 #: Sampling interval of the recordings, s.
 SAMPLING = 0.2
 #: Other steps at which solutions are evaluated, s.
@@ -45,77 +42,41 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
         DataError: recordings that cannot be read.
         StudyError: tasks failed.
     """
-    _check(options)
-    if options.quick:
-        options = replace(
-            options,
-            restarts=4,
-            iterations=30,
-            folds=2,
-            bootstrap=10,
-            descent_steps=30,
-            particles=10,
-            consensus_steps=10,
-        )
-    stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
-    assert options.workers is not None
-    how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(stores)}
-    first = list(_tasks(options, stores))
-    found = run_tasks(first, folder, title="traffic study", **how)
-    again = [] if options.quick else _wider(first, found)
-    if again:
-        wider = run_tasks(again, folder, title="wider search", **how)
-        found |= {_replaces(key, found, one): one for key, one in wider.items()}
-    return blocks(Study(options, stores, found))
-
-
-def _check(options: TrafficStudyOptions) -> None:
-    least = {
-        "restarts": 1,
-        "iterations": 3,
-        "bootstrap": 2,
-        "folds": 2,
-        "descent_steps": 1,
-        "batch_size": 0,
-        "particles": 2,
-        "consensus_steps": 1,
-    }
-    for name, low in least.items():
-        if getattr(options, name) < low:
-            raise ConfigError(f"study.{name}={getattr(options, name)} must be at least {low}")
-    for name in ("box", "descent_lr"):
-        if not getattr(options, name) > 0:
-            raise ConfigError(f"study.{name}={getattr(options, name)} must be positive")
     for name in ("dt", "descent_dt"):
         step = getattr(options, name)
-        if not (0 < step <= SAMPLING and abs(SAMPLING / step - round(SAMPLING / step)) < 1e-6):
+        if step > SAMPLING or abs(SAMPLING / step - round(SAMPLING / step)) > 1e-6:
             raise ConfigError(
                 f"study.{name}={step} s must divide the sampling interval of {SAMPLING} s"
             )
+    stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
+    assert options.workers is not None
+    how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(stores)}
+    every = list(_tasks(options, stores))
+    found = run_tasks(every, folder, title="traffic study", **how)
+    again = {} if options.quick else wider(every, found)
+    if again:
+        more = run_tasks(list(again.values()), folder, title="wider search", **how)
+        for key, task in again.items():
+            if more[task.key]["cost"] < found[key]["cost"]:
+                found[key] = {**more[task.key], "before": found[key]["cost"]}
+    study = Study(options, stores, tidy(every, found))
+    return page("traffic", study.tables(), study.figures(), [stores["keep"]], **study.values())
 
 
-def _wider(tasks_: list[Task], found: dict[str, dict[str, Any]]) -> list[Task]:
-    """Twice the search, from other starts, where the printed cost of a network is lower."""
-    again = []
-    for task in tasks_:
-        one = found[task.key]
-        if not task.key.startswith("fit-keep-") or one["model"] in LAWS or one["box"] is not None:
+def wider(every: list[Task], found: dict[str, dict[str, Any]]) -> dict[str, Task]:
+    """Twice the search, from other starts, by the task whose printed cost of a network is lower."""
+    again = {}
+    for task in every:
+        how, result = task.arguments, found[task.key]
+        if not task.key.startswith("fit-keep-") or how["box"] or how["model"] in LAWS:
             continue
-        theirs = printed.COSTS[one["model"]][printed.RECORDINGS.index(one["recording"])]
-        if theirs < one["cost"]:
-            wide = {key: 2 * task.arguments[key] for key in ("restarts", "iterations")}
-            other = {**task.arguments, **wide, "seed": task.arguments["seed"] + 1}
-            again.append(Task(task.key.replace("fit-", WIDER, 1), tasks.fit, other, 4 * task.cost))
+        theirs = printed.COSTS[how["model"]][printed.RECORDINGS.index(how["recording_name"])]
+        if theirs < result["cost"]:
+            more = {key: 2 * how[key] for key in ("restarts", "iterations")}
+            more = {**how, **more, "seed": how["seed"] + 1}
+            key = task.key.replace("fit-", "wider-", 1)
+            again[task.key] = Task(key, tasks.fit, more, 4 * task.cost)
     return again
-
-
-def _replaces(key: str, found: dict[str, dict[str, Any]], one: dict[str, Any]) -> str:
-    """The key under which a wider search counts: that of the first one where it is better."""
-    first = key.replace(WIDER, "fit-", 1)
-    if one["cost"] < found[first]["cost"]:
-        one["before"] = found[first]["cost"]
-        return first
-    return key
 
 
 def _prepared(options: TrafficStudyOptions, policy: str, folder: Path) -> Store:
@@ -127,96 +88,60 @@ def _prepared(options: TrafficStudyOptions, policy: str, folder: Path) -> Store:
     return prepare(chosen, folder / "data" / policy)
 
 
-def _sizes(store: Store) -> dict[str, int]:
-    """Measured positions of followers by recording: what a gradient's time goes with."""
-    sizes: dict[str, int] = {}
-    for entry in store.index:
-        size = (entry["n_agents"] - 1) * entry["n_samples"]
-        sizes[entry["recording"]] = sizes.get(entry["recording"], 0) + size
-    return sizes
-
-
 def _tasks(options: TrafficStudyOptions, stores: dict[str, Store]) -> Iterator[Task]:
+    """Model × recording × treatment of faults: fits, held-out costs, the paper's optimiser."""
     for policy, store in stores.items():
-        sizes = _sizes(store)
-        largest = max(sizes.values())
+        # the time of a gradient goes with the measured positions of followers
+        sizes: dict[str, int] = {}
+        for entry in store.index:
+            size = (entry["n_agents"] - 1) * entry["n_samples"]
+            sizes[entry["recording"]] = sizes.get(entry["recording"], 0) + size
         for name, size in sizes.items():
             # as much time for a small recording as for the largest: it has as many minima
-            share = min(_MOST, largest / size)
+            share = min(_MOST, max(sizes.values()) / size)
             for model in MODELS:
-                yield from _of_model(options, policy, str(store.folder), name, model, size, share)
+                where: dict[str, Any] = {"folder": str(store.folder), "recording_name": name}
+                where |= {"model": model, "dt": options.dt, "seed": options.seed}
+                yield from _of_model(options, policy, where, _TIMES[model] * size, share)
 
 
 def _of_model(
-    options: TrafficStudyOptions,
-    policy: str,
-    folder: str,
-    name: str,
-    model: str,
-    size: int,
-    share: float,
+    options: TrafficStudyOptions, policy: str, where: dict[str, Any], time: float, share: float
 ) -> Iterator[Task]:
-    where = {"folder": folder, "recording_name": name, "model": model, "dt": options.dt}
-    where["seed"] = options.seed
-    time = _TIMES[model] * size
-    boxes = (None, options.box) if model in NETWORKS else (None,)
-    for box in boxes:
+    model, place = where["model"], f"{where['recording_name']}-{where['model']}"
+    for box in (None, options.box) if model in NETWORKS else (None,):
         suffix = "" if box is None else "-box"
         # laws have two parameters: few starts find what there is
-        starts = options.restarts / 4
-        if box is None and model in NETWORKS:
-            starts = options.restarts * _TIMES["n4"] / _TIMES[model]
-        if policy == "drop":
-            starts /= 2
-        search: dict[str, Any] = {
-            **where,
-            "box": box,
-            "restarts": max(2, round(starts * share)),
-            "iterations": options.iterations,
-        }
+        starts = options.restarts / (4 if model in LAWS or box else _TIMES[model] / _TIMES["n4"])
+        starts /= 2 if policy == "drop" else 1
         if box is None or policy == "keep":
-            draws = options.bootstrap if box is None else 0
-            yield Task(
-                f"fit-{policy}-{name}-{model}{suffix}",
-                tasks.fit,
-                {**search, "bootstrap": draws, "steps": STEPS},
-                cost=3 * time,
-            )
-        yield Task(
-            f"heldout-{policy}-{name}-{model}{suffix}",
-            tasks.cross_validate,
-            {
-                **search,
-                "restarts": max(2, options.restarts // 4),
-                "iterations": max(20, options.iterations * 2 // 3),
-                "folds": options.folds,
-            },
-            cost=3 * time,
-        )
+            more: dict[str, Any] = {
+                "box": box,
+                "restarts": max(2, round(starts * share)),
+                "iterations": options.iterations,
+                "bootstrap": options.bootstrap if box is None else 0,
+                "steps": STEPS,
+            }
+            yield Task(f"fit-{policy}-{place}{suffix}", tasks.fit, where | more, 3 * time)
+        more = {
+            "box": box,
+            "restarts": max(2, options.restarts // 4),
+            "iterations": max(20, options.iterations * 2 // 3),
+            "folds": options.folds,
+        }
+        key = f"heldout-{policy}-{place}{suffix}"
+        yield Task(key, tasks.cross_validate, where | more, 3 * time)
     if policy == "drop":
         return
-    yield Task(
-        f"descent-{name}-{model}",
-        tasks.descend,
-        {
-            **where,
-            "restarts": 2,
-            "steps": options.descent_steps,
-            "updates_dt": options.descent_dt,
-            "lr": options.descent_lr,
-            "batch_size": options.batch_size,
-        },
-        cost=2 * time,
-    )
-    yield Task(
-        f"consensus-{name}-{model}",
-        tasks.agree,
-        {**where, "particles": options.particles, "steps": options.consensus_steps},
-        cost=time,
-    )
+    more = {
+        "restarts": 2,
+        "steps": options.descent_steps,
+        "updates_dt": options.descent_dt,
+        "lr": options.descent_lr,
+        "batch_size": options.batch_size,
+    }
+    yield Task(f"descent-{place}", tasks.descend, where | more, 2 * time)
     if model in LAWS:
-        yield Task(f"scan-{name}-{model}", tasks.scan, _scan(where, options.quick), cost=time)
-
-
-def _scan(where: dict[str, Any], quick: bool) -> dict[str, Any]:
-    return {k: v for k, v in where.items() if k != "seed"} | {"points": 21 if quick else 81}
+        scan = {k: v for k, v in where.items() if k != "seed"}
+        scan |= {"points": 21 if options.quick else 81}
+        yield Task(f"scan-{place}", tasks.scan, scan, time)

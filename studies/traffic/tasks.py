@@ -13,7 +13,6 @@ from nnode.calibrate.bfgs import minimise, optimality_residual
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.evaluate import best_common_speed, constant_velocity, no_interaction
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
-from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.parameters import ParameterVector
 from nnode.calibrate.resampling import group_weights
 from nnode.data.sequence import Batch
@@ -64,7 +63,7 @@ def fit(
         "parameters": named(cost, best),
         "residual": float(residual),
         "speeds": speeds(ParameterVector(problem.system()).fill_(best)),
-        "steps": {
+        "steps_costs": {
             f"{step:g}": float(problem.cost(step, torch.float64).costs(best[None]).mean())
             for step in steps
         },
@@ -219,33 +218,6 @@ def descend(
         with torch.no_grad():
             rows.clamp_(cost.low, cost.high)
     return _ended(problem, dt, best_rows[int(best.argmin())], model, recording_name, history)
-
-
-def agree(
-    folder: str, recording_name: str, model: str, particles: int, steps: int, dt: float, seed: int
-) -> Result:
-    """Consensus-based optimisation from the paper's start."""
-    problem = Problem(recording(folder, recording_name), model)
-    cost = problem.cost(dt, torch.float32)
-    row = problem.starts(1, seed, wide=False)[0].requires_grad_()
-
-    def project() -> None:
-        with torch.no_grad():
-            row.clamp_(cost.low, cost.high)
-
-    optimizer = ConsensusBased(
-        [row],
-        particles=particles,
-        project=project,
-        seed=seed,
-        evaluate=lambda rows: cost.costs(rows).mean(1),
-    )
-    history = []
-    for step in range(1, steps + 1):
-        value = float(optimizer.step())  # type: ignore[arg-type]
-        if step % max(1, steps // 40) == 0:
-            history.append([step * particles, value, value])
-    return _ended(problem, dt, row.detach(), model, recording_name, history)
 
 
 def _ended(
