@@ -47,8 +47,9 @@ def means(costs: pd.DataFrame, seed: int) -> pd.DataFrame:
     A law with an infinite cost has no interval.
     """
     weights = group_weights(clusters(costs), DRAWS, np.random.default_rng(seed))
-    finite = costs.where(np.isfinite(costs).all(), np.nan)
-    low, high = np.quantile(weights @ finite.to_numpy(float), [0.025, 0.975], axis=0)
+    values = costs.to_numpy(float)
+    finite = np.where(np.isfinite(values).all(0), values, np.nan)
+    low, high = np.quantile(weights @ finite, [0.025, 0.975], axis=0)
     return pd.DataFrame({"mean": costs.mean(), "low": low, "high": high}, index=costs.columns)
 
 

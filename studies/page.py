@@ -1,7 +1,7 @@
 """A study's page: a template in Markdown says where its tables, figures and players stand.
 
 A template ``studies/<name>/page.md.j2`` is text with headings of level 2 to 4 and with these calls,
-whose body is the caption::
+whose body is the caption (digits of columns that are not named: those of ``""``)::
 
     {% call table("costs", digits={"p": 3}, least=["held out"]) %}Mean cost (m² s).{% endcall %}
     {% call figure("laws", "Ten panels of speed against gap.") %}Speed by gap.{% endcall %}
@@ -63,6 +63,8 @@ def page(
     ) -> str:
         frame = tables[name]
         shown = frame.head(head) if head else frame
+        if isinstance(digits, dict):
+            digits = {c: digits.get(c, digits.get("", DIGITS)) for c in map(str, shown)}
         bold = least_cells(shown, least, among, row)
         return place(TableBlock(name, shown, _line(caller()), bold, digits, frame))
 

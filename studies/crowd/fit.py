@@ -23,21 +23,20 @@ from nnode.model.system import System
 from nnode.plots.interaction import interaction
 from nnode.simulation.fused import FusedSolver
 
-#: Social force and networks; those with the person himself in the sum, j = i, as printed.
+#: Social force and networks.
 OPTIONS: dict[str, CrowdOptions] = {
     "sf": SocialForceOptions(name="sf", term="social_force"),
     "nn": NetworkForceOptions(name="nn", term="network_force"),
-    "nn_self": NetworkForceOptions(name="nn_self", term="network_force", self_interaction=True),
 }
 #: Parameters of the social force in the order of its rows.
 NAMES = ("A", "k", "kappa")
 
 #: Samples after which the horizon grows; the sequence's own length ends the list.
-GROWTH = {"sf": (4, 8, 13, 26, 51), "nn": (6, 13), "nn_self": (6, 13)}
+GROWTH = {"sf": (4, 8, 13, 26, 51), "nn": (6, 13)}
 #: Steps at most each time before the horizon grows.
-SHORT_STEPS = {"sf": 8, "nn": 3, "nn_self": 3}
+SHORT_STEPS = {"sf": 8, "nn": 3}
 #: Networks bear rounding to single precision and are twice as fast in it; A is too small for it.
-DTYPE = {"sf": torch.float64, "nn": torch.float32, "nn_self": torch.float32}
+DTYPE = {"sf": torch.float64, "nn": torch.float32}
 
 
 def new_system(model: str, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:

@@ -114,7 +114,7 @@ def transfer(folder: str, rows: dict[str, list[float]]) -> Result:
                 **_simple(batch),
             },
         }
-    return found
+    return {"runs": found}
 
 
 def even_pace(batch: Batch) -> Trajectory:

@@ -111,6 +111,6 @@ def _by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
     order = distances["law"].unique(), distances["scene"].unique()
     table = distances.pivot(index="law", columns="scene", values=what).loc[*order]
     place = ("ade", "fde").index(what)
-    told = {scene: printed.CONSTANT_VELOCITY[scene][place] for scene in table}
+    told = {scene: printed.CONSTANT_VELOCITY[scene][place] for scene in map(str, table)}
     table.loc["constant velocity, published"] = pd.Series(told)
     return table.rename_axis(index=None, columns=None)

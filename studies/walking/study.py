@@ -98,7 +98,7 @@ class Walking:
     """Options, and a row of results per task."""
 
     options: WalkingStudyOptions
-    found: pd.DataFrame
+    found: Any
 
     def errors(self, desired: str) -> pd.DataFrame:
         """A row per law, horizon (s) and held-out run: ``people``, and mean squared distances (m²)
@@ -136,14 +136,14 @@ class Walking:
             found[f"walking_{desired}_differences"] = self.differences(desired)
         return found
 
-    def differences(self, desired: str) -> pd.DataFrame:
+    def differences(self, desired: str) -> Any:
         """Of every model from no interaction, by horizon; runs are what is resampled."""
         parts = {}
         for h in self.options.horizons:
             costs, alone = self.costs(desired, h), LABELS["alone"]
-            pairs = [(law, alone) for law in costs if law != alone]
+            pairs = [(str(law), alone) for law in costs if law != alone]
             parts[h] = differences(costs, pairs, self.options.seed).droplevel("second")
-        found = pd.concat(parts, names=["horizon (s)", "model"]).drop(columns="better")
+        found: Any = pd.concat(parts, names=["horizon (s)", "model"]).drop(columns="better")
         return found.reset_index("horizon (s)").sort_index(
             kind="stable", key=lambda laws: [list(LABELS.values()).index(law) for law in laws]
         )
@@ -154,16 +154,18 @@ class Walking:
         mean = self.tables()[f"walking_{desired}"].loc[laws]
         away = self.differences(desired).set_index("horizon (s)", append=True)
         low, high = (
-            mean.iloc[0].to_numpy()
-            + away[end].unstack().reindex(laws).set_axis(mean.columns, axis=1)
+            away[end].unstack().reindex(laws).set_axis(mean.columns, axis=1) + mean.iloc[0]
             for end in ("low", "high")
         )
         return horizon_costs(horizons, mean, low, high)
 
     def _parameters(self) -> pd.DataFrame:
         rows = [
-            [LABELS[one["law"]], one["desired"], one["horizon"], ", ".join(one["held"])]
-            + [name, value, one["train"]]
+            [
+                LABELS[one["law"]],
+                *(one["desired"], one["horizon"], ", ".join(one["held"])),
+                *(name, value, one["train"]),
+            ]
             for one in self.found[self.found["task"] == "fit"].to_dict("records")
             for name, _, value in numbers(one["row"])
         ]
