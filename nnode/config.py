@@ -15,7 +15,6 @@ from omegaconf import MISSING, OmegaConf
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
-    ConsensusOptions,
     GaussNewtonOptions,
     LbfgsOptions,
 )
@@ -203,7 +202,6 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "adadelta_schema"): AdadeltaOptions,
     ("optimizer", "adam_schema"): AdamOptions,
     ("optimizer", "lbfgs_schema"): LbfgsOptions,
-    ("optimizer", "cbo_schema"): ConsensusOptions,
     ("optimizer", "gauss_newton_schema"): GaussNewtonOptions,
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,

@@ -17,7 +17,6 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
-    ConsensusOptions,
     LbfgsOptions,
     OptimizerOptions,
 )
@@ -33,7 +32,6 @@ OPTIMIZERS: list[tuple[OptimizerOptions, int]] = [
     (AdadeltaOptions(), 2),
     (AdamOptions(), 2),
     (LbfgsOptions(max_iter=3), 0),
-    (ConsensusOptions(particles=5), 0),
 ]
 
 

@@ -16,7 +16,6 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
-    ConsensusOptions,
     LbfgsOptions,
     OptimizerOptions,
     build_optimizer,
@@ -47,7 +46,6 @@ CASES: dict[str, tuple[dict[str, Any], OptimizerOptions, int, int]] = {
     "single": (N4, AdadeltaOptions(eta1=0.1), 1, 4),
     "projected": (LIN, AdamOptions(lr=1.0), 2, 7),
     "lbfgs": (N4, LbfgsOptions(max_iter=2), 0, 20),
-    "cbo": (LIN, ConsensusOptions(particles=4), 0, 20),
 }
 
 

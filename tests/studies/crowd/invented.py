@@ -103,27 +103,11 @@ def baselines(folder: str) -> dict[str, Any]:
 def transfer(folder: str, rows: dict[str, list[float]]) -> dict[str, Any]:
     """In place of :func:`studies.crowd.tasks.transfer`."""
     assert rows["sf"] == FORCE[_horizon(folder)]
-    return {
+    runs = {
         run: {
             "people": [6],
             "costs": {model: {"a": cost} for model, cost in {**costs, **SIMPLE}.items()},
         }
         for run, costs in ELSEWHERE.items()
     }
-
-
-def scan(path: str, how: dict[str, Any], cuts: int, seed: int) -> dict[str, Any]:
-    """In place of :func:`studies.crowd.conventions.scan`."""
-    return {
-        "offsets": list(range(cuts)),
-        "printed": [3.0] * cuts,
-        "people": [10.0] * cuts,
-        "relaxation": 4.0,
-        "sf": 2.0,
-        "row": FORCE[1],
-    }
-
-
-def network(path: str, how: dict[str, Any], model: str, seed: int, steps: int) -> dict[str, Any]:
-    """In place of :func:`studies.crowd.conventions.network`."""
-    return {"J": 1.0 + seed, "row": []}
+    return {"runs": runs}

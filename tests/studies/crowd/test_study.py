@@ -6,24 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
-from nnode.calibrate.resampling import Paired
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import write_store
 from nnode.errors import ConfigError
-from nnode.pages.page import TableBlock, write_page
 from nnode.plots.interaction import evaluate_force, interaction
 from studies.crowd import forces as crowd_forces
 from studies.crowd import printed as printed_crowd
-from studies.crowd import study as crowd
 from studies.crowd.data import ALL, Place, cut, fold_of, parts, time_groups, turned
 from studies.crowd.fit import calibrate, costs, new_system, row_of, system_of
-from studies.crowd.page import verdict
 from studies.crowd.tasks import even_pace
-from studies.options import CrowdStudyOptions
 from tests.studies.crowd.corridor import corridor, sequence
 
 TRUE = np.array([0.05, 40.0, 12.0])
@@ -198,30 +192,6 @@ def test_likeness_is_the_sign_and_share_of_agreement():
     assert np.isnan(crowd_forces.likeness(field, 0 * field))
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "words"),
-    [(-2.0, -1.0, "NN is below SF"), (1.0, 2.0, "NN is above SF"), (-1.0, 2.0, "told apart")],
-)
-def test_words_follow_from_the_interval(low, high, words):
-    found = Paired(difference=(low + high) / 2, low=low, high=high, p=0.5, better=0.5)
-    assert words in verdict("NN", "SF", found)
-
-
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"folds": 1}, "folds=1"),
-        ({"horizons": []}, "horizons"),
-        ({"restarts": 0}, "restarts=0"),
-        ({"cuts": 0}, "cuts=0"),
-    ],
-)
-def test_options_out_of_range_are_refused_before_any_work(tmp_path, changed, words):
-    with pytest.raises(ConfigError, match=words):
-        crowd.run(replace(CrowdStudyOptions(workers=1), **changed), tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
 def test_settings_stand_beside_the_printed_forces():
     from nnode.plots.settings import six_settings
 
@@ -231,34 +201,3 @@ def test_settings_stand_beside_the_printed_forces():
     for part in ("F_x", "F_y"):
         away = (table[part] - table[f"{part} printed"]).abs().max()
         assert away < 1e-4
-
-
-@pytest.mark.slow
-def test_the_quick_study_writes_its_page_and_continues(real_data, tmp_path):
-    options = CrowdStudyOptions(source=str(real_data), quick=True, workers=2)
-    blocks = crowd.run(options, tmp_path)
-    kept = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "tasks").iterdir()}
-    tables = {b.name: b for b in blocks if isinstance(b, TableBlock)}
-    expected = {
-        "crowd_parameters",
-        "crowd_costs",
-        "crowd_horizons",
-        "crowd_heldout_runs",
-        "crowd_restarts",
-        "settings_sf",
-        "settings_nn",
-        "parameters",
-        "crowd_data",
-        "crowd_blocks",
-        "settings_nn_along",
-        "crowd_conventions",
-        "crowd_conventions_means",
-        "crowd_conventions_networks",
-    }
-    assert set(tables) == expected
-    assert np.isfinite(tables["crowd_costs"].frame["here (m² s)"]).all()
-    write_page(blocks, tmp_path, title=crowd.TITLE, subtitle=crowd.SUBTITLE)
-    written = pd.read_csv(tmp_path / "crowd_horizons.csv")
-    assert len(written) == 14
-    crowd.run(options, tmp_path)
-    assert kept == {p.name: p.stat().st_mtime_ns for p in (tmp_path / "tasks").iterdir()}

@@ -72,7 +72,7 @@ def test_baselines_calibrate_nothing(folder: str) -> None:
 
 
 def test_a_force_without_directions_holds_in_a_corridor_that_lies_another_way(folder: str) -> None:
-    found = tasks.transfer(folder, {"sf": TRUE.tolist()})["made"]
+    found = tasks.transfer(folder, {"sf": TRUE.tolist()})["runs"]["made"]
     assert found["people"] == [PEOPLE] * 4
     there = tasks.baselines(folder)["costs"]
     for name in ("relaxation", "constant_velocity", "even_pace", "printed"):

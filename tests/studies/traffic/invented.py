@@ -84,7 +84,7 @@ def fit(
         "parameters": parameters,
         "residual": 1e-3,
         "speeds": [15.0] * len(GAPS),
-        "steps": {f"{step:g}": cost * (1 + step) for step in steps},
+        "steps_costs": {f"{step:g}": cost * (1 + step) for step in steps},
         "starts": [cost + k for k in range(5)],
     }
     if bootstrap:
@@ -110,6 +110,7 @@ def cross_validate(
         "box": box,
         "costs": [cost] * 3,
         "groups": [0, 1, 2],
+        "names": ["a", "b", "c"],
         **{name: [UNSEEN[name]] * 3 for name in ("no_interaction", "constant_velocity")},
     }
 
@@ -130,13 +131,6 @@ def descend(recording_name: str, model: str, **how: Any) -> dict[str, Any]:
     begin = printed(model, recording_name)
     history = [[0, begin + 10, begin + 10], [5, begin + 2, begin + 2]]
     return _run(model, recording_name, 2.0, history)
-
-
-def agree(recording_name: str, model: str, **how: Any) -> dict[str, Any]:
-    """In place of :func:`studies.traffic.tasks.agree`: better than descent for laws."""
-    above = 1.0 if model in ("lin", "log") else 3.0
-    end = printed(model, recording_name) + above
-    return _run(model, recording_name, above, [[10, end + 1, end + 1], [20, end, end]])
 
 
 def scan(recording_name: str, model: str, points: int, **how: Any) -> dict[str, Any]:

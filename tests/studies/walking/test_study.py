@@ -6,16 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import write_store
+from studies.frame import differences
 from studies.options import WalkingStudyOptions
 from studies.walking import tasks
 from studies.walking.data import RUNS, chosen
 from studies.walking.laws import GRID, LABELS, LAWS, new_system
-from studies.walking.page import Walking
-from studies.walking.study import groups
+from studies.walking.study import Walking, groups
 
 
 def walker(run: str, tau: float, known: bool = True) -> Sequence:
@@ -60,15 +61,22 @@ def test_laws_have_names_and_starts() -> None:
 
 def test_errors_are_means_over_people() -> None:
     runs = [{"people": 1, "mean": 4.0, "end": 0.0}, {"people": 3, "mean": 0.0, "end": 1.0}]
-    found = {
-        f"simple-1s-{i}": {"preferred": {f"r{i}": one}, "constant_velocity": {f"r{i}": one}}
+    rows = [
+        {
+            "task": "baselines",
+            "horizon": 1.0,
+            "constant_velocity": {f"r{i}": one},
+            "preferred": {f"r{i}": one},
+        }
         for i, one in enumerate(runs)
-    }
-    study = Walking(WalkingStudyOptions(horizons=[1.0], folds=2), found)
-    assert study.error("preferred", "last", 1.0) == 1.0
-    assert study.error("preferred", "last", 1.0, "end") == 0.75
-    same = study.against("preferred", "constant_velocity", "last", 1.0)
-    assert (same.difference, same.low, same.high) == (0, 0, 0)
+    ]
+    study = Walking(WalkingStudyOptions(horizons=[1.0], folds=2), pd.DataFrame(rows))
+    label = LABELS["preferred"]
+    assert study.costs("direction", 1.0)[label].mean() == 1.0
+    assert study.costs("direction", 1.0, "end")[label].mean() == 0.75
+    both = [(label, LABELS["constant_velocity"])]
+    same = differences(study.costs("direction", 1.0), both, 0).iloc[0]
+    assert (same["difference"], same["low"], same["high"]) == (0, 0, 0)
 
 
 def test_predictions_that_go_straight() -> None:
