@@ -7,6 +7,7 @@ is refused before any work starts.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -218,8 +219,9 @@ def choices(group: str) -> list[str]:
     return sorted(files | {n for own, n in SCHEMAS if own == group and not n.endswith("_schema")})
 
 
+@cache
 def register() -> None:
-    """Make all schemas known to Hydra; harmless when repeated."""
+    """Make all schemas known to Hydra, once in a process."""
     store = ConfigStore.instance()
     for (group, name), schema in SCHEMAS.items():
         node = OmegaConf.structured(schema)

@@ -17,10 +17,11 @@ from nnode.calibrate.optimizers import (
     needs_full_batch,
 )
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
 from nnode.simulation import FusedSolver
+from tests.builders import linear
 
 #: v0 (m/s) and L (m) that the data are made with.
 TRUTH = (24.0, 6.0)
@@ -28,25 +29,9 @@ SOLVER = FusedSolver(0.1)
 
 
 def made_with_lin() -> Batch:
-    """Platoons by a plain Euler loop with TRUTH, four steps of 0.05 s between two samples."""
-    items = []
-    for number, gaps in enumerate([[9.0, 14.0], [20.0, 8.0], [30.0, 11.0]]):
-        x = np.concatenate([[0.0], np.cumsum(gaps)])
-        states = [x]
-        for _ in range(7):
-            for _ in range(2):
-                v0, length = TRUTH
-                x = x + 0.1 * np.append(v0 * (1 - length / np.diff(x)), v0)
-            states.append(x)
-        items.append(
-            Sequence(
-                name=str(number),
-                recording="r",
-                time=0.2 * np.arange(8),
-                x=np.array(states)[:, :, None],
-            )
-        )
-    return collate(items)
+    """Platoons of TRUTH."""
+    gaps = ([9.0, 14.0], [20.0, 8.0], [30.0, 11.0])
+    return collate(linear((np.cumsum([0.0, *g]) for g in gaps), *TRUTH, 8, 0.1))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -153,22 +152,6 @@ def test_failing_tasks_let_the_others_finish(workers: int, tmp_path: Path) -> No
     repaired = Task("python", work.square, good[0].arguments)
     run_tasks([repaired], tmp_path, workers=1, fingerprint="f")
     assert not (tmp_path / "tasks" / "python.error.txt").exists()
-
-
-def test_a_worker_killed_from_outside_is_an_error_and_no_hang(tmp_path: Path) -> None:
-    sign = tmp_path / "sign-a"
-
-    def kill() -> None:
-        eventually(lambda: sign.exists() and sign.read_text() != "")
-        os.kill(int(sign.read_text()), signal.SIGKILL)
-
-    sleeping = Task("sleep", work.sleep, {"folder": str(tmp_path), "name": "a"}, cost=9.0)
-    killer = threading.Thread(target=kill)
-    killer.start()
-    with pytest.raises(StudyError, match="1 of 4 tasks failed: sleep: its process was ended by"):
-        run_tasks([sleeping, *squares(tmp_path, 1, 2, 3)], tmp_path, workers=2, fingerprint="f")
-    killer.join()
-    assert len(list((tmp_path / "tasks").glob("square-*.json"))) == 3
 
 
 def start(folder: Path, workers: int) -> subprocess.Popen[str]:

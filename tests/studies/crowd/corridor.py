@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model.system import System
 from nnode.simulation.ode import TorchdiffeqSolver
+from tests.builders import straight
 
 DT = 0.04
 
@@ -16,18 +19,14 @@ def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -
     """People at random places who walk either way; their positions are those of free walkers."""
     x = np.stack([rng.uniform(-2, 2, people), rng.uniform(0.4, 3.6, people)], -1)
     v = np.stack([rng.choice([-1.0, 1.0], people), rng.normal(0, 0.1, people)], -1)
-    time = DT * np.arange(samples)
-    walls = np.array([[-5.0, 0.0, 5.0, 0.0], [5.0, 4.0, -5.0, 4.0]])
-    path = x + time[:, None, None] * v
-    return Sequence(
-        name=f"made/{number:03d}",
-        recording="made",
-        time=time + number,
-        x=path,
-        walls=walls,
-        agents=tuple(f"{number}-{i}" for i in range(people)),
-        destination=path[-1] + 2 * v,
-    )
+    more = {
+        "start": number,
+        "name": f"made/{number:03d}",
+        "walls": np.array([[-5.0, 0.0, 5.0, 0.0], [5.0, 4.0, -5.0, 4.0]]),
+        "agents": tuple(f"{number}-{i}" for i in range(people)),
+        "destination": x + (DT * (samples - 1) + 2) * v,
+    }
+    return replace(straight(x, v, samples, DT, **more), v=None)
 
 
 def corridor(

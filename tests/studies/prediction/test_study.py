@@ -16,24 +16,16 @@ from studies.prediction import printed, tasks
 from studies.prediction.data import AHEAD, SCENES, SEEN, events, scene
 from studies.walking import tasks as walking
 from studies.walking.data import chosen
+from tests.builders import lane
 
 FREE = {"parameters": {"v0": "12 m/s"}, "rate": {"x": "v0"}}
 
 
 def pair(number: int, v0: float, split: str) -> Sequence:
     """A follower at a constant speed, 40 m and 4 m of length behind a leader who is as fast."""
-    time = 0.1 * np.arange(31)
-    x = np.stack([v0 * time, 44 + v0 * time], 1)[..., None]
-    return Sequence(
-        name=f"{split}/{number}",
-        recording=split,
-        time=time,
-        x=x,
-        v=np.full_like(x, v0),
-        agents=(f"f{number}", f"l{number}"),
-        length=np.array([np.nan, 4.0]),
-        split=split,
-    )
+    x = v0 * 0.1 * np.arange(31)[:, None] + np.array([0.0, 44.0])
+    more = {"agents": (f"f{number}", f"l{number}"), "length": np.array([np.nan, 4.0])}
+    return lane(x, 0.1, v=v0, name=f"{split}/{number}", split=split, **more)
 
 
 def test_the_metric_is_that_of_all_samples_together() -> None:

@@ -10,6 +10,7 @@ from nnode.data.sequence import Sequence
 from nnode.model import build_model
 from studies.traffic.printed import COSTS, RECORDINGS
 from studies.traffic.problem import GAPS, model_options
+from tests.builders import lane
 
 #: Cost above the printed one, m² s; all others lie 1 below it. The second is of a wider search.
 ABOVE = {
@@ -28,16 +29,8 @@ V0, V0_LIN, L, L_LEAST, LEAST_IN = 20.0, 25.0, 5.0, 2.0, "5-1_1"
 
 def platoons(name: str) -> list[Sequence]:
     """Three cars at even speeds, three times."""
-    time = 0.2 * np.arange(6)
-    return [
-        Sequence(
-            name=f"{name}/{i:03}",
-            recording=name,
-            time=time + 100 * i,
-            x=(20 * time[:, None] + np.array([0.0, 15.0, 40.0]))[..., None],
-        )
-        for i in range(3)
-    ]
+    x = 4.0 * np.arange(6)[:, None] + np.array([0.0, 15.0, 40.0])
+    return [lane(x, start=100.0 * i, name=f"{name}/{i:03}") for i in range(3)]
 
 
 def printed(model: str, name: str) -> float:
