@@ -76,6 +76,17 @@ def differences(costs: pd.DataFrame, pairs: Iterable[tuple[str, str]], seed: int
     return found.reindex(columns=["difference", "low", "high", "p", "better"])
 
 
+def versus(costs: pd.DataFrame, reference: str, seed: int) -> pd.DataFrame:
+    """Each law's :func:`means`, and its :func:`differences` from one of them.
+
+    Returns:
+        ``mean``, ``low``, ``high``; ``minus <reference>``, ``from``, ``to``; ``p``, ``better``.
+    """
+    away = differences(costs, [(str(law), reference) for law in costs], seed).droplevel("second")
+    away.columns = pd.Index([f"minus {reference}", "from", "to", "p", "better"])
+    return means(costs, seed).join(away)
+
+
 def numbers(parameters: Mapping[str, Any]) -> list[tuple[str, str, float]]:
     """Every number of parameters that may be arrays: name, place in the array, value."""
     return [

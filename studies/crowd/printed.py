@@ -4,31 +4,12 @@ from __future__ import annotations
 
 import pandas as pd
 
-#: Estimated parameters of the social force: A (N), k (kg/s²), kappa (kg/(m s)).
-PARAMETERS = {"A": 0.0044, "k": 34.9539, "kappa": 9.8894}
+from studies.printed import told
 
-#: Mean cost of a sequence of 1 s without the time step, m².
-COSTS = {"sf": 5.0841, "nn": 5.5979}
-
-#: Tables (data6settings) and (data6settingsNN): forces on blue and on red in settings 1 to 6, N.
-FORCES = {
-    "sf": (
-        ((0.0, 2.1118), (0.0, -2.1118)),
-        ((0.0, 2.1118), (0.0, -2.1118)),
-        ((0.0417, 2.0961), (-0.0417, -2.0961)),
-        ((0.0952, 2.0936), (-0.0952, -2.0936)),
-        ((2.1118, 1.1867), (-2.1118, -1.1867)),
-        ((2.1118, 0.0), (-2.1118, 0.0)),
-    ),
-    "nn": (
-        ((0.1794, 0.1517), (-0.2230, -0.1856)),
-        ((0.4607, 0.7512), (-0.2557, -1.0052)),
-        ((0.1782, 0.1496), (-0.2218, -0.1858)),
-        ((0.4602, 0.7487), (-0.2539, -1.0055)),
-        ((0.1742, -0.7027), (0.5133, 0.8687)),
-        ((0.4605, -0.2639), (0.5612, -0.1540)),
-    ),
-}
+_TOLD = told(__package__)
+PARAMETERS = _TOLD["parameters"]
+COSTS = _TOLD["costs"]
+FORCES = _TOLD["forces"]
 
 
 def settings(model: str, table: pd.DataFrame) -> pd.DataFrame:
@@ -44,16 +25,16 @@ def settings(model: str, table: pd.DataFrame) -> pd.DataFrame:
     """
     rows = {}
     for (_, row), printed in zip(table.iterrows(), FORCES[model], strict=True):
-        for person, told in zip(("blue", "red"), printed, strict=True):
+        for person, theirs in zip(("blue", "red"), printed, strict=True):
             place, velocity = row[f"x_{person}"], row[f"v_{person}"]
             force = row[f"force_{person}"]
             rows[(row["setting"], person)] = {
                 "place (m)": f"({place[0]:g}; {place[1]:g})",
                 "velocity (m/s)": f"({velocity[0]:g}; {velocity[1]:g})",
                 "F_x": force[0],
-                "F_x printed": told[0],
+                "F_x printed": theirs[0],
                 "F_y": force[1],
-                "F_y printed": told[1],
+                "F_y printed": theirs[1],
             }
     found = pd.DataFrame(rows).T.rename_axis(["setting", "person"])
     forces = [name for name in map(str, found) if name.startswith("F_")]

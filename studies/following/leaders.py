@@ -48,9 +48,6 @@ def by_leader(folder: str, name: str, restarts: int, seed: int) -> Result:
             without[side].append(row.tolist())
             heldout[side][label == g] = cost.costs(row)[label == g]
     speed = [float(np.mean(pair.velocity()[:, 0])) for pair in pairs]
-    gap = [
-        float(np.mean(pair.x[:, 1, 0] - pair.x[:, 0, 0] - _length(pair.length))) for pair in pairs
-    ]
     return {
         "names": list(named(cost, whole["both"])),
         "kinds": kind.tolist(),
@@ -60,12 +57,8 @@ def by_leader(folder: str, name: str, restarts: int, seed: int) -> Result:
         "costs": {side: cost.costs(row).tolist() for side, row in whole.items()},
         "heldout": {side: values.tolist() for side, values in heldout.items()},
         "speed": speed,
-        "gap": gap,
+        "gap": [float(data.gap_of(pair).mean()) for pair in pairs],
     }
-
-
-def _length(length: np.ndarray | None) -> float:
-    return 0.0 if length is None or np.isnan(length[1]) else float(length[1])
 
 
 def jackknifed(values: np.ndarray, left_out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,19 +21,10 @@ from studies.following import data, figures, leaders, platoons, printed, stabili
 from studies.following.candidates import DECAY, EVERY, REFERENCE, key
 from studies.following.data import gap_of
 from studies.following.fit import OBJECTIVES
-from studies.frame import by_unit, differences, means
+from studies.frame import by_unit, differences, versus
 from studies.options import FollowingStudyOptions
 from studies.replay import player, scenes, spread
 
-#: Units of parameters, by name.
-UNITS = {
-    **dict.fromkeys(("v0",), "m/s"),
-    **dict.fromkeys(("T", "tau_m", "tau_v"), "s"),
-    **dict.fromkeys(("s0", "s_c", "w", "d"), "m"),
-    **dict.fromkeys(("a", "b", "b_1"), "m/s²"),
-    **dict.fromkeys(("kappa", "lam", "c_v"), "1/s"),
-    "c_s": "1/s²",
-}
 #: Objectives on a page.
 WITH_UNITS = {
     "spacing": "gap, RMSE (m)",
@@ -150,38 +141,18 @@ class Study:
         return table.assign(difference=table["here"] - table["printed"])
 
     def _candidates(self) -> pd.DataFrame:
-        costs, one = self.heldout(), {name: self.one("cv", name) for name in self.order}
-        held, away = means(costs, self.options.seed).loc[self.order], self.away(costs)
-        return pd.DataFrame(
-            {
-                "numbers": {name: len(one[name]["row"]) for name in one},
-                "train": {name: float(np.mean(one[name]["train"]["spacing"])) for name in one},
-                "held out": held["mean"],
-                "low": held["low"],
-                "high": held["high"],
-                f"minus {REFERENCE}": away["difference"],
-                "from": away["low"],
-                "to": away["high"],
-                "better": away["better"],
-                "at a limit": {name: ", ".join(one[name]["limits"]) for name in one},
-            }
-        ).rename_axis("candidate")
+        one = {name: self.one("cv", name) for name in self.order}
+        table = versus(self.heldout(), REFERENCE, self.options.seed).loc[self.order]
+        table = table.rename(columns={"mean": "held out"}).drop(columns="p")
+        train = {name: float(np.mean(each["train"]["spacing"])) for name, each in one.items()}
+        table.insert(0, "train", pd.Series(train))
+        table.insert(0, "numbers", pd.Series({n: len(each["row"]) for n, each in one.items()}))
+        return table.assign(**{"at a limit": [", ".join(each["limits"]) for each in one.values()]})
 
     def _test(self) -> pd.DataFrame:
-        costs = self.tested()
-        found, away = means(costs, self.options.seed).loc[self.order], self.away(costs)
-        table = pd.DataFrame(
-            {
-                "held out": self.heldout().mean(),
-                "test": found["mean"],
-                "low": found["low"],
-                "high": found["high"],
-                f"minus {REFERENCE}": away["difference"],
-                "from": away["low"],
-                "to": away["high"],
-                "p": away["p"],
-            }
-        ).loc[self.order]
+        table = versus(self.tested(), REFERENCE, self.options.seed).loc[self.order]
+        table = table.rename(columns={"mean": "test"}).drop(columns="better")
+        table.insert(0, "held out", self.heldout().mean())
         told = {
             f"{law}, printed ({objective})": {"test": value}
             for law, errors in printed.ERRORS.items()
@@ -217,7 +188,7 @@ class Study:
                 "value": row,
                 "from": row - half,
                 "to": row + half,
-                "unit": [UNITS.get(n, "1") for n in names],
+                "unit": [printed.UNITS.get(n, "1") for n in names],
                 "at a limit": [n in limits for n in names],
                 "closed below": [
                     _rises(one["profiles"][n], v, -1) for n, v in zip(names, row, strict=True)
@@ -265,18 +236,9 @@ class Study:
         one = self.found["halves"]
         names = ("pooled", "alone", "shrunk")
         costs = by_unit({name: one[name] for name in names}, one["clusters"])
-        away = differences(costs, [(name, "pooled") for name in names], self.options.seed)
-        away = away.droplevel("second")
-        return pd.DataFrame(
-            {
-                "second half (m)": costs.mean(),
-                "median (m)": costs.median(),
-                "minus pooled": away["difference"],
-                "from": away["low"],
-                "to": away["high"],
-                "better": away["better"],
-            }
-        ).rename_axis("calibrated")
+        table = versus(costs, "pooled", self.options.seed).drop(columns=["low", "high", "p"])
+        table.insert(1, "median (m)", costs.median())
+        return table.rename(columns={"mean": "second half (m)"}).rename_axis("calibrated")
 
     def _spread(self) -> pd.DataFrame:
         one = self.found["halves"]
@@ -285,7 +247,7 @@ class Study:
                 "pooled": one["centre"],
                 "spread of single pairs": one["between"],
                 "spread that lasts": one["spread"],
-                "unit": [UNITS.get(n, "1") for n in one["names"]],
+                "unit": [printed.UNITS.get(n, "1") for n in one["names"]],
             },
             index=pd.Index(one["names"], name="parameter"),
         )
@@ -352,7 +314,7 @@ class Study:
         one = self.found["leaders"]
         row = {k: np.array(one["rows"][k]) for k in leaders.KINDS}
         out = {k: np.array(one["without"][k]) for k in leaders.KINDS}
-        columns: dict[str, Any] = {"unit": [UNITS.get(n, "1") for n in one["names"]]}
+        columns: dict[str, Any] = {"unit": [printed.UNITS.get(n, "1") for n in one["names"]]}
         for k in leaders.KINDS:
             columns |= {k: row[k], f"± {k}": leaders.jackknifed(row[k], out[k])[1]}
         away = row["CAV"] - row["HV"]
@@ -364,22 +326,14 @@ class Study:
         one = self.found["leaders"]
         costs = by_unit(one["heldout"], one["clusters"])
         kind = np.array(one["kinds"])
-        sides = ("both", *leaders.KINDS)
         parts = {}
         for k in leaders.KINDS:
-            on = costs[kind == k]
-            away = differences(on, [(s, "both") for s in sides], self.options.seed)
-            parts[f"behind {k}"] = pd.DataFrame(
-                {
-                    "pairs": len(on),
-                    "speed (m/s)": float(np.array(one["speed"])[kind == k].mean()),
-                    "gap (m)": float(np.array(one["gap"])[kind == k].mean()),
-                    "held out (m)": on.mean()[list(sides)],
-                    "minus both": away["difference"].to_numpy(),
-                    "from": away["low"].to_numpy(),
-                    "to": away["high"].to_numpy(),
-                }
-            )
+            table = versus(costs[kind == k], "both", self.options.seed)
+            table = table.rename(columns={"mean": "held out (m)"}).drop(columns=["p", "better"])
+            for name, what in (("gap (m)", "gap"), ("speed (m/s)", "speed")):
+                table.insert(0, name, float(np.array(one[what])[kind == k].mean()))
+            table.insert(0, "pairs", int((kind == k).sum()))
+            parts[f"behind {k}"] = table
         return pd.concat(parts, names=["pairs", "calibrated on"])
 
     def _parameters(self) -> pd.DataFrame:
@@ -470,7 +424,7 @@ class Study:
                 | {"best": np.array(best)}
                 for n, best in zip(one["names"], one["row"], strict=True)
             }
-            units = {n: UNITS.get(n, "1") for n in one["names"]}
+            units = {n: printed.UNITS.get(n, "1") for n in one["names"]}
             found[f"profiles_{key(name)}"] = figures.profiles(profiles, units)
         return found
 

@@ -14,6 +14,7 @@ from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.system import System
 from nnode.simulation.fused import FusedSolver
+from studies.following.data import gap_of
 from studies.pooled import pooled_fit, start_of
 
 #: Standard deviation of the logarithm of parameters at a start.
@@ -55,13 +56,7 @@ def squares(system: System, pairs: list[Sequence]) -> dict[str, list[float]]:
     batch = collate(pairs)
     late = (FusedSolver()(system, batch).x - batch.x)[..., 0, 0]
     error = (late.square() * batch.valid[..., 0]).sum(0)
-    return {"error": error.tolist(), "spacing": [float((gap(s) ** 2).sum()) for s in pairs]}
-
-
-def gap(pair: Sequence) -> np.ndarray:
-    """``(K,)`` m from bumper to bumper."""
-    assert pair.length is not None
-    return np.asarray(pair.x[:, 1, 0] - pair.x[:, 0, 0] - pair.length[1])
+    return {"error": error.tolist(), "spacing": [float((gap_of(s) ** 2).sum()) for s in pairs]}
 
 
 def rmspe(sums: dict[str, list[float]], weights: np.ndarray | None = None) -> float:

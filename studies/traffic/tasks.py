@@ -53,10 +53,6 @@ def fit(
         found.best
     ]
     result: Result = {
-        "model": model,
-        "recording": recording_name,
-        "box": box,
-        "restarts": restarts,
         "cost": float(found.costs[found.best]),
         "costs": cost.costs(best[None])[0].tolist(),
         "groups": groups(folder, recording_name).tolist(),
@@ -129,7 +125,7 @@ def cross_validate(
     group = groups(folder, recording_name)
     number = int(group.max()) + 1
     if number < 2:
-        return {"model": model, "recording": recording_name, "box": box, "costs": None}
+        return {"costs": None}
     place = np.random.default_rng(seed).permutation(number) % min(folds, number)
     fold = place[group]
     problem = Problem(sequences, model, box)
@@ -142,9 +138,6 @@ def cross_validate(
         train = problem.batch.select(np.flatnonzero(fold != k).tolist())
         common[out], kept[out] = _simple(train, problem.batch.select(out.tolist()), problem, dt)
     return {
-        "model": model,
-        "recording": recording_name,
-        "box": box,
         "costs": costs.tolist(),
         "no_interaction": common.tolist(),
         "constant_velocity": kept.tolist(),
@@ -217,19 +210,15 @@ def descend(
         optimizer.step()
         with torch.no_grad():
             rows.clamp_(cost.low, cost.high)
-    return _ended(problem, dt, best_rows[int(best.argmin())], model, recording_name, history)
+    return _ended(problem, dt, best_rows[int(best.argmin())], history)
 
 
-def _ended(
-    problem: Problem, dt: float, row: Tensor, model: str, name: str, history: list[Any]
-) -> Result:
+def _ended(problem: Problem, dt: float, row: Tensor, history: list[Any]) -> Result:
     """The end of a run, evaluated in float64."""
     cost = problem.cost(dt, torch.float64)
     value, gradient = cost(row[None])
     residual = optimality_residual(row[None], value, gradient, cost.low, cost.high)
     return {
-        "model": model,
-        "recording": name,
         "cost": float(value[0]),
         "parameters": named(cost, row),
         "residual": float(residual[0]),
@@ -251,8 +240,6 @@ def scan(folder: str, recording_name: str, model: str, points: int, dt: float) -
     costs = torch.cat([cost.costs(part).mean(1) for part in grid.split(256)])
     least = int(costs.argmin())
     return {
-        "model": model,
-        "recording": recording_name,
         "cost": float(costs[least]),
         **dict(zip(names, grid[least].tolist(), strict=True)),
         "lengths": axes["L"].tolist(),
