@@ -22,7 +22,7 @@ from nnode.calibrate.resampling import group_weights
 from nnode.data.paths import noise_variance
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
-from nnode.generate.noise import Noise, sample, takes_drivers
+from nnode.generate.noise import Noise, sample, sample_each, takes_drivers
 from nnode.model import System
 
 #: s; times of the noise at which motion is sampled, between which moments are interpolated.
@@ -124,13 +124,19 @@ def fit_noise(
             f"the noise needs {_WHO[system.domain]} that are measured for more than {least:g} s"
         )
 
-    def sampled(noise: Noise) -> _Sums:
+    def sampled(*noises: Noise) -> list[_Sums]:
         parts = [
-            sample(system, batch, noise, SAMPLES, seed=(seed, i), **options).x
-            - x.repeat(1, SAMPLES, 1, 1)
+            [
+                found.x - x.repeat(1, SAMPLES, 1, 1)
+                for found in sample_each(
+                    system, batch, list(noises), SAMPLES, seed=(seed, i), **options
+                )
+            ]
             for i, (batch, x) in enumerate(zip(batches, plain, strict=True))
         ]
-        return _sums(parts, batches, groups, lags, number)
+        return [
+            _sums(list(each), batches, groups, lags, number) for each in zip(*parts, strict=True)
+        ]
 
     every = np.ones(number)
     sigma, spread = _FIRST[system.order], _SPREAD if takes_drivers(system, batches[0]) else 0.0
@@ -138,8 +144,8 @@ def fit_noise(
     for _ in range(2):
         search = _Search(
             measured,
-            [sampled(Noise(sigma, tau)) for tau in TIMES],
-            sampled(Noise(0.0, 1.0, 0.0, spread)) if spread else None,
+            sampled(*(Noise(sigma, tau) for tau in TIMES)),
+            sampled(Noise(0.0, 1.0, 0.0, spread))[0] if spread else None,
             sigma,
             spread,
             _white(len(lags), error),
