@@ -270,13 +270,22 @@ class _Search:
         goal = np.log(np.maximum(self.measured.mean(weight), 1e-12))
         pushes = np.array([sums.mean(weight) for sums in self.pushes]) / self.unit**2
         at = PchipInterpolator(np.log(TIMES), np.log(pushes))
+        rise = at.derivative()
         others = 0.0 * goal
         if self.drivers is not None:
             others = self.drivers.mean(weight) / self.spread**2
 
+        def parts(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return np.exp(2 * p[0] + at(p[1])), np.exp(2 * p[2]) * others
+
         def moments(p: np.ndarray) -> np.ndarray:
-            found = np.exp(2 * p[0] + at(p[1])) + self.white + np.exp(2 * p[2]) * others
-            return np.asarray(found)
+            pushed, driven = parts(p)
+            return np.asarray(pushed + self.white + driven)
+
+        def slopes(p: np.ndarray) -> np.ndarray:
+            pushed, driven = parts(p)
+            columns = [2 * pushed, rise(p[1]) * pushed, 2 * driven]
+            return np.stack(columns, -1) / (pushed + self.white + driven)[:, None]
 
         low, high = np.log(TIMES[[0, -1]])
         best = None
@@ -285,6 +294,7 @@ class _Search:
             found = least_squares(
                 lambda p: np.log(moments(p)) - goal,
                 [size, start, np.log(0.05)],
+                slopes,
                 x_scale="jac",
                 bounds=([-20.0, low, -20.0], [20.0, high, 0.0]),
             )
