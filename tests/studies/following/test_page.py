@@ -15,6 +15,7 @@ from studies.following.candidates import EVERY, key
 from studies.following.data import LEADERS, PAIRS, PLATOONS
 from studies.following.fit import OBJECTIVES, named
 from studies.following.results import Study
+from studies.following.study import after, training
 from studies.options import FollowingStudyOptions
 from studies.page import page
 from tests.studies.following.test_fit import driven
@@ -154,3 +155,11 @@ def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
     assert list(ends.index[ends > 0]) == ["T", "a", "b"]
     paths = write_page(blocks, tmp_path, title="Car following")
     assert all(path.stat().st_size for path in paths)
+
+
+def test_every_task_has_a_key_of_its_own(study: Study) -> None:
+    first, rest = training(study.options, study.stores), after(study)
+    assert {task.key for task in first} == {f"cv-{key(name)}" for name in EVERY}
+    keys = [task.key for task in (*first, *rest)]
+    assert len(set(keys)) == len(keys)
+    assert {"precision-idm", "precision-idm-memory"} < set(keys)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from nnode.app.python.inputs import data_options
@@ -12,7 +13,7 @@ from nnode.data.prepare import prepare
 from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from nnode.model.build import build_model
-from studies.prediction import printed, tasks
+from studies.prediction import printed, study, tasks
 from studies.prediction.data import AHEAD, SCENES, SEEN, events, scene
 from studies.walking import tasks as walking
 from studies.walking.data import chosen
@@ -73,3 +74,27 @@ def test_the_configurations_are_those_of_the_study(real_data: Path) -> None:
         chosen = ("columns", "time_unit", "frame_rate", "velocity", "history", "t_seq")
         for key in (key for key in chosen if hasattr(own, key)):
             assert getattr(shipped, key) == pytest.approx(getattr(own, key)), key
+
+
+def test_tables_of_errors() -> None:
+    sums = {"error": [1.0, 9.0], "spacing": [100.0, 100.0]}
+    run = {"people": 4, "ade": 0.5, "fde": 1.0}
+    found = pd.DataFrame(
+        [
+            {"task": "follow", "law": "idm", "row": {"T": 1.5}, "train": sums, "test": sums},
+            {"task": "baselines", **{name: {"eth_univ": run} for name in study.SIMPLE}},
+            {"task": "fit", "law": "alone", "errors": {"eth_univ": {**run, "ade": 0.25}}},
+        ]
+    )
+    table = study._following(found, 0)
+    assert table.loc["idm", "test"] == pytest.approx(np.sqrt(10 / 200))
+    assert table.loc["idm", "low"] < table.loc["idm", "test"] < table.loc["idm", "high"]
+    assert table.loc["idm", "parameters"] == "T = 1.5"
+    assert list(table.index[1:]) == ["idm, published", "learned, published"]
+    ade = study._by_scene(study._distances(found), "ade")["eth_univ"]
+    assert ade.to_dict() == {
+        "constant velocity": 0.5,
+        "mean speed with the stream": 0.5,
+        "no interaction": 0.25,
+        "constant velocity, published": printed.CONSTANT_VELOCITY["eth_univ"][0],
+    }
