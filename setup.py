@@ -28,7 +28,7 @@ if __name__ == "__main__":
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     setup(
-        packages=[*find_packages(include=["nnode*"]), "nnode.conf"],
+        packages=[*find_packages(include=["nnode*", "studies*"]), "nnode.conf"],
         package_dir={"nnode.conf": "conf"},
         long_description=described(readme, project["urls"].get("Repository")),
         long_description_content_type="text/markdown",

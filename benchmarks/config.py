@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 
 from hydra.core.config_store import ConfigStore
 
@@ -104,8 +105,9 @@ SCHEMAS = {
 }
 
 
+@cache
 def register() -> None:
-    """Make all schemas known to Hydra, those of nnode too; harmless when repeated."""
+    """Make all schemas known to Hydra, those of nnode too, once in a process."""
     config.register()
     store = ConfigStore.instance()
     for name, node in SCHEMAS.items():

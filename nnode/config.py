@@ -7,6 +7,7 @@ is refused before any work starts.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -15,7 +16,6 @@ from omegaconf import MISSING, OmegaConf
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
-    ConsensusOptions,
     GaussNewtonOptions,
     LbfgsOptions,
 )
@@ -47,7 +47,7 @@ from nnode.model.options import (
     SocialForceOptions,
 )
 from nnode.program import configuration
-from nnode.study.options import (
+from studies.options import (
     CrowdStudyOptions,
     FollowingStudyOptions,
     PredictionStudyOptions,
@@ -203,7 +203,6 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("optimizer", "adadelta_schema"): AdadeltaOptions,
     ("optimizer", "adam_schema"): AdamOptions,
     ("optimizer", "lbfgs_schema"): LbfgsOptions,
-    ("optimizer", "cbo_schema"): ConsensusOptions,
     ("optimizer", "gauss_newton_schema"): GaussNewtonOptions,
     ("study", "traffic_study_schema"): TrafficStudyOptions,
     ("study", "crowd_study_schema"): CrowdStudyOptions,
@@ -220,8 +219,9 @@ def choices(group: str) -> list[str]:
     return sorted(files | {n for own, n in SCHEMAS if own == group and not n.endswith("_schema")})
 
 
+@cache
 def register() -> None:
-    """Make all schemas known to Hydra; harmless when repeated."""
+    """Make all schemas known to Hydra, once in a process."""
     store = ConfigStore.instance()
     for (group, name), schema in SCHEMAS.items():
         node = OmegaConf.structured(schema)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("nnode", "conf", "setup.py", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("nnode", "studies", "conf", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -17,7 +17,7 @@ from benchmarks.torture.child import Child
 from nnode import progress
 from nnode.calibrate.progress import Reporter
 from nnode.progress import Stages
-from nnode.study.progress import TaskProgress
+from studies.progress import TaskProgress
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 
 from benchmarks.discovery.task import sources
 from benchmarks.truths.arms import first_seed
-from nnode.study.runner import Task, run_tasks
+from studies.runner import Task, run_tasks
 
 #: Samples' distance and Euler's steps, s; time before the first sample, s; vehicles, platoons.
 DT, STEP, BEFORE, VEHICLES, FIRST = 0.2, 0.02, 30.0, 5, 40

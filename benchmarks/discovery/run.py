@@ -17,8 +17,8 @@ from benchmarks.truths.arms import cases, first_seed, hides
 from nnode.errors import ConfigError
 from nnode.machine import cores
 from nnode.pages.page import write_page
-from nnode.study.cluster import on_cluster
-from nnode.study.runner import kept_results, run_tasks
+from studies.cluster import on_cluster
+from studies.runner import kept_results, run_tasks
 
 #: The arm that needs many cases: it shows how often something is named where nothing is hidden.
 _NOTHING = "nothing"

@@ -19,7 +19,7 @@ from benchmarks.discovery.task import diagnose_case, sources
 from benchmarks.truths.arms import cases, first_seed
 from benchmarks.truths.score import UNKNOWN
 from nnode.discover.rules import Rules
-from nnode.study.runner import Task, run_tasks
+from studies.runner import Task, run_tasks
 
 
 def settings() -> Iterator[tuple[str, dict[str, float]]]:

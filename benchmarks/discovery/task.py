@@ -13,7 +13,7 @@ import nnode
 from benchmarks.truths import TABLE, WALLS, Case, generate
 from benchmarks.truths.score import score
 from nnode.errors import NNodeError
-from nnode.study.runner import Task
+from studies.runner import Task
 
 #: Base models by their name in the truth: the term that is calibrated.
 TERMS = {"lin": "lin", "log": "log", "sf": "social_force"}

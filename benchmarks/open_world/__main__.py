@@ -13,7 +13,7 @@ from benchmarks.discovery.task import sources
 from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.page import write
 from benchmarks.truths.arms import first_seed
-from nnode.study.runner import Task, run_tasks
+from studies.runner import Task, run_tasks
 
 
 def main() -> None:

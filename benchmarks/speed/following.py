@@ -6,7 +6,7 @@ Examples:
 
 Both minimise the mean root mean square error of the gap over the same pairs within the published
 bounds, in the same compiled simulator with one thread. Differential evolution is SciPy's with the
-settings of the replication package (:mod:`nnode.study.following.printed`).
+settings of the replication package (:mod:`studies.following.printed`).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from scipy.optimize import differential_evolution
 
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.files import write_json
-from nnode.study.following import data, printed
-from nnode.study.following.candidates import EVERY
-from nnode.study.following.fit import costs_of
-from nnode.study.options import FollowingStudyOptions
+from studies.following import data, printed
+from studies.following.candidates import EVERY
+from studies.following.fit import costs_of
+from studies.options import FollowingStudyOptions
 
 
 def timed(call: Callable[[], Any]) -> tuple[Any, dict[str, float]]:

@@ -19,8 +19,8 @@ from nnode.data.prepare import prepare
 from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import traffic_recording
 from nnode.pages.page import Block, TableBlock
-from nnode.study.runner import Task, run_tasks
-from nnode.study.traffic.tasks import fit, scan
+from studies.runner import Task, run_tasks
+from studies.traffic.tasks import fit, scan
 
 #: Names of entries that tell how long something took, or when.
 _CLOCKS = ("seconds", "time taken", "laps")
@@ -260,7 +260,7 @@ def _resumed(source: str) -> Callable[[Path], list[str] | None]:
 
 
 def _small_study(raw: Path) -> None:
-    from nnode.app import study
+    from studies import command as study
 
     def small(name: str) -> Any:
         return Small(raw)
@@ -306,9 +306,10 @@ def load_libraries() -> None:
     import torch.utils.tensorboard
 
     from benchmarks.discovery import run  # noqa: F401
-    from nnode.app import discover, prepare, study, train  # noqa: F401
+    from nnode.app import discover, prepare, train  # noqa: F401
     from nnode.discover import diagnose  # noqa: F401
     from nnode.discover.report import page  # noqa: F401
     from nnode.simulation import fused  # noqa: F401
+    from studies import command  # noqa: F401
 
     torch.set_num_threads(1)

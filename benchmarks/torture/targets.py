@@ -37,7 +37,7 @@ from nnode.data.store import MANIFEST, TABLE, Store, write_store
 from nnode.model import Traffic, build_model
 from nnode.model.laws import law_from
 from nnode.simulation.kernels import source
-from nnode.study.runner import KEPT, Task, run_tasks
+from studies.runner import KEPT, Task, run_tasks
 
 Damage = Callable[[bytes, random.Random], bytes]
 

@@ -121,8 +121,8 @@ def sentence(found: Examination) -> str:
     wrong = f"{errors} error{'s' * (errors != 1)}, {looks} thing{'s' * (looks != 1)} to look at"
     who = "people" if found.scale.domain == "crowd" else "vehicles"
     return (
-        f"{len(set(found.tracks.agent.tolist()))} {who}, {len(found.tracks)} positions, sampled "
-        f"every {found.tracks.dt:.4g} s: {wrong}."
+        f"{len(set(found.rows.agent.tolist()))} {who}, {len(found.rows)} positions, sampled "
+        f"every {found.rows.dt:.4g} s: {wrong}."
     )
 
 
@@ -197,7 +197,7 @@ def python_lines(found: Examination) -> list[str]:
 def _units(found: Examination) -> str:
     scale = found.scale
     clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
-    speeds = f", speeds in {scale.speed}" if found.tracks.speed is not None else ""
+    speeds = f", speeds in {scale.speed}" if found.rows.v is not None else ""
     return f"{scale.domain}, positions in {scale.position}, times in {clock}{speeds}"
 
 
@@ -335,17 +335,17 @@ def _figures(found: Examination) -> list[Block]:
     from nnode.plots import check as plots  # loads Matplotlib, which takes a second
     from nnode.plots.quality import faults_figure
 
-    tracks, domain = found.tracks, found.scale.domain
+    rows, domain = found.rows, found.scale.domain
     shown: list[Block] = [
         FigureBlock(
             "speeds",
-            plots.speeds(tracks, USUAL[domain]["speed"]),
+            plots.speeds(rows, USUAL[domain]["speed"]),
             "Speeds over ten samples, and steps in time. Shaded: what is usual.",
             "Histograms of speeds in m/s and of sampling steps in s.",
         ),
         FigureBlock(
             "presence",
-            plots.presence(tracks, domain),
+            plots.presence(rows, domain),
             "Above, where agents are over time, of many a part; below, how many there are.",
             "Paths over time, and the number of agents over time.",
         ),

@@ -16,6 +16,7 @@ from nnode.app.export import checkpoint_of
 from nnode.app.python.inputs import Table, data_used
 from nnode.app.training import set_threads, started, threads_given_back
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.resampling import paired
 from nnode.data.clusters import clusters
 from nnode.data.dataset import Source
 from nnode.data.options import DataOptions
@@ -27,7 +28,6 @@ from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free
 from nnode.generate.scores import LEAST
 from nnode.generate.simulated import Sampling, Simulated, Way, batches
-from nnode.study.statistics import paired
 
 #: At most so many training sequences, drawn by the seed, tell the noise.
 FITTED = 200

@@ -222,16 +222,6 @@ def _collate_share(sequences: list[Sequence]) -> Batch | None:
     return collate(sequences) if sequences else None
 
 
-def load_all(store: Store, indices: Iterable[int] | None = None) -> Batch:
-    """All sequences, or those at ``indices``, as one batch in memory.
-
-    Raises:
-        DataError: no sequence, a position that the store does not have, or sequences that do
-            not fit into one batch.
-    """
-    return collate(store[i] for i in _positions(store, indices))
-
-
 def _positions(store: Source, indices: Iterable[int] | None) -> ListLike[int]:
     if indices is None:
         return range(len(store))

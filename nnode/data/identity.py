@@ -30,8 +30,8 @@ from nnode.data.options import Agents
 from nnode.data.quality import LIMITS
 from nnode.data.sequence import Domain, Sequence
 
-#: Greatest number of a sampling time that adds up without rounding.
-_LATEST = 2.0**52
+#: Sampling times are counted up to this number: it is exact, and adding to it as well.
+LATEST = 2.0**52
 
 
 def numbered(name: str, number: int, taken: frozenset[str] | set[str] = frozenset()) -> str:
@@ -67,30 +67,24 @@ def identify(
             recordings[s.recording].append(i)
     for recording, places in recordings.items():
         own = [sequences[i] for i in places]
-        found = _by_sequence(own) if mode is Agents.sequence else _judged(own, domain)
+        found: _Numbers | None
+        if mode is Agents.sequence:
+            found = _counted(own, range(len(own))), "identifiers belong to their sequence"
+        else:
+            found = _judged(own, domain)
         if found is None:
             continue
-        notes.append(f"{recording}: {found.why}")
+        notes.append(f"{recording}: {found[1]}")
         taken = {name for s in own for name in s.agents}
-        for i, s, numbers in zip(places, own, found.numbers, strict=True):
+        for i, s, numbers in zip(places, own, found[0], strict=True):
             named[i] = tuple(
                 numbered(name, n, taken) for name, n in zip(s.agents, numbers, strict=True)
             )
     return named, notes
 
 
-@dataclass
-class _Found:
-    """Per sequence and agent the number of the agent among those of its name, and the reason."""
-
-    numbers: list[list[int]]
-    why: str
-
-
-def _by_sequence(sequences: list[Sequence]) -> _Found:
-    return _Found(
-        _counted(sequences, range(len(sequences))), "identifiers belong to their sequence"
-    )
+#: Per sequence and agent the number of the agent among those of its name, and the reason.
+_Numbers = tuple[list[list[int]], str]
 
 
 def _counted(sequences: list[Sequence], worlds: Iterable[int]) -> list[list[int]]:
@@ -102,7 +96,7 @@ def _counted(sequences: list[Sequence], worlds: Iterable[int]) -> list[list[int]
     ]
 
 
-def _judged(sequences: list[Sequence], domain: Domain) -> _Found | None:
+def _judged(sequences: list[Sequence], domain: Domain) -> _Numbers | None:
     error = LIMITS[domain].noise
     tracks = _tracks(sequences)
     near, far = _neighbours(tracks, error)
@@ -122,7 +116,7 @@ def _judged(sequences: list[Sequence], domain: Domain) -> _Found | None:
     i, j = apart
     name = min(name for name, met in _met(tracks, apart, error).items() if not met)
     whose = "their sequence" if count == n else f"one of {count} runs of sequences that carry on"
-    return _Found(
+    return (
         _counted(sequences, worlds),
         f"identifiers belong to {whose}, because {sequences[i].name} and {sequences[j].name} "
         f"have the same times and identifiers (such as {name}) at different places",
@@ -155,7 +149,7 @@ def _tracks(sequences: list[Sequence]) -> list[_Track | None]:
 def _track(s: Sequence, step: float) -> _Track | None:
     if s.n_samples < 2 or not (step > 0 and np.isclose(s.dt, step, rtol=1e-2)):
         return None
-    if not abs(s.time).max() < _LATEST * step:
+    if not abs(s.time).max() < LATEST * step:
         return None
     first = int(np.ceil(s.time[0] / step - 1e-6))
     last = max(int(np.floor(s.time[-1] / step + 1e-6)), first)
@@ -228,7 +222,7 @@ def _met(tracks: list[_Track | None], pair: tuple[int, int], error: float) -> di
     return found
 
 
-def _used_again(sequences: list[Sequence], domain: Domain) -> _Found | None:
+def _used_again(sequences: list[Sequence], domain: Domain) -> _Numbers | None:
     """Identifiers that turn up where their agent cannot have got to, on one clock."""
     stays: dict[str, list[tuple[int, int]]] = defaultdict(list)
     for i in np.argsort([s.time[0] for s in sequences], kind="stable"):
@@ -259,7 +253,7 @@ def _used_again(sequences: list[Sequence], domain: Domain) -> _Found | None:
             numbers[i][n] = count
     name, number = min(new)
     i = stays[name][number][0]
-    return _Found(
+    return (
         numbers,
         f"{len({name for name, _ in new})} identifiers are used again for another agent, who "
         f"cannot have come from where the one before was (such as {name}, another one from "

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nnode.data.options import Faults
-from nnode.data.quality import Fault, usable
+from nnode.data.quality import Fault, by_kind, usable
 from nnode.data.sequence import Sequence
 from nnode.errors import DataError, FaultError
 
@@ -58,7 +58,8 @@ def apply_policy(
         lines = [f"  {f.sequence}: {f.kind}: {f.detail}" for f in found[:LISTED]]
         more = [f"  ... and {len(found) - LISTED} more"] if len(found) > LISTED else []
         raise FaultError(
-            f"{len(faulty)} of {len(sequences)} sequences hold faults ({_counts(faulty, faults)}); "
+            f"{len(faulty)} of {len(sequences)} sequences hold faults "
+            f"({_listed(_counts(faulty, faults))}); "
             "data.faults=error refuses them, data.faults=drop leaves them out, data.faults=keep "
             "keeps them:\n" + "\n".join(lines + more)
         )
@@ -78,7 +79,7 @@ def apply_policy(
     ]
     if not kept:
         raise DataError(
-            f"nothing is left of {len(sequences)} sequences: {_counts(faulty, faults)}; "
+            f"nothing is left of {len(sequences)} sequences: {_listed(_counts(faulty, faults))}; "
             + _advice(faulty, faults, keep)
         )
     return kept, dropped
@@ -103,8 +104,7 @@ def without(
             f"({listed}; first {left_out[0]['name']})"
         )
     if dropped:
-        kinds = Counter(kind for d in dropped for kind in {r["kind"] for r in d["reasons"]})
-        listed = ", ".join(f"{kind} in {n}" for kind, n in kinds.most_common())
+        listed = _listed(by_kind([r["kind"] for r in d["reasons"]] for d in dropped))
         told.append(
             f"{len(dropped)} of {len(read)} sequences are left out for their faults: {listed}"
         )
@@ -133,15 +133,12 @@ def told_filled(filled: list[dict[str, Any]]) -> str:
     )
 
 
-def _counts(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> str:
-    counts = _by_kind(sequences, faults)
+def _counts(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> dict[str, int]:
+    return by_kind([fault.kind for fault in faults[s.name]] for s in sequences)
+
+
+def _listed(counts: dict[str, int]) -> str:
     return ", ".join(f"{kind} in {n}" for kind, n in counts.items()) or "no sequence at all"
-
-
-def _by_kind(sequences: list[Sequence], faults: dict[str, list[Fault]]) -> dict[str, int]:
-    """Number of sequences with each kind of fault, the most frequent first."""
-    kinds = Counter(kind for s in sequences for kind in {f.kind for f in faults[s.name]})
-    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
 
 
 def by_recording(
@@ -157,6 +154,6 @@ def by_recording(
             "read": len(own),
             "kept": n_kept,
             "dropped": len(own) - n_kept,
-            "faulty": _by_kind(own, faults),
+            "faulty": _counts(own, faults),
         }
     return table

@@ -34,7 +34,6 @@ from nnode.data.options import (
     TableOptions,
     VehicleTableOptions,
     WalkwayOptions,
-    positive,
     with_present_names,
 )
 from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
@@ -53,7 +52,7 @@ from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, read_table, table_files
 from nnode.data.readers.vehicles import read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence, check_interval
-from nnode.data.smooth import measured_noise, smoothed, start_smoothed
+from nnode.data.smooth import measured_noise, start_smoothed
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError, DataError
 from nnode.files import file_name
@@ -82,9 +81,9 @@ Draw = Callable[[list[Sequence], dict[str, list[Fault]], Domain, Path], Any]
 class Format:
     """A raw format: which files it needs, and how they become sequences."""
 
-    files: Callable[[Any], _Files]
+    files: Callable[..., _Files]
     read: Callable[[_Files, Any], list[Sequence]]
-    smooths: bool = True  # whether the reader applies ``data.smooth`` itself, before it cuts
+    tables: bool = False  # whether ``files`` takes a table in memory as well
 
     def sequences(self, files: _Files, options: Any) -> list[Sequence]:
         """Read the files.
@@ -115,19 +114,22 @@ def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any]
 
 #: The format that each kind of options stands for; a new format is one more entry.
 FORMATS: dict[type[DataOptions], Format] = {
-    EsimasOptions: Format(esimas_files, _each(read_esimas), smooths=False),
-    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles)),
+    EsimasOptions: Format(esimas_files, _each(read_esimas)),
+    VehicleTableOptions: Format(vehicle_files, _each(read_vehicles), tables=True),
     NgsimOptions: Format(vehicle_files, _each(read_ngsim)),
     JuelichOptions: Format(juelich_files, _each(read_juelich)),
     TableOptions: Format(
-        table_files, lambda files, options: read_table(files[TIDY], options, files.get(WALLS))
+        table_files,
+        lambda files, options: read_table(files[TIDY], options, files.get(WALLS)),
+        tables=True,
     ),
     WalkwayOptions: Format(
         walkway_files,
         lambda files, options: read_walkway(files[PEOPLE], options, files.get(GEOMETRY)),
+        tables=True,
     ),
-    PairOptions: Format(pair_files, read_pairs),
-    OpenAccOptions: Format(openacc_files, read_openacc, smooths=False),
+    PairOptions: Format(pair_files, read_pairs, tables=True),
+    OpenAccOptions: Format(openacc_files, read_openacc),
     SumoOptions: Format(sumo_files, _each(read_sumo)),
     HighDOptions: Format(highd_files, read_highd),
 }
@@ -206,9 +208,6 @@ def judge(
     domain = _domain(options, read)
     read = read if isinstance(read, Reading) else Reading(read)
     _plausible(options, read)
-    if options.smooth is not None and not FORMATS[type(options)].smooths:
-        positive("smooth", options.smooth)
-        read[:] = [smoothed(s, options.smooth) for s in read]
     noise = measured_noise(read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
     faults = {}

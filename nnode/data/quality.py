@@ -8,7 +8,8 @@ condemn noise. And what a fault means for a calibration: see the ``faults`` opti
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequence import UNEVEN, Domain, Sequence
 
 #: Every kind of fault, with what it means.
 KINDS: dict[str, str] = {
@@ -84,14 +85,11 @@ class Limits:
             Beyond it a step back is a jump.
         noise: m, an error that a single position may have without being a fault: 0.5 for a
             vehicle in a road camera's image, 0.1 for a head seen from above.
-        scatter: what a displacement's error may be in standard deviations, as these are seen in
-            the sequence itself; 0 where paths are too short or too coarse to tell.
         spacing: m. Fronts of consecutive vehicles in one lane: 2, as no car is shorter.
             Centres of two people: 0.1, half the breadth of a head.
         reach: m within which a position continues a path extrapolated at constant velocity:
             5, a car's length, or 0.4, a person's depth. Decides between swap and jump.
         min_agents, min_samples: needed for an interaction and for an acceleration.
-        uneven: share of the sampling interval by which a time step may deviate.
     """
 
     max_speed: float
@@ -101,8 +99,6 @@ class Limits:
     reach: float
     min_agents: int
     min_samples: int = 3
-    uneven: float = 0.01
-    scatter: float = 0.0
 
 
 #: Limits by domain.
@@ -117,7 +113,6 @@ LIMITS: dict[Domain, Limits] = {
         spacing=0.1,
         reach=0.4,
         min_agents=1,
-        scatter=4.0,
     ),
 }
 
@@ -128,13 +123,12 @@ def find_faults(sequence: Sequence, domain: Domain, noise: float = 0.0) -> list[
     NaN means that an agent has no position at that time.
 
     Args:
-        noise: m, standard deviation of the noise of vehicles' positions where it is known: a step
-            holds that of two positions, and is no fault up to NOISY times its deviation.
+        noise: m, standard deviation of the noise of positions where it is known: a step holds that
+            of two positions, and is no fault up to NOISY times its deviation.
     """
     limits = LIMITS[domain]
-    if domain == "traffic":
-        error = max(limits.noise, NOISY * np.sqrt(2) * np.nan_to_num(noise))
-        limits = replace(limits, noise=float(error))
+    error = max(limits.noise, NOISY * np.sqrt(2) * np.nan_to_num(noise))
+    limits = replace(limits, noise=float(error))
     view = _View(sequence, domain, limits)
     found = [*_short(view), *_times(view), *_values(view), *_duplicates(view)]
     if sequence.n_samples and sequence.n_agents:
@@ -147,6 +141,16 @@ def find_faults(sequence: Sequence, domain: Domain, noise: float = 0.0) -> list[
 def usable(sequence: Sequence, faults: list[Fault]) -> bool:
     """Whether a sequence can be simulated at all, whatever its faults."""
     return sequence.n_samples > 1 and not any(fault.kind in UNUSABLE for fault in faults)
+
+
+def by_kind(found: Iterable[Iterable[str]]) -> dict[str, int]:
+    """Number of sequences with each kind of fault, the most frequent first.
+
+    Args:
+        found: the kinds of the faults of every sequence.
+    """
+    kinds = Counter(kind for own in found for kind in set(own))
+    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
 
 
 class _View:
@@ -185,6 +189,12 @@ class _View:
         return ", ".join(f"{value:.1f}" for value in self.sequence.x[k, i])
 
 
+def _samples(mask: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Columns of ``(K, N)`` in which something holds, each with the samples at which it does."""
+    for i in map(int, np.flatnonzero(mask.any(axis=0))):
+        yield i, np.flatnonzero(mask[:, i])
+
+
 def _short(view: _View) -> Iterator[Fault]:
     limits, s = view.limits, view.sequence
     if s.n_samples < limits.min_samples:
@@ -200,7 +210,7 @@ def _times(view: _View) -> Iterator[Fault]:
     if not np.isfinite(view.time).all():
         yield view.fault("non_finite", (), None, "a sampling time is no number")
         return
-    uneven = np.flatnonzero(~(np.abs(steps - view.dt) <= view.limits.uneven * abs(view.dt)))
+    uneven = np.flatnonzero(~(np.abs(steps - view.dt) <= UNEVEN * abs(view.dt)))
     if uneven.size or (steps.size and view.dt <= 0):
         k = int(uneven[0]) if uneven.size else 0
         text = f"a step of {steps[k]:g} s among steps of {view.dt:g} s"
@@ -215,8 +225,7 @@ def _values(view: _View) -> Iterator[Fault]:
         (absent, "gap_in_time", "has no position"),
         (broken, "non_finite", "has a position that is no number"),
     ):
-        for i in map(int, np.flatnonzero(mask.any(axis=0))):
-            k = np.flatnonzero(mask[:, i])
+        for i, k in _samples(mask):
             span = f"{view.time[k[0]]:g}-{view.time[k[-1]]:g} s"
             text = f"{view.who(i)} {what} at {len(k)} of {len(x)} samples ({span})"
             yield view.fault(kind, (i,), int(k[0]), text)
@@ -242,8 +251,7 @@ def _duplicates(view: _View) -> Iterator[Fault]:
 
 
 def _zero_rows(view: _View) -> Iterator[Fault]:
-    for i in map(int, np.flatnonzero(view.zero.any(axis=0))):
-        k = np.flatnonzero(view.zero[:, i])
+    for i, k in _samples(view.zero):
         text = f"{view.who(i)} is at exactly zero at {len(k)} of {len(view.x)} samples"
         yield view.fault("zero_row", (i,), int(k[0]), text)
 
@@ -253,8 +261,7 @@ def _displacements(view: _View) -> Iterator[Fault]:
     limits, x = view.limits, view.x
     step = np.diff(x, axis=0)
     size = np.linalg.norm(step, axis=2)
-    error = max(limits.noise, limits.scatter * np.sqrt(2) * _scatter(x))
-    far = size > limits.max_speed * view.dt + error
+    far = size > limits.max_speed * view.dt + limits.noise
     back = np.zeros_like(far)
     if view.domain == "traffic":
         far |= step[:, :, 0] < -(limits.max_reverse * view.dt + limits.noise)
@@ -278,15 +285,6 @@ def _displacements(view: _View) -> Iterator[Fault]:
                 )
                 kind = "jump" if far[k, i] else "backward"
                 yield view.fault(kind, (i,), k + 1, text)
-
-
-def _scatter(x: np.ndarray) -> float:
-    """Standard deviation of the errors of positions (m), by third differences: people's paths are
-    smooth, and some faults do not move a median."""
-    third = np.abs(np.diff(x, 3, axis=0))
-    third = third[np.isfinite(third)]
-    # 0.6745: median of a standard normal variable's size; 20: sum of 1, 3, 3, 1 squared
-    return float(np.median(third) / 0.6745 / np.sqrt(20)) if third.size else 0.0
 
 
 def _expected(sound: np.ndarray, k: int) -> np.ndarray:
@@ -358,11 +356,10 @@ def _order(view: _View, found: list[Fault]) -> Iterator[Fault]:
     """Neighbours in the lane that are not in the order of their positions."""
     gap = np.diff(view.x[:, :, 0], axis=1)
     swapped = [set(f.agents) for f in found if f.kind == "identity_swap"]
-    for i in map(int, np.flatnonzero((gap < 0).any(axis=0))):
+    for i, k in _samples(gap < 0):
         # After a swap the wrong order is its consequence, not another fault.
         if any({i, i + 1} <= agents for agents in swapped):
             continue
-        k = np.flatnonzero(gap[:, i] < 0)
         text = (
             f"{view.who(i)} is up to {-np.nanmin(gap[:, i]):.1f} m ahead of {view.who(i + 1)}, "
             f"its leader, at {len(k)} of {len(view.x)} samples"
@@ -378,8 +375,7 @@ def _bumpers(view: _View) -> Iterator[Fault]:
     gap, length = np.diff(view.x[:, :, 0], axis=1), view.sequence.length[1:]
     # fronts that are nearer, or in the wrong order, are another fault
     inside = (gap >= limits.spacing) & (length - gap > limits.noise)
-    for i in map(int, np.flatnonzero(inside.any(axis=0))):
-        k = np.flatnonzero(inside[:, i])
+    for i, k in _samples(inside):
         text = (
             f"the front of {view.who(i)} is {gap[k, i].min():.2f} m behind that of "
             f"{view.who(i + 1)}, which is {length[i]:.2f} m long, at {len(k)} of {len(view.x)} "

@@ -23,6 +23,8 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: microseconds, nanoseconds, and, below it, days.
 SHORTEST, LONGEST = 1e-3, 10.0
 
+#: Share of the sampling interval by which a time may miss equal steps.
+UNEVEN = 0.01
 #: Distance (m) between the padding vehicles that stand in front of a shorter platoon.
 PADDING_GAP = 1e5
 #: Fields of a batch that are positions. They stay in float64: numbers of float32 are 0.5 m apart

@@ -16,21 +16,13 @@ import pandas as pd
 from platformdirs import user_cache_path
 
 from nnode.data._arrow import to_table
-from nnode.data.check.recognise import Recognised, recognised
+from nnode.data.check.recognise import recognised
+from nnode.data.check.source import Recognised
 from nnode.data.clusters import clusters, index_of
-from nnode.data.options import (
-    DataOptions,
-    LaneOptions,
-    PairOptions,
-    TableOptions,
-    VehicleTableOptions,
-    WalkwayOptions,
-)
+from nnode.data.options import DataOptions, LaneOptions
 from nnode.data.prepare import FORMATS, judge
 from nnode.data.readers.columns import Table
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE
-from nnode.data.readers.recordings import reading, table_path
-from nnode.data.readers.table import TABLE, WALLS
+from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence, check_interval
 from nnode.errors import ConfigError, DataError
 
@@ -263,21 +255,11 @@ def _files(options: DataOptions, frame: pd.DataFrame | Table | None) -> dict[str
     if frame is None:
         cache = str(user_cache_path("nnode") / "raw")
         return FORMATS[type(options)].files(replace(options, download=options.download or cache))
-    table = frame if isinstance(frame, Table) else Table(frame)
-    if isinstance(options, TableOptions):
-        walls = options.walls
-        return {TABLE: table} | (
-            {} if walls is None else {WALLS: table_path(options, "walls", walls)}
-        )
-    if type(options) is VehicleTableOptions or isinstance(options, PairOptions):
-        return {table.path.stem: table}
-    if isinstance(options, WalkwayOptions):
-        geometry = options.geometry
-        return {PEOPLE: table} | (
-            {} if geometry is None else {GEOMETRY: table_path(options, "geometry", geometry)}
-        )
-    kind = "lanes of another program" if isinstance(options, LaneOptions) else "files"
+    kind = FORMATS[type(options)]
+    if kind.tables:
+        return kind.files(options, frame if isinstance(frame, Table) else Table(frame))
+    lanes = "lanes of another program" if isinstance(options, LaneOptions) else "files"
     raise ConfigError(
-        f"data={options.name} are {kind} and no data frame; give their path, or rename the columns "
-        "and take data='table', 'pairs' or 'vehicles'"
+        f"data={options.name} are {lanes} and no data frame; give their path, or rename the "
+        "columns and take data='table', 'pairs' or 'vehicles'"
     )

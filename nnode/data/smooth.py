@@ -145,25 +145,6 @@ def smooth_speeds(sequence: Sequence, window: float) -> Sequence:
     return start_smoothed(replace(sequence, v=v))
 
 
-def smoothed(sequence: Sequence, window: float) -> Sequence:
-    """A sequence with the positions and speeds of local cubics, see :func:`smooth`.
-
-    One whose times are uneven or that has holes stays as it is: it is faulty.
-    """
-    steps = np.diff(sequence.time)
-    if (
-        not np.isfinite(sequence.x).all()
-        or (np.abs(steps - sequence.dt) > 0.01 * sequence.dt).any()
-    ):
-        return sequence
-    x, v = sequence.x.copy(), np.empty_like(sequence.x)
-    for n in range(sequence.n_agents):
-        for d in range(x.shape[2]):
-            x[:, n, d], v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], window)
-    # a vehicle that stands shall not roll back
-    return replace(sequence, x=x, v=np.maximum(v, 0.0) if x.shape[2] == 1 else v)
-
-
 def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarray:
     """Positions in the hole between samples ``i`` and ``i + 1``.
 

@@ -11,14 +11,16 @@ import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from nnode.data.identity import given_anew, numbered
+from nnode.data.identity import LATEST, given_anew, numbered
 from nnode.data.options import positive
+from nnode.data.sequence import UNEVEN
 from nnode.data.smooth import across, smooth
 from nnode.errors import DataError
 
@@ -26,10 +28,6 @@ log = logging.getLogger(__name__)
 
 #: A step longer than so many usual ones is a hole.
 HOLE = 1.5
-#: Share of the sampling interval by which a time may miss the grid without being interpolated.
-UNEVEN = 0.01
-#: Steps are counted up to this number: it is exact, and adding to it as well.
-LATEST = 2.0**52
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,13 +45,16 @@ class Trajectories:
         time: ``(R,)`` s.
         x: ``(R, D)`` m, along the lane (growing as vehicles drive on) or in the plane; NaN where
             a sample is missing.
-        v: ``(R, D)`` m/s, NaN where a sample is missing, or None.
+        v: ``(R, D)`` m/s, or ``(R, 1)`` of speeds whose direction is unknown; NaN where a sample is
+            missing; or None.
         recording: ``(R,)`` names, or None: all rows are of one.
         sequence: ``(R,)`` names of the sequences or pairs that the source is cut into, or None.
         lane: ``(R,)`` names, or None: there is one.
         length: ``(R,)`` m, NaN where unknown, or None.
         kind, group, split: ``(R,)`` names, or None.
         destination: ``(R, D)`` m, or None.
+        spacing: ``(R,)`` m from bumper to bumper to the vehicle in front, NaN where unknown, or
+            None.
     """
 
     path: Path
@@ -71,6 +72,7 @@ class Trajectories:
     group: np.ndarray | None = None
     split: np.ndarray | None = None
     destination: np.ndarray | None = None
+    spacing: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -78,22 +80,68 @@ class Trajectories:
     def at(self, rows: np.ndarray) -> Trajectories:
         """Some of the rows, by number."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        own: dict[str, Any] = {
+        chosen: dict[str, Any] = {
             name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)
         }
-        return replace(self, where=lambda i: self.where(int(rows[i])), **own)
+        return replace(self, where=lambda i: self.where(int(rows[i])), **chosen)
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """``(S,)`` s from each row of an agent to its next one in time."""
+        names = [n for n in ("recording", "sequence", "agent") if getattr(self, n) is not None]
+        columns = pd.DataFrame({n: getattr(self, n) for n in names})
+        code = columns.groupby(names, sort=False).ngroup().to_numpy()
+        order = np.lexsort((self.time, code))
+        return np.asarray(np.diff(self.time[order])[np.diff(code[order]) == 0])
+
+    @cached_property
+    def dt(self) -> float:
+        """The sampling interval (s) of agents' rows; NaN where no agent has two.
+
+        It is the mean of steps and of the parts of multiple ones, so that times which were rounded
+        do not drift; of uneven times it is rounded to two or three digits.
+        """
+        step = self.steps[self.steps > 0]
+        if not step.size:
+            return float("nan")
+        usual = float(np.median(step))
+        step = step[step < LATEST * usual]
+        number = np.maximum(np.round(step / usual), 1)
+        # whatever the order of rows
+        mean = math.fsum(step) / float(number.sum())
+        if (np.abs(step - number * usual) <= UNEVEN * usual).all():
+            return mean
+        short = float(f"{mean:.2g}")
+        return short if abs(short - mean) <= 2 * UNEVEN * mean else float(f"{mean:.3g}")
+
+    def in_order(self) -> Trajectories:
+        """The rows with an agent, a time and a position, in the order of agents and, of each, of
+        time; no time twice."""
+        code = pd.factorize(self.agent)[0]
+        usable = np.isfinite(self.time) & np.isfinite(self.x).all(axis=1) & (code >= 0)
+        order = np.flatnonzero(usable)
+        order = order[np.lexsort((self.time[order], code[order]))]
+        repeated = (np.diff(code[order]) == 0) & (np.diff(self.time[order]) == 0)
+        return self.at(np.delete(order, np.flatnonzero(repeated) + 1))
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(N,)`` first and last row of every agent of rows :meth:`in_order`."""
+        begins = np.ones(len(self), dtype=bool)
+        begins[1:] = self.agent[1:] != self.agent[:-1]
+        start = np.flatnonzero(begins)
+        return start, np.append(start[1:], len(self)) - 1
 
     def parts(self, *names: str) -> Iterator[tuple[tuple[str, ...], Trajectories]]:
         """The rows of every combination of names, such as ``recording``, in order of first rows."""
-        known = [column for name in names if (column := getattr(self, name)) is not None]
-        if not known:
+        given = [column for name in names if (column := getattr(self, name)) is not None]
+        if not given:
             yield tuple("" for _ in names), self
             return
-        groups = pd.DataFrame(dict(enumerate(known))).groupby(list(range(len(known))), sort=False)
+        groups = pd.DataFrame(dict(enumerate(given))).groupby(list(range(len(given))), sort=False)
         for rows in sorted(groups.indices.values(), key=min):
-            own = self.at(np.sort(rows))
-            columns = (getattr(own, name) for name in names)
-            yield tuple("" if column is None else str(column[0]) for column in columns), own
+            part = self.at(np.sort(rows))
+            columns = (getattr(part, name) for name in names)
+            yield tuple("" if column is None else str(column[0]) for column in columns), part
 
 
 @dataclass(frozen=True)
@@ -132,32 +180,16 @@ class Record:
         return self.first + len(self.x) - 1
 
 
-def usual_step(table: Trajectories) -> float:
-    """The sampling interval (s) of agents' rows; NaN where no agent has two.
+def driven(time: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """``(K,)`` m that are covered at the speeds ``v`` from the first time on.
 
-    It is the mean of steps and of the parts of multiple ones, so that times which were rounded do
-    not drift; of uneven times it is rounded to two or three digits.
+    The trapezium rule; over holes (NaN) by the line between their ends.
     """
-    names = [n for n in ("recording", "sequence", "agent") if getattr(table, n) is not None]
-    code = pd.DataFrame({n: getattr(table, n) for n in names}).groupby(names, sort=False).ngroup()
-    order = np.lexsort((table.time, code))
-    return usual_interval(np.diff(table.time[order])[np.diff(code.to_numpy()[order]) == 0])
-
-
-def usual_interval(step: np.ndarray) -> float:
-    """The sampling interval (s) that steps are multiples of, see :func:`usual_step`."""
-    step = step[step > 0]
-    if not step.size:
-        return float("nan")
-    usual = float(np.median(step))
-    step = step[step < LATEST * usual]
-    number = np.maximum(np.round(step / usual), 1)
-    # whatever the order of rows
-    mean = math.fsum(step) / float(number.sum())
-    if (np.abs(step - number * usual) <= UNEVEN * usual).all():
-        return mean
-    short = float(f"{mean:.2g}")
-    return short if abs(short - mean) <= 2 * UNEVEN * mean else float(f"{mean:.3g}")
+    measured = np.isfinite(v)
+    if not measured.any():
+        return np.zeros(len(v))
+    whole = np.interp(time, time[measured], v[measured])
+    return np.concatenate([[0.0], np.cumsum((whole[1:] + whole[:-1]) / 2 * np.diff(time))])
 
 
 def measured_times(table: Trajectories, grid: Grid, first: int, last: int) -> np.ndarray:
@@ -205,33 +237,34 @@ def records(
     code, ids = pd.factorize(table.agent, sort=True)
     order = np.lexsort((table.time, code))
     _once(table, order, code[order])
-    known = np.isfinite(table.x).all(axis=1)
+    # infinite ones are no holes, but a fault
+    measured = ~np.isnan(table.x).any(axis=1)
     if table.v is not None:
-        known &= np.isfinite(table.v).all(axis=1)
-    order = order[known[order]]
+        measured &= ~np.isnan(table.v).any(axis=1)
+    order = order[measured[order]]
     if not len(order):
         return []
-    time, x, own = table.time[order], table.x[order], code[order]
+    time, x, agent_code = table.time[order], table.x[order], code[order]
     v = None if table.v is None else table.v[order]
-    step, other = np.diff(time), np.diff(own) != 0
+    step, other = np.diff(time), np.diff(agent_code) != 0
     usual = float(np.median(step[~other])) if (~other).any() else grid.dt
     hole = ~other & (step > HOLE * usual) & (step - usual > fill + 1e-6)
     number = np.ones(len(order), dtype=int)
     if reused:
-        number = _numbers(ids[own], time, x[:, 0], other, hole, reused)
+        number = _numbers(ids[agent_code], time, x[:, 0], other, hole, reused)
     if smoothing is not None:
         positive("smooth", smoothing)
         x, v = _smoothed(time, x, other | hole, smoothing)
     ends = other | hole
     if table.lane is not None:
         ends |= table.lane[order][1:] != table.lane[order][:-1]
-    taken, found = set(map(str, ids)), []
+    taken, agent_records = set(map(str, ids)), []
     for rows in np.split(np.arange(len(order)), np.flatnonzero(ends) + 1):
-        agent = numbered(str(ids[own[rows[0]]]), int(number[rows[0]]), taken)
+        agent = numbered(str(ids[agent_code[rows[0]]]), int(number[rows[0]]), taken)
         made = _on_grid(time[rows], x[rows], None if v is None else v[rows], grid, usual)
         if made is not None:
-            found.append(Record(agent, int(order[rows[0]]), *made))
-    return found
+            agent_records.append(Record(agent, int(order[rows[0]]), *made))
+    return agent_records
 
 
 def _once(table: Trajectories, order: np.ndarray, code: np.ndarray) -> None:

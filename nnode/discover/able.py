@@ -24,7 +24,7 @@ from nnode.population.followers import behind_leaders
 #: does not know of. Above, smoothed leaders keep too much: at 5 Hz the share that drivers seem to
 #: look two vehicles ahead, where they do not, is 0.01, 0.03 and 0.08 at errors of 0.06, 0.15 and
 #: 0.3 m before the correction by simulation, and 0.2 is the least that matters.
-NOISE = (0.015, 0.25)
+NOISE = (0.015, 0.45)
 
 
 def check_effect(effect: type[Effect]) -> None:

@@ -18,12 +18,12 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from nnode.calibrate.resampling import group_weights
 from nnode.data.paths import noise_variance
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
-from nnode.generate.noise import Noise, sample, takes_drivers
+from nnode.generate.noise import Noise, sample, sample_each, takes_drivers
 from nnode.model import System
-from nnode.study.statistics import group_weights
 
 #: s; times of the noise at which motion is sampled, between which moments are interpolated.
 TIMES = np.geomspace(0.25, 128.0, 8)
@@ -124,13 +124,19 @@ def fit_noise(
             f"the noise needs {_WHO[system.domain]} that are measured for more than {least:g} s"
         )
 
-    def sampled(noise: Noise) -> _Sums:
+    def sampled(*noises: Noise) -> list[_Sums]:
         parts = [
-            sample(system, batch, noise, SAMPLES, seed=(seed, i), **options).x
-            - x.repeat(1, SAMPLES, 1, 1)
+            [
+                found.x - x.repeat(1, SAMPLES, 1, 1)
+                for found in sample_each(
+                    system, batch, list(noises), SAMPLES, seed=(seed, i), **options
+                )
+            ]
             for i, (batch, x) in enumerate(zip(batches, plain, strict=True))
         ]
-        return _sums(parts, batches, groups, lags, number)
+        return [
+            _sums(list(each), batches, groups, lags, number) for each in zip(*parts, strict=True)
+        ]
 
     every = np.ones(number)
     sigma, spread = _FIRST[system.order], _SPREAD if takes_drivers(system, batches[0]) else 0.0
@@ -138,8 +144,8 @@ def fit_noise(
     for _ in range(2):
         search = _Search(
             measured,
-            [sampled(Noise(sigma, tau)) for tau in TIMES],
-            sampled(Noise(0.0, 1.0, 0.0, spread)) if spread else None,
+            sampled(*(Noise(sigma, tau) for tau in TIMES)),
+            sampled(Noise(0.0, 1.0, 0.0, spread))[0] if spread else None,
             sigma,
             spread,
             _white(len(lags), error),
@@ -264,13 +270,22 @@ class _Search:
         goal = np.log(np.maximum(self.measured.mean(weight), 1e-12))
         pushes = np.array([sums.mean(weight) for sums in self.pushes]) / self.unit**2
         at = PchipInterpolator(np.log(TIMES), np.log(pushes))
+        rise = at.derivative()
         others = 0.0 * goal
         if self.drivers is not None:
             others = self.drivers.mean(weight) / self.spread**2
 
+        def parts(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return np.exp(2 * p[0] + at(p[1])), np.exp(2 * p[2]) * others
+
         def moments(p: np.ndarray) -> np.ndarray:
-            found = np.exp(2 * p[0] + at(p[1])) + self.white + np.exp(2 * p[2]) * others
-            return np.asarray(found)
+            pushed, driven = parts(p)
+            return np.asarray(pushed + self.white + driven)
+
+        def slopes(p: np.ndarray) -> np.ndarray:
+            pushed, driven = parts(p)
+            columns = [2 * pushed, rise(p[1]) * pushed, 2 * driven]
+            return np.stack(columns, -1) / (pushed + self.white + driven)[:, None]
 
         low, high = np.log(TIMES[[0, -1]])
         best = None
@@ -279,6 +294,7 @@ class _Search:
             found = least_squares(
                 lambda p: np.log(moments(p)) - goal,
                 [size, start, np.log(0.05)],
+                slopes,
                 x_scale="jac",
                 bounds=([-20.0, low, -20.0], [20.0, high, 0.0]),
             )

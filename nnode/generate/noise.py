@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -60,21 +60,21 @@ class Noise:
 class Push(Term):
     """A state of each vehicle that is added to what the law and all effects say.
 
-    By itself it decays; :func:`sample` kicks it after each step. A push stops a vehicle, it does
-    not make it drive backwards.
+    By itself it stays; :func:`sample` lets it decay and kicks it after each step. A push stops a
+    vehicle, it does not make it drive backwards.
     """
 
     name = "noise"
     rules: ClassVar[dict[int, Rule]] = {
-        1: Rule(rate="max(W + push, min(W, 0*W))", states={"push": ("m/s", "-push/tau", "0*W")}),
+        1: Rule(rate="max(W + push, min(W, 0*W))", states={"push": ("m/s", "0*push/tau", "0*W")}),
         # whoever stands stays: steps end at a speed of 0 at the least
-        2: Rule(rate="W + push", states={"push": ("m/s^2", "-push/tau", "0*W")}),
+        2: Rule(rate="W + push", states={"push": ("m/s^2", "0*push/tau", "0*W")}),
     }
     source = "Uhlenbeck & Ornstein 1930; in car following: Treiber, Kesting & Helbing 2006"
 
-    def __init__(self, tau: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.declare("tau", tau, unit="s")
+        self.declare("tau", 1.0, unit="s")
 
     def forward(self, state: State) -> Tensor:
         return effect_increment(self, state)
@@ -148,34 +148,64 @@ def sample(
         SimulationError: no finite number.
         ConfigError: a step that does not divide the sampling interval.
     """
+    return sample_each(system, batch, [noise], samples, seed=seed, dt=dt, method=method)[0]
+
+
+@torch.no_grad()
+def sample_each(
+    system: System,
+    batch: Batch,
+    noises: list[Noise],
+    samples: int,
+    *,
+    seed: int | tuple[int, ...],
+    dt: float | None = None,
+    method: str | None = None,
+) -> list[Trajectory]:
+    """What :func:`sample` gives of each of several noises, from the same random numbers.
+
+    Vehicles of all noises are simulated side by side where nothing but size and time of the push
+    differs between them.
+    """
+    alike = len({noise.drivers for noise in noises}) == 1
+    drawn_each = any(isinstance(term, IndividualEffect) for term in system.terms)
+    if len(noises) > 1 and (isinstance(system, Crowd) or not alike or drawn_each):
+        options: dict[str, Any] = {"seed": seed, "dt": dt, "method": method}
+        return [sample_each(system, batch, [one], samples, **options)[0] for one in noises]
     rng = np.random.default_rng(seed)
-    many = batch.select([b for _ in range(samples) for b in range(len(batch))])
-    many = replace(many, names=numbered(batch.names, samples))
+    copies = samples * len(noises)
+    many = batch.select([b for _ in range(copies) for b in range(len(batch))])
+    many = replace(many, names=numbered(batch.names, copies))
     if isinstance(system, Crowd):
         moving = copy.deepcopy(system)
         _give_drivers(moving, many, batch.names, rng)
+        (noise,) = noises
         own = (noise.sigma, noise.tau, noise.drivers)
-        return sample_people(moving, many, own, rng, dt)
+        return [sample_people(moving, many, own, rng, dt)]
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n
-    kept = math.exp(-step / noise.tau)
     noisy = copy.deepcopy(system)
-    if noise.drivers:
-        noisy.terms.append(DriverHeterogeneity(sigma=noise.drivers))
+    if noises[0].drivers:
+        noisy.terms.append(DriverHeterogeneity(sigma=noises[0].drivers))
     _give_drivers(noisy, many, batch.names, rng)
-    # Euler's step of this time constant is exact for the given one
-    noisy.terms.append(Push(step / (1 - kept)))
+    noisy.terms.append(Push())
     if method not in ("semi_implicit", "ballistic", "rk4"):
         method = noisy.step
     rates = Rates(noisy, many, n, method)
     y = noisy.initial(many, step)
+    # of each sampled sequence
+    sigma, kept = (
+        torch.tensor(values, dtype=y.dtype).repeat_interleave(samples * len(batch))[:, None]
+        for values in ([o.sigma for o in noises], [math.exp(-step / o.tau) for o in noises])
+    )
+    kick = sigma * torch.sqrt(1 - kept**2)
 
     def normal() -> Tensor:
-        return torch.randn(y.shape[:2], generator=generator, dtype=y.dtype)
+        shape = samples * len(batch), y.shape[1]
+        return torch.randn(shape, generator=generator, dtype=y.dtype).repeat(len(noises), 1)
 
-    y[..., -1] = noise.sigma * normal()
-    kick = noise.sigma * math.sqrt(1 - kept**2)
+    y[..., -1] = sigma * normal()
 
     still = torch.ones_like(y[0, 0])
     still[-1] = 0.0
@@ -187,14 +217,20 @@ def sample(
             third = rates(step + 0.5, y + still * second / 2)
             last = rates(step + 1, y + still * third)
             found = found + still * ((found + 2 * second + 2 * third + last) / 6 - found)
-        found[..., -1] += kick * normal()
+        # exact for an autoregressive process
+        found[..., -1] = (kept - 1) * y[..., -1] + kick * normal()
         return found
 
     times = n * torch.arange(batch.n_samples, dtype=y.dtype)
     grid = {"grid_constructor": whole_steps}
     states = odeint(change, y, times, method="euler", options=grid)
     x, v = noisy.observe(states, many)
-    return check_finite(Trajectory(x, v), many)
+    check_finite(Trajectory(x, v), many)
+    each = samples * len(batch)
+    parts = zip(
+        x.split(each, 1), [None] * len(noises) if v is None else v.split(each, 1), strict=True
+    )
+    return [Trajectory(*part) for part in parts]
 
 
 def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:

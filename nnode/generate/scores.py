@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nnode.calibrate.resampling import DRAWS, group_weights
 from nnode.errors import ConfigError
-from nnode.study.statistics import DRAWS, group_weights
 
 #: Bands that are scored.
 BANDS = (0.5, 0.95)

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from nnode.calibrate.resampling import Paired
 from nnode.data.dataset import Source
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.sequences import Sequences
@@ -22,7 +23,6 @@ from nnode.generate.fit import FittedNoise
 from nnode.generate.noise import Noise, numbered, sample
 from nnode.generate.scores import BANDS, Mean, Scores, band
 from nnode.model import System
-from nnode.study.statistics import Paired
 
 #: At most so many vehicles or people, samples counted, move at once.
 _AT_ONCE = 4000

@@ -6,50 +6,49 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from nnode.data.check.scale import Range
-from nnode.data.check.tracks import Tracks
+from nnode.data.check.scale import Range, moves_of
 from nnode.data.sequence import Domain
+from nnode.data.trajectories import Trajectories
 from nnode.plots.style import GREY, OKABE_ITO, dress, new_figure
 
 #: Paths and positions of each that are drawn; more would not be seen.
 PATHS, POINTS = 300, 200
 
 
-def speeds(tracks: Tracks, usual: Range) -> Figure:
+def speeds(rows: Trajectories, usual: Range) -> Figure:
     """Histograms of speeds over some samples, m/s, and of sampling steps, s."""
     figure = new_figure(8.6, 2.8)
     left, right = figure.subplots(1, 2)
-    moves = tracks.moves()
-    values = moves.size / moves.took if len(moves) else np.empty(0)
+    moves = moves_of(rows)
+    values = moves.size / moves.took
     top = max(float(np.percentile(values, 99.5)) * 1.1, 1.3 * usual.high) if values.size else 1.0
     left.axvspan(usual.low, usual.high, color=OKABE_ITO["orange"], alpha=0.25, linewidth=0)
     left.hist(np.clip(values, 0, top), bins=60, range=(0, top), color=OKABE_ITO["blue"])
     dress(left, x="speed (m/s)", y="displacements")
-    steps = tracks.steps
-    end = float(np.clip(np.percentile(steps, 99.9), 1.5 * tracks.dt, 5 * tracks.dt))
+    steps = rows.steps
+    end = float(np.clip(np.percentile(steps, 99.9), 1.5 * rows.dt, 5 * rows.dt))
     right.hist(np.clip(steps, 0, end), bins=60, range=(0, end), color=OKABE_ITO["blue"])
     right.set_yscale("log")
     dress(right, x="time between neighbouring samples (s)", y="steps")
     return figure
 
 
-def presence(tracks: Tracks, domain: Domain) -> Figure:
+def presence(rows: Trajectories, domain: Domain) -> Figure:
     """Positions along the way of agents over time, and their number."""
     figure = new_figure(8.6, 4.6)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks))
-    axis = int(np.argmax(np.abs(tracks.x[end - 1] - tracks.x[start]).sum(axis=0)))
+    start, end = rows.ends()
+    axis = int(np.argmax(np.abs(rows.x[end] - rows.x[start]).sum(axis=0)))
     every = max(1, -(-len(start) // PATHS))
     lines = []
     for a, b in zip(start[::every], end[::every], strict=True):
-        k = np.unique(np.linspace(a, b - 1, POINTS).astype(int))
-        lines.append(np.column_stack([tracks.time[k], tracks.x[k, axis]]))
+        k = np.unique(np.linspace(a, b, POINTS).astype(int))
+        lines.append(np.column_stack([rows.time[k], rows.x[k, axis]]))
     above.add_collection(LineCollection(lines, colors=OKABE_ITO["blue"], linewidths=0.6))
     above.autoscale()
     along = f"{'xy'[axis]} (m)" if domain == "crowd" else "position (m)"
     dress(above, y=along)
-    times, number = np.unique(tracks.time, return_counts=True)
+    times, number = np.unique(rows.time, return_counts=True)
     below.fill_between(times, number, step="mid", color=GREY, alpha=0.5, linewidth=0)
     below.set_ylim(0)
     dress(below, x="time (s)", y="agents")

@@ -10,9 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.model.system import System
-from nnode.population.estimate import Estimate, Variances, estimate, fit_deviations, fit_variances
+from nnode.population.estimate import (
+    STEPS,
+    Estimate,
+    Variances,
+    estimate,
+    fit_deviations,
+    fit_variances,
+)
 from nnode.population.followers import Followers, Paths, score_bias
 from nnode.population.likelihood import Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
@@ -35,6 +42,9 @@ START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 LONGEST, TOLERANCE = 0.3, 1e-2
 #: At most so many parameters are estimated to differ before the best is chosen.
 RANKED = 2
+#: Linearisations of each until then. Most estimates converge in fewer; those that do not are of
+#: parameters that hardly differ, and the chosen one is continued.
+RANKING_STEPS = 15
 #: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
 #: estimate's standard error.
 PAIRS = 2
@@ -192,7 +202,7 @@ def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Popul
     model, noise, before = found.model, found.noise, found.estimate
     try:
         bias = score_bias(model, noise, before, rng, pairs)
-    except (ValueError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
+    except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return found
     bias = np.clip(bias, -LONGEST, LONGEST)
@@ -209,6 +219,7 @@ def _estimated(
     variances: Variances,
     agents: np.ndarray | None = None,
     start: np.ndarray | None = None,
+    steps: int = STEPS,
 ) -> Population:
     """The estimate of a model; the search starts at parameters, standard deviations and, where they
     are given, deviations of drivers and of starts."""
@@ -223,6 +234,7 @@ def _estimated(
         tolerance=TOLERANCE,
         agents=agents,
         start=start,
+        steps=steps,
     )
     return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
 
@@ -257,12 +269,18 @@ def _better(best: Population, price: float) -> Population | None:
     for name in tried:
         system, paths = best.model.system, best.model.paths
         model, before = Followers(system, paths, [*best.random, name]), best.estimate
-        found = _estimated(model, best.noise, before.theta, _widened(before.variances))
+        variances = _widened(before.variances)
+        found = _estimated(model, best.noise, before.theta, variances, steps=RANKING_STEPS)
         if _differs(found.estimate) and found.marginal.loglik > limit:
             better.append(found)
         if len(better) == RANKED:
             break
-    return max(better, key=lambda one: one.marginal.loglik, default=None)
+    chosen = max(better, key=lambda one: one.marginal.loglik, default=None)
+    if chosen is None or chosen.estimate.converged:
+        return chosen
+    there = chosen.estimate
+    modes = there.agents, there.start
+    return _estimated(chosen.model, best.noise, there.theta, there.variances, *modes)
 
 
 def _linearised(best: Population, name: str) -> float:

@@ -23,11 +23,13 @@ from scipy.optimize import minimize
 from nnode.population.likelihood import Linearised, Marginal, Noise, Products, marginal
 
 #: Difference of logarithms of standard deviations for derivatives.
-DIFFERENCE = 1e-4
+DIFFERENCE = 1e-6
 #: Halvings of a step at most.
 HALVINGS = 6
 #: How closely deviations are found where parameters and variances are given, see :func:`estimate`.
 MODES = 0.02
+#: Linearisations of a search at most.
+STEPS = 40
 #: The smallest share of a step that turns back.
 LEAST = 0.2
 
@@ -109,7 +111,7 @@ def estimate(
     high: np.ndarray | None = None,
     restricted: bool = False,
     longest: float = np.inf,
-    steps: int = 40,
+    steps: int = STEPS,
     tolerance: float = 1e-3,
     agents: np.ndarray | None = None,
     start: np.ndarray | None = None,
@@ -240,11 +242,11 @@ def fit_variances(
     if not len(free):
         return variances
 
-    def slopes(row: np.ndarray) -> tuple[Marginal, list[tuple[Marginal, Marginal]]]:
-        """The likelihood, and those on both sides of each standard deviation."""
-        known: dict[tuple[float, ...], Products] = {}  # most sides have the same noise
+    def at(row: np.ndarray) -> tuple[Marginal, list[Marginal]]:
+        """The likelihood, and those with a little more of each standard deviation."""
+        known: dict[tuple[float, ...], Products] = {}  # most of them have the same noise
 
-        def at(row: np.ndarray) -> Marginal:
+        def one(row: np.ndarray) -> Marginal:
             logs = whole.copy()
             logs[free] = row
             found = variances.filled(np.exp(logs))
@@ -253,16 +255,15 @@ def fit_variances(
                 known[key] = noise.products(data, found.noise)
             return marginal(data, known[key], found.spread, found.start, restricted=restricted)
 
-        steps = DIFFERENCE * np.eye(len(row))
-        return at(row), [(at(row + step), at(row - step)) for step in steps]
+        return one(row), [one(row + step) for step in DIFFERENCE * np.eye(len(row))]
 
-    first, sides = slopes(whole[free])
-    scores = np.stack([(up.each - down.each) / (2 * DIFFERENCE) for up, down in sides])
+    first, sides = at(whole[free])
+    scores = np.stack([(up.each - first.each) / DIFFERENCE for up in sides])
     scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
 
     def value(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        here, sides = slopes(scaled * scale)
-        slope = np.array([up.loglik - down.loglik for up, down in sides]) / (2 * DIFFERENCE)
+        here, sides = at(scaled * scale)
+        slope = np.array([up.loglik - here.loglik for up in sides]) / DIFFERENCE
         return -here.loglik, -slope * scale
 
     low, high = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale

@@ -21,7 +21,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import smooth
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import measured_noise
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.model.differentiate import derivatives
 from nnode.model.formula import inputs_of
 from nnode.model.lane_rates import SAFE, Formulas
@@ -443,6 +443,9 @@ class Followers:
         Args:
             found: an estimate of this model, with pushes ``sigma``, ``tau``.
             draw: of deviations of drivers, pushes and errors.
+
+        Raises:
+            SimulationError: drawn drivers blow up.
         """
         paths, (sigma, tau) = self.paths, found.variances.noise
         agents = found.variances.spread * draw(found.agents.shape)
@@ -454,6 +457,8 @@ class Followers:
             pushes[k] = keep * pushes[k - 1] + math.sqrt(1 - keep**2) * fresh[k]
         own = self.spread(found.theta, agents)
         x = self.simulate(own[None], found.start.T[None], lambda at, *_: pushes[at])[:, 0, 0].T
+        if not np.isfinite(x[paths.seen]).all():
+            raise SimulationError("followers with drawn parameters and disturbances blow up")
         return paths.remeasured(x, draw)
 
 

@@ -19,6 +19,7 @@ Source:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -55,7 +56,7 @@ class Linearised:
     forced: np.ndarray | None = None
     dt: float = 1.0
 
-    @property
+    @cached_property
     def columns(self) -> np.ndarray:
         """``(S, K, 1 + P + Q + H)`` w, X, Z and H; 0 where there is no sample."""
         every = [self.residual[..., None], self.fixed, self.random, self.start]
@@ -194,70 +195,95 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns that a Kalman filter has whitened, and logarithms of determinants.
 
-    The state is (d, e); the first element of d is measured.
+    The state is (d, e); the first element of d is measured. All arrays of a step are allocated
+    once: allocations would take most of the time.
     """
     number, samples, width = columns.shape
     m = step.shape[-1]
-    white = np.zeros((number, samples, width))
-    logdet = np.zeros(number)
-    mean, spread = np.empty((m + 1, width)), np.empty((m + 1, m + 1))
-    forward, noise = np.zeros((m + 1, m + 1)), np.empty(m + 1)
+    n = m + 1
+    white, logdet = np.zeros((number, samples, width)), np.zeros(number)
+    mean, before = np.empty((n, width)), np.empty((n, width))
+    spread, half = np.empty((n, n)), np.empty((n, n))
+    forward, noise, gain = np.zeros((n, n)), np.empty(n), np.empty(n)
     forward[m, m], noise[m] = keep, 1.0
     for s in range(number):
         mean[:], spread[:] = 0.0, 0.0
         spread[m, m] = sigma**2
         for k in range(samples):
             if k:
-                forward[:m, :m] = step[s, k - 1]
-                noise[:m] = forced[s, k - 1]
-                forward[:m, m] = noise[:m] * (1 + keep)
-                _predict(mean, spread, forward, noise, sigma**2 * (1 - keep**2))
+                for i in range(m):
+                    noise[i] = forced[s, k - 1, i]
+                    forward[i, m] = noise[i] * (1 + keep)
+                    for j in range(m):
+                        forward[i, j] = step[s, k - 1, i, j]
+                _predict(mean, spread, forward, noise, sigma**2 * (1 - keep**2), before, half)
             if seen[s, k]:
-                logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k])
+                logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k], gain)
     return white, logdet
 
 
 @njit(cache=True, nogil=True)
 def _predict(
-    mean: np.ndarray, spread: np.ndarray, forward: np.ndarray, noise: np.ndarray, fresh: float
+    mean: np.ndarray,
+    spread: np.ndarray,
+    forward: np.ndarray,
+    noise: np.ndarray,
+    fresh: float,
+    before: np.ndarray,
+    half: np.ndarray,
 ) -> None:
-    """The state one sample later: mean and covariance are replaced."""
+    """The state one sample later: mean and covariance are replaced; ``before`` and ``half`` are
+    memory of their sizes."""
     n, width = mean.shape
-    before, half = mean.copy(), np.zeros((n, n))
     for i in range(n):
-        mean[i] = 0.0
+        for c in range(width):
+            before[i, c] = mean[i, c]
+            mean[i, c] = 0.0
+    for i in range(n):
         for j in range(n):
             for c in range(width):
                 mean[i, c] += forward[i, j] * before[j, c]
+            total = 0.0
             for q in range(n):
-                half[i, j] += forward[i, q] * spread[q, j]
+                total += forward[i, q] * spread[q, j]
+            half[i, j] = total
     for i in range(n):
-        for j in range(n):
-            spread[i, j] = noise[i] * noise[j] * fresh
+        for j in range(i + 1):
+            total = noise[i] * noise[j] * fresh
             for q in range(n):
-                spread[i, j] += half[i, q] * forward[j, q]
+                total += half[i, q] * forward[j, q]
+            spread[i, j] = total
+            spread[j, i] = total
 
 
 @njit(cache=True, nogil=True)
 def _condition(
-    mean: np.ndarray, spread: np.ndarray, sample: np.ndarray, variance: float, white: np.ndarray
+    mean: np.ndarray,
+    spread: np.ndarray,
+    sample: np.ndarray,
+    variance: float,
+    white: np.ndarray,
+    gain: np.ndarray,
 ) -> float:
-    """The state after a sample: mean and covariance are replaced, ``white`` is filled.
+    """The state after a sample: mean and covariance are replaced, ``white`` is filled; ``gain`` is
+    memory of its size.
 
     Returns:
         The logarithm of the innovation's variance.
     """
     n, width = mean.shape
     total = spread[0, 0] + variance
-    gain = spread[:, 0] / total
-    for c in range(width):
-        innovation = sample[c] - mean[0, c]
-        white[c] = innovation / np.sqrt(total)
-        for i in range(n):
-            mean[i, c] += gain[i] * innovation
     for i in range(n):
+        gain[i] = spread[i, 0] / total
+    for c in range(width):
+        white[c] = sample[c] - mean[0, c]
+    for i in range(n):
+        for c in range(width):
+            mean[i, c] += gain[i] * white[c]
         for j in range(n):
             spread[i, j] -= gain[i] * gain[j] * total
+    for c in range(width):
+        white[c] /= np.sqrt(total)
     return float(np.log(total))
 
 

@@ -30,7 +30,11 @@ LOADED = (
     "scipy.optimize",
     "torch.utils.tensorboard",
     *(f"nnode.app.{name}" for name in ("discover", "drive", "evaluate", "export")),
-    *(f"nnode.app.{name}" for name in ("forces", "prepare", "study", "train")),
+    *(f"nnode.app.{name}" for name in ("forces", "prepare", "train")),
+    "studies.command",
+    # what the first optimiser, unit, table and command load
+    *("torch._dynamo", "torch.distributed.nn", "sympy", "pint", "pyarrow.parquet"),
+    *("nnode.app.cli.run", "nnode.app.commands.discover", "nnode.app.commands.train"),
 )
 
 

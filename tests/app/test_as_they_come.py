@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import nnode
+from nnode.app.python.inputs import model_options
+from nnode.data.sequence import Sequence
 from tests.app.following import table
+from tests.calibrate.test_gauss_newton_people import TRUTH, crowd
 
 #: The same platoons in other words: what changes, and the options that go with it.
 Form = Callable[[pd.DataFrame], pd.DataFrame]
@@ -119,3 +123,41 @@ def test_samples_that_are_missing_or_late_hardly_change_a_fit(
     for one in (found, fitted(given)):
         for name in ("idm.T", "idm.s0"):
             assert one.estimate[name] == pytest.approx(known.estimate[name], rel=0.1)
+
+
+def moved_people(s: Sequence, by: Callable[[np.ndarray], np.ndarray]) -> Sequence:
+    """Positions, destinations and velocities under a motion of the plane."""
+    assert s.v is not None
+    assert s.destination is not None
+    origin = by(np.zeros(2))
+    return replace(s, x=by(s.x), v=by(s.v) - origin, destination=by(s.destination))
+
+
+def reversed_people(s: Sequence) -> Sequence:
+    assert s.v is not None
+    assert s.destination is not None
+    return replace(
+        s,
+        x=s.x[:, ::-1],
+        v=s.v[:, ::-1],
+        destination=s.destination[::-1],
+        agents=s.agents[::-1],
+    )
+
+
+PEOPLE: dict[str, Callable[[Sequence], Sequence]] = {
+    "at map coordinates": lambda s: moved_people(s, lambda x: np.add(x, [7e6, -3e6])),
+    "in a mirrored corridor": lambda s: moved_people(s, lambda x: x * [1.0, -1.0]),
+    "in a corridor along y": lambda s: moved_people(s, lambda x: x[..., ::-1]),
+    "later": lambda s: replace(s, time=s.time + 1e6),
+    "under other names": lambda s: replace(s, agents=tuple(f"no. {name}" for name in s.agents)),
+    "in another order": reversed_people,
+}
+
+
+@pytest.mark.parametrize("form", PEOPLE)
+def test_the_social_force_does_not_depend_on_where_people_walk(form: str) -> None:
+    start = {**model_options("sf"), "A": 0.4, "k": 35.0, "kappa": 11.0}
+    people = [PEOPLE[form](crowd(seed)) for seed in range(4)]
+    fitted = nnode.Calibrator(start, optimizer="gauss_newton").fit(people)
+    np.testing.assert_allclose(fitted.parameters_.estimate, TRUTH, rtol=1e-3)

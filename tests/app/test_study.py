@@ -11,20 +11,20 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from nnode.app import study
 from nnode.errors import ConfigError
-from nnode.study.options import CrowdStudyOptions, TrafficStudyOptions
+from studies import command as study
+from studies.options import CrowdStudyOptions, TrafficStudyOptions
 from tests.app.conftest import composed
 from tests.app.forked import Forks
 
 #: The script with another study in the place of the traffic's.
 CODE = """
 import sys
-from nnode.app import study
+from studies import command as study
 from nnode.app.cli.run import run
 if __name__ == "__main__":
     sys.argv[0] = "scripts/study.py"
-    study.STUDIES["traffic"] = "tests.study.tiny"
+    study.STUDIES["traffic"] = "tests.studies.tiny"
     run("study", study.study)
 """
 
@@ -76,7 +76,7 @@ def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
 
 
 def test_quick_results_have_a_folder_of_their_own(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setitem(study.STUDIES, "traffic", "tests.study.tiny")
+    monkeypatch.setitem(study.STUDIES, "traffic", "tests.studies.tiny")
     (tmp_path / "quick").mkdir()
     (tmp_path / "quick" / "awake").write_text("")
     options = OmegaConf.structured(TrafficStudyOptions(quick=True, workers=1))

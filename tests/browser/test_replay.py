@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nnode.data.sequence import Sequence
 from nnode.pages.page import write_player
 from nnode.pages.replay import ReplayBlock, Scene, Zone
 from tests.browser.chromium import MISSING, Browser
+from tests.builders import lane, people
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 
@@ -33,22 +33,19 @@ PIXELS = """([r, g, b], top, bottom) => {
 }"""
 
 
-def lane(name: str, seconds: float) -> Scene:
+def car(name: str, seconds: float) -> Scene:
     """One car, which a model has LATE metres behind."""
-    time = 50 + 0.1 * np.arange(round(10 * seconds) + 1)
-    x = SPEED * (time - 50)[:, None, None]
-    return Scene(Sequence(name=name, recording="r", time=time, x=x), {"late": x - LATE})
+    s = lane(SPEED * 0.1 * np.arange(round(10 * seconds) + 1)[:, None], 0.1, start=50.0, name=name)
+    return Scene(s, {"late": s.x - LATE})
 
 
 def corridor() -> Scene:
     """Two people who pass each other."""
-    time = 0.1 * np.arange(31)
-    right = np.stack([-3 + 1.3 * time, np.full(31, 1.0)], -1)
-    x = np.stack([right, right * [-1, 1] + [0, 2]], 1)
-    s = Sequence(name="walk", recording="w", time=time, x=x, walls=WALLS)
+    right = np.stack([-3 + 0.13 * np.arange(31), np.full(31, 1.0)], -1)
+    s = people(np.stack([right, right * [-1, 1] + [0, 2]], 1), 0.1, name="walk", walls=WALLS)
     return Scene(
         s,
-        {"without effects": x + np.array([0.0, 0.3]), "with effects": x + np.array([0.0, 0.1])},
+        {"without effects": s.x + np.array([0.0, 0.3]), "with effects": s.x + np.array([0.0, 0.1])},
     )
 
 
@@ -71,7 +68,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     zone = [Zone("slow zone", x=ZONE)]
     blocks = {
         "lane": ReplayBlock(
-            "p", [lane("first", 4.0), lane("second", 2.0)], "Cars.", "A car drives.", zone
+            "p", [car("first", 4.0), car("second", 2.0)], "Cars.", "A car drives.", zone
         ),
         "corridor": ReplayBlock("p", [corridor()], "People.", "Two people pass each other."),
         "dull": ReplayBlock("p", [alone(), corridor()], "People.", "They walk."),

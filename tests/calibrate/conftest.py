@@ -13,10 +13,10 @@ from nnode.calibrate.options import TrainerOptions
 from nnode.calibrate.trainer import Provenance, Trainer
 from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import LoaderOptions
-from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store
 from nnode.model import build_model
 from nnode.simulation import TorchdiffeqSolver
+from tests.builders import linear
 
 LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 
@@ -30,19 +30,8 @@ def store(tmp_path: Path) -> Store:
 def write_platoons(folder: Path) -> Store:
     """Seven platoons of two to four cars over 1 s, v0 = 22 m/s and L = 4 m."""
     rng = np.random.default_rng(1)
-    sequences = []
-    for i in range(7):
-        x = np.cumsum(rng.uniform(8, 30, rng.integers(2, 5)))
-        rows = [x]
-        for _ in range(500):
-            speed = np.append(22 * (1 - 4 / np.diff(x)), 22)
-            x = x + 0.002 * speed
-            rows.append(x)
-        time = 10.0 * i + 0.2 * np.arange(6)
-        sequences.append(
-            Sequence(name=f"r/{i:03d}", recording="r", time=time, x=np.array(rows)[::100, :, None])
-        )
-    return write_store(folder, sequences, {"dt": 0.2, "files": {}})
+    starts = [np.cumsum(rng.uniform(8, 30, rng.integers(2, 5))) for _ in range(7)]
+    return write_store(folder, linear(starts, 22, 4, 6, 0.002), {"dt": 0.2, "files": {}})
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from nnode.model import build_model
 from nnode.simulation import Solver, TorchdiffeqSolver
 from nnode.simulation.base import Trajectory
 from nnode.simulation.fused import FusedSolver
+from tests.builders import lane
 
 SOLVERS = [
     pytest.param(lambda dt: TorchdiffeqSolver(gradient="discrete", dt=dt), id="torchdiffeq"),
@@ -24,8 +25,7 @@ SOLVERS = [
 
 
 def platoon(*starts: float) -> Batch:
-    x = np.array(starts)[None, :, None] + 10.0 * 0.2 * np.arange(6)[:, None, None]
-    return collate([Sequence(name="tunnel/7", recording="tunnel", time=0.2 * np.arange(6), x=x)])
+    return collate([lane(np.array(starts) + 2.0 * np.arange(6)[:, None], name="tunnel/7")])
 
 
 def law(term: str, **options: Any) -> Any:

@@ -14,23 +14,13 @@ from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver, Trajectory
+from tests.builders import lane
 
 
 def two_sequences() -> Batch:
     """K = 3 samples of two vehicles, and K = 2 of one."""
-    long = Sequence(
-        name="long",
-        recording="r",
-        time=np.array([0.0, 0.5, 1.0]),
-        x=np.array([[0.0, 10.0], [5.0, 16.0], [9.0, 21.0]])[..., None],
-    )
-    short = Sequence(
-        name="short",
-        recording="r",
-        time=np.array([7.0, 7.5]),
-        x=np.array([[1.0], [4.0]])[..., None],
-    )
-    return collate([long, short])
+    long = lane([[0.0, 10.0], [5.0, 16.0], [9.0, 21.0]], 0.5, name="long")
+    return collate([long, lane([[1.0], [4.0]], 0.5, start=7.0, name="short")])
 
 
 def shifted(batch: Batch) -> Trajectory:

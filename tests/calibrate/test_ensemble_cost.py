@@ -11,10 +11,11 @@ import torch
 from nnode.calibrate.cost import Convention, sequence_costs
 from nnode.calibrate.ensemble import EnsembleCost
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
+from tests.builders import lane
 
 DT = 0.02
 N4 = {
@@ -33,9 +34,9 @@ def batch() -> Batch:
     draw = np.random.default_rng(0)
     items = []
     for n, samples in ((3, 6), (4, 4)):
-        t = 0.2 * np.arange(samples)
-        x = 14.0 * np.arange(n) + 18 * t[:, None] + 0.3 * draw.standard_normal((samples, n))
-        items.append(Sequence(name=f"s/{n}", recording="s", time=t, x=x[:, :, None]))
+        t = 0.2 * np.arange(samples)[:, None]
+        x = 14.0 * np.arange(n) + 18 * t + 0.3 * draw.standard_normal((samples, n))
+        items.append(lane(x, name=f"s/{n}"))
     return collate(items).to(dtype=torch.float64)
 
 

@@ -20,13 +20,12 @@ from nnode.calibrate.evaluate import (
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver, Trajectory
+from tests.builders import lane, straight
 
 
 def traffic(name: str, x: list[list[float]], dt: float = 0.5) -> Sequence:
     """A sequence from one row of positions (m) per sample."""
-    return Sequence(
-        name=name, recording="r", time=dt * np.arange(len(x)), x=np.asarray(x)[:, :, None]
-    )
+    return lane(x, dt, name=name)
 
 
 BATCHES = [
@@ -140,9 +139,8 @@ def test_best_common_speed_is_the_least_cost() -> None:
 
 
 def steady(n: int, speeds: list[float], samples: int) -> Sequence:
-    t = 0.2 * np.arange(samples)
-    x = 7.0 + 15.0 * np.arange(n) + t[:, None] * np.asarray(speeds)
-    return Sequence(name=f"{n}", recording="r", time=t, x=x[:, :, None])
+    t = 0.2 * np.arange(samples)[:, None]
+    return lane(7.0 + 15.0 * np.arange(n) + t * np.asarray(speeds), name=f"{n}")
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
@@ -174,18 +172,8 @@ def test_no_interaction_lets_everyone_but_a_measured_leader_drive_at_free_speed(
 
 def walkers() -> Sequence:
     """Three people on straight lines, each walking towards the last position."""
-    t = 0.1 * np.arange(6)[:, None, None]
-    start = np.array([[0.0, 0.0], [0.3, 0.2], [2.0, 1.0]])
-    v = np.array([[1.2, 0.1], [-0.8, 0.5], [0.0, 1.4]])
-    x = start + t * v
-    return Sequence(
-        name="w",
-        recording="r",
-        time=t[:, 0, 0],
-        x=x,
-        v=np.broadcast_to(v, x.shape),
-        walls=np.array([[-2.0, -1.0, 4.0, -1.0]]),
-    )
+    start, v = [[0.0, 0.0], [0.3, 0.2], [2.0, 1.0]], [[1.2, 0.1], [-0.8, 0.5], [0.0, 1.4]]
+    return straight(start, v, 6, 0.1, name="w", walls=np.array([[-2.0, -1.0, 4.0, -1.0]]))
 
 
 def touchy() -> Crowd:

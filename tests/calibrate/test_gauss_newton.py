@@ -15,7 +15,7 @@ from nnode.errors import ConfigError
 from nnode.model import System, Traffic, build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.term import State, Term
-from nnode.simulation import FusedSolver, TorchdiffeqSolver
+from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
 from tests.simulation.fused.compare import RungeKutta
 
 TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
@@ -55,15 +55,24 @@ def pairs() -> Batch:
     return batch
 
 
-@pytest.mark.parametrize("kind", list(Convention))
-def test_costs_and_slopes_are_those_of_autograd(kind: Convention, pairs: Batch) -> None:
+@pytest.fixture(scope="module")
+def differentiable(pairs: Batch) -> tuple[System, Trajectory]:
+    """A model, and its motion with the graph of its derivatives."""
     system = model(T=1.1)
+    return system, RungeKutta()(system, pairs)
+
+
+@pytest.mark.parametrize("kind", list(Convention))
+def test_costs_and_slopes_are_those_of_autograd(
+    kind: Convention, pairs: Batch, differentiable: tuple[System, Trajectory]
+) -> None:
+    system, run = differentiable
     cost = ResidualProblem(system, pairs, FusedSolver(), kind)
     curved = cost(cost.start)
-    wanted = sequence_costs(RungeKutta()(system, pairs), pairs, kind)
+    wanted = sequence_costs(run, pairs, kind)
     np.testing.assert_allclose(curved.cost, wanted.detach().numpy(), rtol=1e-11)
     np.testing.assert_allclose(cost.costs(cost.start), curved.cost, rtol=1e-11)
-    slopes = torch.autograd.grad(wanted.sum(), list(system.parameters()))
+    slopes = torch.autograd.grad(wanted.sum(), list(system.parameters()), retain_graph=True)
     np.testing.assert_allclose(curved.gradient.sum(0), [float(s) for s in slopes], rtol=1e-9)
 
 

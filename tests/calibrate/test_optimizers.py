@@ -11,18 +11,17 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.optimizers import (
     AdadeltaOptions,
     AdamOptions,
-    ConsensusOptions,
     LbfgsOptions,
     OptimizerOptions,
     build_optimizer,
     needs_full_batch,
 )
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
-from nnode.calibrate.optimizers.consensus import ConsensusBased
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
 from nnode.simulation import FusedSolver
+from tests.builders import linear
 
 #: v0 (m/s) and L (m) that the data are made with.
 TRUTH = (24.0, 6.0)
@@ -30,25 +29,9 @@ SOLVER = FusedSolver(0.1)
 
 
 def made_with_lin() -> Batch:
-    """Platoons by a plain Euler loop with TRUTH, four steps of 0.05 s between two samples."""
-    items = []
-    for number, gaps in enumerate([[9.0, 14.0], [20.0, 8.0], [30.0, 11.0]]):
-        x = np.concatenate([[0.0], np.cumsum(gaps)])
-        states = [x]
-        for _ in range(7):
-            for _ in range(2):
-                v0, length = TRUTH
-                x = x + 0.1 * np.append(v0 * (1 - length / np.diff(x)), v0)
-            states.append(x)
-        items.append(
-            Sequence(
-                name=str(number),
-                recording="r",
-                time=0.2 * np.arange(8),
-                x=np.array(states)[:, :, None],
-            )
-        )
-    return collate(items)
+    """Platoons of TRUTH."""
+    gaps = ([9.0, 14.0], [20.0, 8.0], [30.0, 11.0])
+    return collate(linear((np.cumsum([0.0, *g]) for g in gaps), *TRUTH, 8, 0.1))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +40,6 @@ def made_with_lin() -> Batch:
         (AdadeltaOptions(eps=1e-3), 400, 1e-2),
         (AdamOptions(lr=0.2), 200, 1e-3),
         (LbfgsOptions(), 5, 1e-9),
-        (ConsensusOptions(), 80, 1e-3),
     ],
     ids=lambda o: getattr(o, "name", ""),
 )
@@ -97,9 +79,6 @@ def test_options_reach_the_optimiser() -> None:
     assert isinstance(adadelta, NoisyAdadelta)
     expected = {"lr": 0.5, "rho": 0.9, "eps": 1e-3, "eta1": 2.0, "eta2": 0.1}
     assert {key: adadelta.param_groups[0][key] for key in expected} == expected
-    consensus = build_optimizer(model, ConsensusOptions(particles=13))
-    assert isinstance(consensus, ConsensusBased)
-    assert consensus.state_dict()["x"].shape == (13, 2)
 
 
 def test_the_paper_s_constants_are_the_defaults() -> None:
@@ -108,33 +87,18 @@ def test_the_paper_s_constants_are_the_defaults() -> None:
     assert {key: group[key] for key in expected} == expected
 
 
-@pytest.mark.parametrize("options", [AdadeltaOptions(), ConsensusOptions()], ids=lambda o: o.name)
-def test_the_seed_reaches_the_optimiser(options: OptimizerOptions) -> None:
+def test_the_seed_reaches_the_optimiser() -> None:
     states = [
-        build_optimizer(Traffic([make_law("lin")]), options, seed=s).state_dict()["generator"]
+        build_optimizer(Traffic([make_law("lin")]), AdadeltaOptions(), seed=s).state_dict()[
+            "generator"
+        ]
         for s in (4, 4, 5)
     ]
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
 
 
-def test_consensus_projects_with_the_model() -> None:
-    model = Traffic([make_law("lin", v0=20.0, L=2.0)])
-    optimizer = build_optimizer(model, ConsensusOptions())
-    lengths = []
-
-    def closure() -> Tensor:
-        lengths.append(model.terms[0].L.item())
-        return torch.tensor(1.0)
-
-    optimizer.step(closure)
-    assert min(lengths) == 2.0
-    assert max(lengths) > 2.0
-
-
-@pytest.mark.parametrize(
-    ("name", "full"), [("adadelta", False), ("adam", False), ("lbfgs", True), ("cbo", True)]
-)
+@pytest.mark.parametrize(("name", "full"), [("adadelta", False), ("adam", False), ("lbfgs", True)])
 def test_who_compares_costs_of_different_steps(name: str, full: bool) -> None:
     assert needs_full_batch(name) is full
 
@@ -142,11 +106,12 @@ def test_who_compares_costs_of_different_steps(name: str, full: bool) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (OptimizerOptions(name="adadlta"), r"optimizer\.name=adadlta.*adadelta, adam, lbfgs, cbo"),
+        (
+            OptimizerOptions(name="adadlta"),
+            r"optimizer\.name=adadlta.*adadelta, adam, lbfgs, gauss_newton",
+        ),
         (AdadeltaOptions(rho=1.5), "adadelta: rho=1.5"),
         (AdamOptions(lr=-1.0), "adam: .*learning rate"),
-        (ConsensusOptions(particles=1), "cbo: particles=1"),
-        (ConsensusOptions(dt=-0.1), "cbo: dt=-0.1"),
     ],
     ids=lambda v: v if isinstance(v, str) else "",
 )

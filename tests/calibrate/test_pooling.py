@@ -17,9 +17,9 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.simulation import FusedSolver
-from nnode.study.following.candidates import EVERY
+from studies.following.candidates import EVERY
 from tests.app.following import pairs
-from tests.study.following.test_fit import HELLY, driven
+from tests.studies.following.test_fit import HELLY, driven
 
 TIME_GAPS = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
 

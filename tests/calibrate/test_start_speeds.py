@@ -18,9 +18,9 @@ from nnode.data.smooth import start_smoothed
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.simulation import FusedSolver
-from nnode.study.following.candidates import EVERY
+from studies.following.candidates import EVERY
 from tests.app.following import pairs
-from tests.study.following.test_fit import HELLY, driven
+from tests.studies.following.test_fit import HELLY, driven
 
 
 def known(name: str = "helly") -> System:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.data.dataset import EpochSampler, SequenceDataset, load_all, make_loader
+from nnode.data.dataset import EpochSampler, SequenceDataset, make_loader
 from nnode.data.options import LoaderOptions
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store, write_store
@@ -125,22 +125,11 @@ def test_nothing_is_read_before_it_is_asked_for(
     assert read == [0, 1]
 
 
-def test_load_all_is_one_batch(store: Store) -> None:
-    assert load_all(store).names == tuple(f"r/{i}" for i in range(11))
-    some = load_all(store, [4, 1])
-    assert some.names == ("r/4", "r/1")
-    np.testing.assert_array_equal(some.x[: store[4].n_samples, 0, : store[4].n_agents], store[4].x)
-
-
 def test_positions_that_the_store_has_not_are_refused(store: Store, tmp_path: Path) -> None:
     for positions in ([11], [-1]):
         with pytest.raises(DataError, match="sequences 0 to 10, asked for number"):
             SequenceDataset(store, positions)
-        with pytest.raises(DataError, match="asked for number"):
-            load_all(store, positions)
     with pytest.raises(DataError, match="no sequence to load"):
         make_loader(SequenceDataset(store, []), LoaderOptions(), seed=0)
-    with pytest.raises(DataError, match="at least one sequence"):
-        load_all(write_store(tmp_path, [], {}))
     with pytest.raises(ConfigError, match="workers=-1"):
         make_loader(SequenceDataset(store), LoaderOptions(workers=-1), seed=0)

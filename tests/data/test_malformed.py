@@ -114,7 +114,7 @@ def test_more_cells_than_names_are_refused(tmp_path: Path) -> None:
 def test_times_and_agents_of_a_sequence_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nnode.data.readers.table.MOST_CELLS", 100)
+    monkeypatch.setattr("nnode.data.cut.MOST_CELLS", 100)
     path = tmp_path / "t.csv"
     path.write_text("sequence,time,agent,x\n" + "".join(f"s,{k},a{k},{k}\n" for k in range(11)))
     with pytest.raises(DataError, match="11 times and 11 agents in 11 rows, expected at most"):

@@ -18,6 +18,7 @@ from nnode.data.readers.esimas import read_esimas
 from nnode.data.readers.juelich import juelich_files, read_juelich
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Domain, Sequence
+from nnode.data.smooth import measured_noise
 from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults
 
 
@@ -43,8 +44,8 @@ def changed(sequence: Sequence, at: tuple, value: object) -> Sequence:
     return replace(sequence, x=x)
 
 
-def kinds(sequence: Sequence, domain: str = "traffic") -> list[str]:
-    return [fault.kind for fault in find_faults(sequence, domain)]  # type: ignore[arg-type]
+def kinds(sequence: Sequence, domain: Domain = "traffic", noise: float = 0.0) -> list[str]:
+    return [fault.kind for fault in find_faults(sequence, domain, noise)]
 
 
 @given(
@@ -68,10 +69,11 @@ def test_people_measured_badly_do_not_jump(dt: float) -> None:
     for seed in range(20):
         s = people(k=60, dt=dt)
         noisy = s.x + np.random.default_rng(seed).normal(0.0, 0.1, s.x.shape)
-        assert kinds(replace(s, x=noisy), "crowd") == []
+        noise = measured_noise([replace(s, x=noisy)]).position
+        assert kinds(replace(s, x=noisy), "crowd", noise) == []
         # somebody who does is still seen
         noisy[30:, 2] += (1.0, 0.8)
-        assert kinds(replace(s, x=noisy), "crowd") == ["jump"]
+        assert kinds(replace(s, x=noisy), "crowd", noise) == ["jump"]
 
 
 def test_zero_row() -> None:

@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import savemat
 
-from nnode.data.options import NgsimOptions, VehicleTableOptions
+from nnode.data.options import (
+    DataOptions,
+    EsimasOptions,
+    NgsimOptions,
+    OpenAccOptions,
+    PairOptions,
+    SumoOptions,
+    TableOptions,
+    VehicleTableOptions,
+    WalkwayOptions,
+)
+from nnode.data.prepare import prepare
 from nnode.data.readers.ngsim import read_ngsim
 from nnode.data.readers.vehicles import read_vehicles
 from nnode.data.sequence import Sequence
@@ -191,3 +205,76 @@ def test_a_hole_does_not_bias_speeds() -> None:
     lacking = x.copy()
     lacking[20:26] = np.nan
     assert [len(one.x) for one in record(time, lacking)] == [20, 34]
+
+
+NOISE = 0.05 * np.random.default_rng(6).standard_normal((3, 120))
+CARS = 8.0 * 0.1 * np.arange(120) + 25.0 * np.arange(3)[:, None] + NOISE
+
+
+def rows_of() -> pd.DataFrame:
+    """Three cars, one row per car and time, the last one in front."""
+    time = (0.1 * np.arange(120)).round(3)
+    table = pd.DataFrame({"vehicle": np.repeat(range(3), 120), "time": np.tile(time, 3)})
+    return table.assign(x=CARS.ravel())
+
+
+def as_esimas(path: Path) -> DataOptions:
+    cells = np.empty((1, 1), dtype=object)
+    cells[0, 0] = {"Xarr": CARS, "Tarr": 0.1 * np.arange(120)}
+    savemat(path / "sequence_dataown.mat", {"sequences": cells})
+    return EsimasOptions(source=str(path), recording="own")
+
+
+def as_vehicles(path: Path) -> DataOptions:
+    rows_of().to_csv(path / "t.csv", index=False)
+    return VehicleTableOptions(path=str(path / "t.csv"), dt=0.1)
+
+
+def as_table(path: Path) -> DataOptions:
+    rows_of().rename(columns={"vehicle": "agent"}).assign(sequence=1).to_csv(path / "t.csv")
+    return TableOptions(domain="traffic", path=str(path / "t.csv"))
+
+
+def as_pairs(path: Path) -> DataOptions:
+    pair = {"time": 0.1 * np.arange(120), "x_follower": CARS[0], "x_leader": CARS[1]}
+    pd.DataFrame(pair).to_csv(path / "t.csv", index=False)
+    return PairOptions(path=str(path / "t.csv"))
+
+
+def as_openacc(path: Path) -> DataOptions:
+    """Positions follow from gaps: their noise is that of the gaps."""
+    table = rows_of().assign(run=1, v=8.0, position=lambda t: 3 - t.vehicle)
+    table["gap"] = 20.0 + table.x - table.time * 8.0 - 25.0 * table.vehicle
+    table.rename(columns={"time": "t"}).drop(columns="x").to_csv(path / "t.csv", index=False)
+    return OpenAccOptions(path=str(path / "t.csv"), max_error=None)
+
+
+def as_sumo(path: Path) -> DataOptions:
+    moments = [
+        f'<timestep time="{time:.1f}">'
+        + "".join(f'<vehicle id="{i}" lane="e_0" pos="{CARS[i, k]}"/>' for i in range(3))
+        + "</timestep>"
+        for k, time in enumerate(0.1 * np.arange(120))
+    ]
+    (path / "t.xml").write_text(f"<fcd-export>{''.join(moments)}</fcd-export>")
+    return SumoOptions(path=str(path / "t.xml"), dt=0.1)
+
+
+def as_people(path: Path) -> DataOptions:
+    rows = [f"{i} {k} {CARS[i, k] / 8:.6f} {i} 0" for i in range(3) for k in range(120)]
+    (path / "t.txt").write_text("# framerate: 10\n# id frame x/m y/m z/m\n" + "\n".join(rows))
+    return WalkwayOptions(path=str(path / "t.txt"), t_seq=5.0)
+
+
+SOURCES = [as_esimas, as_vehicles, as_table, as_pairs, as_openacc, as_sumo, as_people]
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.__name__)
+def test_every_source_is_smoothed(tmp_path: Path, source: Callable[[Path], DataOptions]) -> None:
+    options = source(tmp_path)
+    raw = prepare(options, tmp_path / "raw")
+    smooth = prepare(replace(options, smooth=1.0), tmp_path / "smooth")
+    assert len(raw) == len(smooth) >= 1
+    assert smooth[0].v is not None
+    before, after = (np.abs(np.diff(s[0].x[:, 0, 0], 4)).mean() for s in (raw, smooth))
+    assert after < 0.2 * before

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nnode.app.python.inputs import model_options
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError, DataError
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
@@ -21,6 +21,7 @@ from nnode.model.laws import make_law
 from nnode.model.term import State, Term
 from nnode.simulation import TorchdiffeqSolver
 from tests.app.following import TRUE, platoon
+from tests.builders import lane
 from tests.simulation.fused.compare import RungeKutta
 
 STEP = 0.1
@@ -37,16 +38,7 @@ def platoons(number: int, seconds: float, cars: int = 3, seed: int = 0) -> Batch
     rng, found = np.random.default_rng(seed), []
     for i in range(number):
         x, v = platoon(rng, cars, seconds)
-        found.append(
-            Sequence(
-                name=f"s{i}",
-                recording=f"r{i}",
-                time=STEP * np.arange(len(x)),
-                x=x[..., None],
-                v=v[..., None],
-                length=np.full(cars, 4.5),
-            )
-        )
+        found.append(lane(x, STEP, v=v, name=f"s{i}", length=4.5))
     return collate(found)
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nnode.app.python.inputs import model_options
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import DataError
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
@@ -18,6 +18,7 @@ from nnode.generate.people import SLOWEST
 from nnode.generate.scores import band, nearest
 from nnode.model import Crowd, System, build_model
 from nnode.simulation import TorchdiffeqSolver
+from tests.builders import straight
 
 STEP = 0.1
 
@@ -29,12 +30,11 @@ def walking(*effects: dict[str, object], desired: str = "direction") -> System:
 def groups(number: int, seconds: float, people: int = 4, seed: int = 0) -> Batch:
     """People abreast who walk straight on at speeds of their own."""
     rng, found = np.random.default_rng(seed), []
-    time = STEP * np.arange(round(seconds / STEP) + 1)
+    abreast = np.stack([np.zeros(people), 1.5 * np.arange(people)], -1)
     for i in range(number):
         speed = 1.3 + 0.1 * rng.normal(size=people)
-        x = np.stack([time[:, None] * speed, np.tile(1.5 * np.arange(people), (len(time), 1))], -1)
-        v = np.tile(np.stack([speed, 0 * speed], -1), (len(time), 1, 1))
-        found.append(Sequence(name=f"s{i}", recording=f"r{i}", time=time, x=x, v=v))
+        v = np.stack([speed, 0 * speed], -1)
+        found.append(straight(abreast, v, round(seconds / STEP) + 1, STEP, name=f"s{i}"))
     return collate(found)
 
 

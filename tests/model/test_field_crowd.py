@@ -15,7 +15,8 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.model import Crowd, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
-from nnode.study.walking.laws import without_walls
+from studies.walking.laws import without_walls
+from tests.builders import straight
 
 R = 0.25
 
@@ -37,14 +38,7 @@ def scene(x: Any, v: Any, preferred: Any = None) -> Sequence:
     """People at one moment; they want to walk at 1.3 m/s to the right, if not told otherwise."""
     x, v = np.asarray(x, float), np.asarray(v, float)
     wish = np.tile([1.3, 0.0], (len(x), 1)) if preferred is None else np.asarray(preferred, float)
-    return Sequence(
-        name="a",
-        recording="a",
-        time=np.array([0.0, 0.04]),
-        x=np.stack([x, x + 0.04 * v]),
-        v=np.stack([v, v]),
-        preferred=wish,
-    )
+    return straight(x, v, 2, 0.04, name="a", preferred=wish)
 
 
 def rates(found: Crowd, item: Sequence) -> np.ndarray:

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Law, Scene, State, Traffic, make_law
+from tests.builders import lane
 
 GAPS = [2.5, 5.0, 7.3, 18.0, 60.0]
 
 
 def platoon(name: str, positions: list[float], samples: int = 2) -> Sequence:
     """Vehicles at rest at ``positions`` (m), the last one leading."""
-    x = np.repeat(np.asarray(positions)[None, :, None], samples, axis=0)
-    return Sequence(name=name, recording="r", time=0.2 * np.arange(samples), x=x)
+    return lane(np.tile(positions, (samples, 1)), name=name)
 
 
 def rates(term: Law, *platoons: list[float]) -> Tensor:

@@ -10,6 +10,7 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import DataError
 from nnode.model import Crowd, Scene, Traffic, make_law
 from nnode.model.scene import wall_points
+from tests.builders import lane
 
 NAN = float("nan")
 
@@ -74,9 +75,7 @@ def test_no_walls_at_all() -> None:
 
 
 def ramp(name: str, samples: int, agents: int) -> Sequence:
-    t = 0.2 * np.arange(samples)
-    x = 10.0 * np.arange(agents)[None] + (t**2)[:, None]
-    return Sequence(name=name, recording="r", time=t, x=x[:, :, None])
+    return lane(10.0 * np.arange(agents) + (0.2 * np.arange(samples)[:, None]) ** 2, name=name)
 
 
 def test_who_leads_and_who_follows() -> None:

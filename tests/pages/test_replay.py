@@ -13,12 +13,12 @@ from nnode.errors import ConfigError
 from nnode.pages import replay
 from nnode.pages.page import Heading, write_page, write_player
 from nnode.pages.replay import ReplayBlock, Scene, Zone, packed
+from tests.builders import lane
 
 
 def platoon(name: str = "lane/1", samples: int = 31, dt: float = 0.2, **more: object) -> Sequence:
-    time = 100 + dt * np.arange(samples)
-    x = 1e5 + 15 * (time[:, None] - 100) + np.array([0.0, 20.0, 45.0])
-    return Sequence(name=name, recording="lane", time=time, x=x[..., None], **more)  # type: ignore[arg-type]
+    x = 1e5 + 15 * dt * np.arange(samples)[:, None] + np.array([0.0, 20.0, 45.0])
+    return lane(x, dt, start=100.0, name=name, **more)
 
 
 def scene(s: Sequence, late: float = 1.0) -> Scene:

@@ -99,7 +99,7 @@ def errors(steps: int, contact: float) -> np.ndarray:
     columns = [one.of_people(field)[0].numpy() for field in one.parameters([1e-4] * 3)]
     columns.append(np.concatenate([pushed(t) for t in np.linspace(0.0, SECONDS, steps + 1)]))
     found = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
-    fine, small = 1600 // steps, 1e-5
+    fine, small = 400 // steps, 1e-5
     away = []
     for unit, response in zip(np.eye(8), found, strict=True):
         after, before = (integrated(s * small * unit, steps, fine, contact) for s in (1, -1))

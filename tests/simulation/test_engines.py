@@ -23,6 +23,7 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 from nnode.model.steps import METHODS
 from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
 from nnode.simulation.kernels import lanes
+from tests.builders import straight
 from tests.model.effects.test_crowd_effects import VALUES
 from tests.model.following import model
 from tests.simulation.fused.compare import RungeKutta
@@ -382,20 +383,12 @@ def room() -> Batch:
     """Crowds of one to nine people, of different duration, with none to three walls."""
     found = []
     for n, walls, samples in ((6, 1, 6), (9, 2, 4), (1, 3, 6), (2, 0, 6)):
-        draw, time = np.random.default_rng(n), 0.04 * np.arange(samples)
+        draw = np.random.default_rng(n)
         x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
-        found.append(
-            Sequence(
-                name=f"{n}",
-                recording="r",
-                time=time,
-                x=x + time[:, None, None] * v,
-                v=np.broadcast_to(v, (samples, n, 2)),
-                walls=WALLS[:walls],
-                preferred=draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1],
-                group=tuple("ab"[i % 2] for i in range(n)),
-            )
-        )
+        wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
+        group = tuple("ab"[i % 2] for i in range(n))
+        more = {"walls": WALLS[:walls], "preferred": wish, "group": group}
+        found.append(straight(x, v, samples, 0.04, name=f"{n}", **more))
     return collate(found)
 
 

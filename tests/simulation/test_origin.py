@@ -23,6 +23,7 @@ from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, Law, law_from
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.base import simulated_batch
+from tests.builders import lane, straight
 
 #: Metres: a city's own coordinates, a country's, and northings of UTM.
 AWAY = (1e5, 7e6)
@@ -34,18 +35,16 @@ SOLVERS = {
 
 def people(shift: float = 0.0) -> Sequence:
     """Two streams that meet between two walls, of people who touch."""
-    time = 0.1 * np.arange(21)
     start = np.array([[0.0, 0.0], [1.2, 0.3], [4.0, 0.62], [5.0, -0.4], [2.5, 1.0]])
     speed = np.array([[1.3, 0.0], [1.1, 0.0], [-1.2, 0.0], [-1.0, 0.0], [0.9, -0.3]])
     walls = np.array([[-5.0, -1.0, 15.0, -1.0], [15.0, 2.0, -5.0, 2.0]])
-    x = start + time[:, None, None] * speed + shift
-    return Sequence(name="people", recording="r", time=time, x=x, walls=walls + shift)
+    return replace(straight(start + shift, speed, 21, 0.1, walls=walls + shift), v=None)
 
 
 def cars(shift: float = 0.0, number: int = 5) -> Sequence:
-    time = 0.2 * np.arange(76)
-    x = 25.0 * np.arange(number) + 15 * time[:, None] + 8 * np.sin(time[:, None] / 4)
-    return Sequence(name=f"cars {number}", recording="r", time=time, x=(x + shift)[..., None])
+    time = 0.2 * np.arange(76)[:, None]
+    x = 25.0 * np.arange(number) + 15 * time + 8 * np.sin(time / 4)
+    return lane(x + shift, name=f"cars {number}")
 
 
 def crowd(dtype: torch.dtype) -> System:

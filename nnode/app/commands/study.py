@@ -15,7 +15,7 @@ command goes on where it was stopped.
 from __future__ import annotations
 
 from nnode.app.cli.run import run
-from nnode.app.study import study
+from studies.command import study
 
 
 def main() -> None:

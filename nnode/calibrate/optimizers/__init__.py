@@ -11,7 +11,6 @@ from omegaconf import MISSING
 from torch.optim import Optimizer
 
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
-from nnode.calibrate.optimizers.consensus import ConsensusBased
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.parameters import ParameterVector
 from nnode.errors import ConfigError
@@ -59,19 +58,6 @@ class LbfgsOptions(OptimizerOptions):
 
 
 @dataclass
-class ConsensusOptions(OptimizerOptions):
-    """Consensus-based optimisation; wants all sequences in one mini-batch."""
-
-    name: str = "cbo"
-    particles: int = 30  # parameter sets at a time
-    spread: float = 0.5  # standard deviation of their start
-    alpha: float = 30.0  # weight of good ones in the consensus
-    drift: float = 1.0  # towards the consensus, per unit of time
-    sigma: float = 2.0  # noise, by the distance from the consensus
-    dt: float = 0.1  # of a step, no unit
-
-
-@dataclass
 class GaussNewtonOptions(OptimizerOptions):
     """Damped Gauss-Newton; formulas of lanes or people, solver=fused, all sequences at once."""
 
@@ -100,9 +86,6 @@ OPTIMIZERS: dict[str, Callable[[System, dict[str, Any], int], Optimizer]] = {
         _trained(model), betas=(o.pop("beta1"), o.pop("beta2")), **o
     ),
     "lbfgs": lambda model, o, _: _lbfgs(model, o),
-    "cbo": lambda model, o, seed: ConsensusBased(
-        _trained(model), **o, project=model.project_, seed=seed
-    ),
     "gauss_newton": lambda model, o, _: GaussNewton(model, **o),
 }
 
@@ -110,7 +93,7 @@ OPTIMIZERS: dict[str, Callable[[System, dict[str, Any], int], Optimizer]] = {
 def needs_full_batch(name: str) -> bool:
     """Whether the optimiser compares costs of different steps, so that they must be of the
     same sequences."""
-    return name in ("lbfgs", "cbo", "gauss_newton")
+    return name in ("lbfgs", "gauss_newton")
 
 
 def build_optimizer(model: System, options: OptimizerOptions, seed: int = 0) -> Optimizer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,6 +165,33 @@ class Meaning:
     unit: str
     sure: str
     rivals: tuple[str, ...] = ()
+
+
+def clock_of(found: Collection[str]) -> str:
+    """The meaning of the column that times are from, ``time`` or ``frame``."""
+    return "time" if "time" in found else "frame"
+
+
+def are_pairs(found: Collection[str]) -> bool:
+    """Whether meanings are those of a follower and its leader, with or without positions."""
+    return {"x_follower", "x_leader"} <= set(found) or is_spaced(found)
+
+
+def is_spaced(found: Collection[str]) -> bool:
+    """Whether meanings are those of pairs whose positions follow from spacing and speeds."""
+    return {"spacing", "v_follower", "v_leader"} <= set(found) and not (
+        {"x", "x_follower", "x_leader"} & set(found)
+    )
+
+
+def rivals(found: Mapping[str, Meaning]) -> dict[str, str]:
+    """By meaning, that more than one column may have it, in words."""
+    return {
+        meaning: f"the column of {meaning} may be {one.column} or {' or '.join(one.rivals)}, which "
+        f"hold different values; say which, as in data.columns.{meaning}={one.column}"
+        for meaning, one in found.items()
+        if one.rivals
+    }
 
 
 def plain(name: str) -> tuple[str, str]:

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from nnode.data.check import findings as find
-from nnode.data.check.columns import Meaning, in_seconds, meanings
+from nnode.data.check.columns import (
+    Meaning,
+    are_pairs,
+    clock_of,
+    in_seconds,
+    is_spaced,
+    meanings,
+    rivals,
+)
 from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.rows import scaled
-from nnode.data.check.scale import Medians, Scale, medians
-from nnode.data.check.source import Source, are_pairs, is_spaced, native_source, source_of
-from nnode.data.check.tracks import Tracks, tracks_from
+from nnode.data.check.scale import LIKELY, SURE, Medians, Scale, medians
+from nnode.data.check.source import Recognised, native_source, source_of, source_of_native
 from nnode.data.cut import Reading
 from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
@@ -21,15 +30,11 @@ from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
+from nnode.data.trajectories import Trajectories
 from nnode.errors import NNodeError
 
 #: Sequences in which faults are looked for.
 MOST = 400
-#: How sure something is, by its probability.
-SURE, LIKELY = 0.95, 0.7
-#: A rate that is no less probable than this fits.
-FAIR = 0.05
-
 #: Formats whose records are cut: where one begins or ends, nobody comes or goes.
 _CUT = ("esimas", "openacc", "astazero")
 
@@ -47,7 +52,7 @@ class Examination:
         meanings: column by meaning; empty where the format fixes them.
         scales: combinations of units, the most probable first; one where the format fixes them.
         known: medians in the file's own units.
-        tracks: rows in SI units, by the most probable units.
+        rows: in order and in SI units, by the most probable units.
         findings: errors first.
         source: what reads it, with its options.
         sequences: that the reader makes, at most :data:`MOST`.
@@ -59,9 +64,9 @@ class Examination:
     meanings: dict[str, Meaning]
     scales: list[Scale]
     known: Medians
-    tracks: Tracks
+    rows: Trajectories
     findings: list[Finding]
-    source: Source
+    source: Recognised
     sequences: list[Sequence] = field(default_factory=list)
     faults: dict[str, list[Fault]] = field(default_factory=dict)
 
@@ -103,14 +108,51 @@ def examine(path: Path, domain: Domain | None = None, rate: float | None = None)
 
 def _native(raw: Raw) -> Examination:
     """A format whose reader knows its units."""
-    source = source_of(raw)
+    source = source_of_native(raw)
     sequences = _read(source)
-    tracks = tracks_from(sequences, cut=raw.native in _CUT)
-    domain: Domain = "crowd" if tracks.x.shape[1] == 2 else "traffic"
-    known = medians(tracks, domain)
+    rows = _rows_of(raw, sequences)
+    domain: Domain = "crowd" if rows.x.shape[1] == 2 else "traffic"
     scale = replace(_SI, domain=domain)
-    found = Examination(raw.path, raw, {}, [scale], known, tracks, [], source)
+    found = Examination(raw.path, raw, {}, [scale], medians(rows, domain), rows, [], source)
     return _judged(found, sequences, None)
+
+
+def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
+    """Sequences that a reader made, as rows in order.
+
+    An agent without an identifier is one of its own, and so is everyone in sequences whose
+    positions begin anew.
+    """
+    parts: list[tuple[np.ndarray, ...]] = []
+    for s in sequences:
+        n, k = s.n_agents, s.n_samples
+        whose = s.name if raw.native in _CUT or not s.agents else s.recording
+        names = [f"{whose} {name}" for name in s.agents or range(n)]
+        v = np.full((k, n), np.nan) if s.v is None else np.linalg.norm(s.v, axis=2)
+        length = np.full(n, np.nan) if s.length is None else s.length
+        parts.append(
+            (
+                np.tile(np.array(names, dtype=object), k),
+                np.repeat(s.time, n),
+                s.x.reshape(k * n, -1),
+                v.reshape(-1, 1),
+                np.tile(length, k),
+                np.full(k * n, s.recording, dtype=object),
+            )
+        )
+    agent, time, x, v, length, recording = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return Trajectories(
+        path=raw.path,
+        name=raw.path.stem,
+        where=str,
+        agent=agent,
+        time=time,
+        x=x,
+        v=None if np.isnan(v).all() else v,
+        recording=recording,
+        lane=recording,
+        length=None if np.isnan(length).all() else length,
+    ).in_order()
 
 
 def _table(
@@ -121,70 +163,31 @@ def _table(
     seen = scaled(raw, found, domain, rate)
     found = seen.meanings
     rate = rate or raw.rate
-    every = seen.scales
-    source = source_of(raw, found, seen.scale, seen.tracks)
-    examined = Examination(raw.path, raw, found, every, seen.known, seen.tracks, [], source)
+    source = source_of(raw, seen)
+    examined = Examination(raw.path, raw, found, seen.scales, seen.known, seen.rows, [], source)
     needed: dict[str, str] = {
         m: found[m].column
-        for m in ("agent", seen.clock, "x", "y", "x_follower", "x_leader")
+        for m in ("agent", clock_of(found), "x", "y", "x_follower", "x_leader")
         if m in found
     }
     if is_spaced(found):
         needed |= {m: found[m].column for m in ("spacing", "v_follower", "v_leader")}
     examined.findings += find.cells(table, needed)
-    examined.findings += find.rows(table, seen.agent[: len(table)], seen.time[: len(table)])
-    examined.findings += _unsure(every, rate)
-    examined.findings += _rivals(found)
+    stand = seen.table.at(np.arange(len(table)))
+    examined.findings += find.order(stand, int(table.frame.duplicated().sum()))
+    doubts = [("units", text) for text in seen.doubts(rate).values()]
+    doubts += [("columns", text) for text in rivals(found).values()]
+    examined.findings += [Finding(kind, "warning", text) for kind, text in doubts]
     sequences = _tried(source, examined.findings)
     return _judged(examined, sequences, rate)
 
 
-def _rivals(found: Mapping[str, Meaning]) -> Iterator[Finding]:
-    """Meanings that more than one column may have."""
-    for meaning, one in found.items():
-        if one.rivals:
-            yield Finding(
-                "columns",
-                "warning",
-                f"{meaning} may be {one.column} or {' or '.join(one.rivals)}, which hold different "
-                f"values; {one.column} is taken",
-            )
-
-
-def _unsure(every: list[Scale], rate: float | None) -> Iterator[Finding]:
-    """What is known too little: the frame rate, or units."""
-    best = every[0]
-    same = [one for one in every if unit_names(one) == unit_names(best)]
-    if sum(one.probability for one in same) < LIKELY:
-        others = "; ".join(f"{_words(one)} ({one.probability:.0%})" for one in every[:3])
-        yield Finding("units", "warning", f"units are a guess: {others}; say what you know")
-    if rate is None and best.rate is not None:
-        rates = sorted(one.rate for one in same if one.rate and one.probability > FAIR)
-        yield Finding(
-            "units",
-            "warning",
-            f"times are frames of a rate that the file does not tell; of the usual ones "
-            f"{', '.join(f'{one:g}' for one in rates)} frames/s fit, {best.rate:g} is taken: tell "
-            "the right one with frame_rate=",
-        )
-
-
-def unit_names(scale: Scale) -> tuple[str, ...]:
-    """Domain and units, whatever the rate of frames."""
-    return scale.domain, scale.position, scale.time, scale.speed
-
-
-def _words(scale: Scale) -> str:
-    clock = f"{scale.rate:g} frames/s" if scale.rate else scale.time
-    return f"{scale.domain}, {scale.position}, {clock}, {scale.speed}"
-
-
-def _read(source: Source) -> list[Sequence]:
+def _read(source: Recognised) -> list[Sequence]:
     kind = FORMATS[type(source.options)]
     return kind.sequences(kind.files(source.options), source.options)
 
 
-def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:
+def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
     """The sequences that the reader makes of the file; what it refuses is a finding."""
     try:
         made = _read(source)
@@ -202,20 +205,19 @@ def _tried(source: Source, findings: list[Finding]) -> list[Sequence]:
 
 def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -> Examination:
     """With everything that rows and sequences show."""
-    tracks, domain = found.tracks, found.scale.domain
-    found.findings += find.sampling(tracks)
+    rows, domain = found.rows, found.scale.domain
+    found.findings += find.sampling(rows)
     found.findings += find.time_scale(found.known, found.scale, rate)
-    found.findings += find.extremes(tracks, domain)
-    found.findings += find.direction(tracks, domain)
+    found.findings += find.accelerations(rows)
+    found.findings += find.direction(rows, domain)
     whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
-    found.findings += find.coming_and_going(tracks, domain, whole)
+    found.findings += find.coming_and_going(rows, domain, whole)
     found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
     noise = measured_noise(found.sequences)
     known = 0.0 if found.source.options.published else noise.position
     found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain, known))}
     found.findings += find.measurement(noise, found.sequences, domain)
-    every = [fault for own in found.faults.values() for fault in own]
-    found.findings += find.faults(every, len(found.sequences))
+    found.findings += find.faults(found.faults, len(found.sequences))
     found.findings += _made(found, len(sequences))
     found.findings.sort(key=lambda one: _LEVELS.index(one.level))
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,14 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from nnode.data.check.scale import AGREE, INTERVAL, RATES, SWAYS, USUAL, Medians, Scale
-from nnode.data.check.tracks import Tracks
+from nnode.data.check.scale import AGREE, INTERVAL, RATES, SWAYS, USUAL, Medians, Scale, moves_of
 from nnode.data.policy import told_filled
-from nnode.data.quality import KINDS, LIMITS, Fault
+from nnode.data.quality import KINDS, LIMITS, Fault, by_kind
 from nnode.data.readers.columns import Table, floats, quoted
-from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequence import UNEVEN, Domain, Sequence
 from nnode.data.smooth import BEARABLE, Noise, suggested_window
-from nnode.data.trajectories import HOLE, UNEVEN
+from nnode.data.trajectories import HOLE, Trajectories
 
 #: Greatest acceleration of a tyre on dry road, whose friction is about 1, and of a person's shoe,
 #: over a second: that of gravity, m/s².
@@ -26,6 +24,10 @@ FRICTION = 9.81
 EDGE = 0.1
 #: Share of agents from which on something is told of all.
 FEW = 0.02
+
+
+#: Meanings of columns with a value for every sample.
+_SAMPLED = ("x", "y", "x_follower", "x_leader")
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
         bad = empty
         if meaning != "agent":
             bad = ~np.isfinite(floats(own))
+        if meaning in _SAMPLED and not bad.all():  # empty ones are missing samples
+            bad &= ~empty
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             shown = "nothing" if empty[i] else quoted(own.iloc[i])[:42]
@@ -62,36 +66,39 @@ def cells(table: Table, columns: dict[str, str]) -> Iterator[Finding]:
             )
 
 
-def rows(table: Table, agent: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
-    """One agent twice at one time, and rows that are not in order of time."""
-    code = pd.factorize(agent)[0]
+def order(rows: Trajectories, same: int) -> Iterator[Finding]:
+    """One agent twice at one time, and rows that are not in order of time.
+
+    Args:
+        same: number of rows that stood in the file before.
+    """
+    code, time = pd.factorize(rows.agent)[0], rows.time
     pairs = pd.DataFrame({"agent": code, "time": time})
     again = pairs.duplicated().to_numpy() & np.isfinite(time)
     if again.any():
         i = int(np.flatnonzero(again)[0])
-        whole = int(table.frame.duplicated().sum())
         yield Finding(
             "duplicates",
             "error",
-            f"{again.sum()} rows have an agent and a time that stood there before ({whole} of them "
-            f"are the same throughout), first agent {agent[i]} at {time[i]:g} in {table.row(i)}; "
-            "keep one row per agent and time, or tell agents of one name apart",
+            f"{again.sum()} rows have an agent and a time that stood there before ({same} of them "
+            f"are the same throughout), first agent {rows.agent[i]} at {time[i]:g} in "
+            f"{rows.where(i)}; keep one row per agent and time, or tell agents of one name apart",
         )
-    order = np.argsort(code, kind="stable")
-    back = (np.diff(time[order]) < 0) & (np.diff(code[order]) == 0)
+    by_agent = np.argsort(code, kind="stable")
+    back = (np.diff(time[by_agent]) < 0) & (np.diff(code[by_agent]) == 0)
     if back.any():
-        i = int(order[np.flatnonzero(back)[0] + 1])
+        i = int(by_agent[np.flatnonzero(back)[0] + 1])
         yield Finding(
             "unsorted",
             "note",
-            f"{back.sum()} rows stand before earlier ones of their agent, first in {table.row(i)}; "
-            "the readers sort them",
+            f"{back.sum()} rows stand before earlier ones of their agent, first in "
+            f"{rows.where(i)}; the readers sort them",
         )
 
 
-def sampling(tracks: Tracks) -> Iterator[Finding]:
+def sampling(rows: Trajectories) -> Iterator[Finding]:
     """Sampling interval, uneven steps, holes (s)."""
-    steps, dt = tracks.steps, tracks.dt
+    steps, dt = rows.steps, rows.dt
     if not steps.size:
         yield Finding(
             "rate", "error", "no agent has two rows at different times; nothing moves here"
@@ -195,15 +202,17 @@ def measurement(noise: Noise, sequences: list[Sequence], domain: Domain) -> Iter
     yield Finding("noise", "warning", text + cure)
 
 
-def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
-    """Steps, and accelerations over a second, that nobody can have (m, s)."""
-    yield from _jumps(tracks, domain)
-    moves = tracks.moves(max(1, round(1.0 / tracks.dt)) if tracks.dt > 0 else 1)
-    if not len(moves):
+def accelerations(rows: Trajectories) -> Iterator[Finding]:
+    """Accelerations over a second that nobody can have (m, s).
+
+    Steps that are too long, and identifiers that are swapped, are faults of the sequences.
+    """
+    moves = moves_of(rows, max(1, round(1.0 / rows.dt)) if rows.dt > 0 else 1)
+    if not moves.size.size:
         return
-    v = (tracks.x[moves.last] - tracks.x[moves.first]) / moves.took[:, None]
+    v = (rows.x[moves.last] - rows.x[moves.first]) / moves.took[:, None]
     # the next second of the same agent begins where this one ends
-    next_ = np.searchsorted(moves.first, moves.last).clip(max=len(moves) - 1)
+    next_ = np.searchsorted(moves.first, moves.last).clip(max=moves.first.size - 1)
     good = moves.first[next_] == moves.last
     a = np.linalg.norm(v[next_] - v, axis=1)[good] / moves.took[good]
     if a.size and (a > FRICTION).mean() > 0.001:
@@ -216,26 +225,12 @@ def extremes(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
         )
 
 
-def _jumps(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
-    """Steps that are too long; the faults of the sequences say where identifiers are swapped."""
-    steps, limits = tracks.moves(1), LIMITS[domain]
-    fast = steps.size > limits.max_speed * steps.took + limits.noise
-    if fast.any():
-        who = sorted({tracks.names[i] for i in tracks.agent[steps.first[fast]]})
-        yield Finding(
-            "fast",
-            "error",
-            f"{fast.sum()} of {len(steps)} steps are faster than {limits.max_speed:g} m/s, of "
-            f"{_some(who)}",
-        )
-
-
-def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
+def direction(rows: Trajectories, domain: Domain) -> Iterator[Finding]:
     """Which way agents go (m)."""
-    start, end = ends(tracks)
-    net = tracks.x[end] - tracks.x[start]
+    start, end = rows.ends()
+    net = rows.x[end] - rows.x[start]
     if domain == "traffic":
-        net = _usual(tracks)[:, None] * (end - start)[:, None]
+        net = _usual(rows)[:, None] * (end - start)[:, None]
     went = np.abs(net).max(axis=1) > 3 * LIMITS[domain].noise
     if not went.any():
         return
@@ -255,10 +250,9 @@ def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
         text = "all vehicles drive towards smaller positions; data.direction=-1 turns them"
         yield Finding("direction", "warning", text)
         return
-    lanes = np.zeros(went.sum(), int) if tracks.lane is None else tracks.lane[start][went]
-    both = [i for i in np.unique(lanes) if 0 < back[lanes == i].mean() < 1]
-    names = [str(tracks.lanes[i]) for i in both] if tracks.lane is not None else []
-    where = f" in lane {_some(names)}" if names else ""
+    lanes = np.full(went.sum(), "") if rows.lane is None else rows.lane[start][went]
+    both = [name for name in dict.fromkeys(lanes) if 0 < back[lanes == name].mean() < 1]
+    where = f" in lane {_some(both)}" if both and rows.lane is not None else ""
     opposed = "both ways" + where if both else "one way in some lanes, the other way in others"
     yield Finding(
         "direction",
@@ -268,54 +262,48 @@ def direction(tracks: Tracks, domain: Domain) -> Iterator[Finding]:
     )
 
 
-def _usual(tracks: Tracks) -> np.ndarray:
+def _usual(rows: Trajectories) -> np.ndarray:
     """Median step of every agent along the lane: one that is wrong does not turn it."""
-    same = np.diff(tracks.agent) == 0
-    step = pd.Series(np.diff(tracks.x[:, 0])[same])
-    found = step.groupby(tracks.agent[1:][same]).median()
-    return np.array(found.reindex(np.unique(tracks.agent)).fillna(0.0), dtype=float)
+    same = rows.agent[1:] == rows.agent[:-1]
+    step = pd.Series(np.diff(rows.x[:, 0])[same])
+    found = step.groupby(rows.agent[1:][same]).median()
+    return np.array(found.reindex(rows.agent[rows.ends()[0]]).fillna(0.0), dtype=float)
 
 
-def ends(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
-    """First and last row of every agent."""
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    return start, np.append(start[1:], len(tracks)) - 1
-
-
-def coming_and_going(tracks: Tracks, domain: Domain, whole: bool) -> Iterator[Finding]:
+def coming_and_going(rows: Trajectories, domain: Domain, whole: bool) -> Iterator[Finding]:
     """Who is there, who enters and leaves, and whose record breaks off where nobody can (m, s).
 
     Args:
         whole: whether records begin and end where agents come and go, not where they were cut.
     """
-    start, end = ends(tracks)
-    times, count = np.unique(tracks.time, return_counts=True)
+    start, end = rows.ends()
+    times, count = np.unique(rows.time, return_counts=True)
     span = times[-1] - times[0]
     yield Finding(
         "agents",
         "note",
         f"{len(start)} {'people' if domain == 'crowd' else 'vehicles'} in {span:.5g} s, "
         f"{np.median(count):.0f} at a time (at most {count.max()}), each for "
-        f"{np.median(tracks.time[end] - tracks.time[start]):.3g} s",
+        f"{np.median(rows.time[end] - rows.time[start]):.3g} s",
     )
     if not whole:
         return
-    axis = int(np.argmax(np.abs(tracks.x[end] - tracks.x[start]).sum(axis=0)))
-    low, high = np.percentile(tracks.x[:, axis], [1, 99])
+    axis = int(np.argmax(np.abs(rows.x[end] - rows.x[start]).sum(axis=0)))
+    low, high = np.percentile(rows.x[:, axis], [1, 99])
     edge = EDGE * (high - low)
 
-    part = np.zeros(len(tracks), int) if tracks.part is None else tracks.part
-    clock = pd.Series(tracks.time).groupby(part)
+    part = np.zeros(len(rows), int) if rows.recording is None else rows.recording
+    clock = pd.Series(rows.time).groupby(part)
 
-    def inside(rows: np.ndarray, moments: pd.Series) -> np.ndarray:
-        at = tracks.x[rows, axis]
+    def inside(chosen: np.ndarray, moments: pd.Series) -> np.ndarray:
+        at = rows.x[chosen, axis]
         found: np.ndarray = (at > low + edge) & (at < high - edge)
-        return found & (np.abs(tracks.time[rows] - moments.to_numpy()[rows]) > tracks.dt)
+        return found & (np.abs(rows.time[chosen] - moments.to_numpy()[chosen]) > rows.dt)
 
     born, gone = inside(start, clock.transform("min")), inside(end, clock.transform("max"))
     if not (born.any() or gone.any()):
         return
-    again = _continued(tracks, start[born], end[gone], domain)
+    again = _continued(rows, start[born], end[gone], domain)
     text = (
         f"{born.sum()} agents appear and {gone.sum()} vanish in the middle of what is covered, "
         "away from its ends and from the recording's or sequence's"
@@ -330,37 +318,36 @@ def coming_and_going(tracks: Tracks, domain: Domain, whole: bool) -> Iterator[Fi
 
 
 def _continued(
-    tracks: Tracks, born: np.ndarray, gone: np.ndarray, domain: Domain
+    rows: Trajectories, born: np.ndarray, gone: np.ndarray, domain: Domain
 ) -> list[tuple[str, str]]:
     """Agents that end and others that begin where these would be, within ten samples."""
     if not (len(born) and len(gone)):
         return []
     found = []
     # time as a third coordinate: ten samples count like the reach
-    clock = LIMITS[domain].reach / (10 * tracks.dt)
+    clock = LIMITS[domain].reach / (10 * rows.dt)
     before = np.maximum(gone - 1, 0)
-    v = (tracks.x[gone] - tracks.x[before]) / tracks.dt
-    v[tracks.agent[before] != tracks.agent[gone]] = 0
-    tree = cKDTree(np.column_stack([tracks.x[born], clock * tracks.time[born]]))
+    v = (rows.x[gone] - rows.x[before]) / rows.dt
+    v[rows.agent[before] != rows.agent[gone]] = 0
+    tree = cKDTree(np.column_stack([rows.x[born], clock * rows.time[born]]))
     for k in range(1, 11):
-        then = tracks.x[gone] + k * tracks.dt * v
-        at = np.column_stack([then, clock * (tracks.time[gone] + k * tracks.dt)])
+        then = rows.x[gone] + k * rows.dt * v
+        at = np.column_stack([then, clock * (rows.time[gone] + k * rows.dt)])
         away, which = tree.query(at, distance_upper_bound=LIMITS[domain].reach / 2)
         for i in np.flatnonzero(np.isfinite(away)):
             row = born[which[i]]
-            late = tracks.time[row] - tracks.time[gone[i]]
-            if 0 < late < 10.5 * tracks.dt and tracks.agent[row] != tracks.agent[gone[i]]:
-                found.append((tracks.names[tracks.agent[gone[i]]], tracks.names[tracks.agent[row]]))
+            late = rows.time[row] - rows.time[gone[i]]
+            if 0 < late < 10.5 * rows.dt and rows.agent[row] != rows.agent[gone[i]]:
+                found.append((rows.agent[gone[i]], rows.agent[row]))
     return sorted(set(found))
 
 
-def faults(found: list[Fault], sequences: int) -> Iterator[Finding]:
+def faults(found: dict[str, list[Fault]], sequences: int) -> Iterator[Finding]:
     """What no vehicle and no person can have done, as :mod:`nnode.data.quality` finds it."""
-    counts = Counter(kind for kind, _ in {(f.kind, f.sequence) for f in found})
-    for kind, number in counts.most_common():
+    for kind, number in by_kind([f.kind for f in own] for own in found.values()).items():
         if kind == "too_short":
             continue
-        first = next(f for f in found if f.kind == kind)
+        first = next(f for own in found.values() for f in own if f.kind == kind)
         level = "error" if number > 0.1 * sequences else "warning"
         yield Finding(
             kind,

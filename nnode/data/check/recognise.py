@@ -6,52 +6,40 @@ The same recognition as that of the check, without a look at faults.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from nnode.data.check.columns import Meaning, in_seconds, meanings, plain
-from nnode.data.check.examine import FAIR, LIKELY, SURE, sure, unit_names
+from nnode.data.check.columns import Meaning, in_seconds, meanings, plain, rivals
+from nnode.data.check.examine import sure
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.rows import Scaled, scaled
-from nnode.data.check.scale import Scale
-from nnode.data.check.source import native_source, source_of
+from nnode.data.check.scale import SURE, Scale
+from nnode.data.check.source import (
+    CALLED,
+    Recognised,
+    native_source,
+    source_of,
+    source_of_native,
+)
 from nnode.data.options import DataOptions, PairOptions, TableOptions, VehicleTableOptions
+from nnode.data.readers import pairs, table, vehicles
 from nnode.data.readers.columns import Table
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError, DataError, NNodeError
 
 #: Formats of tables, by the group of their options, each with columns that it cannot do without.
 NEEDED: dict[str, tuple[type[DataOptions], set[str]]] = {
-    "pairs": (PairOptions, {"time", "x_follower", "x_leader"}),
-    "table": (TableOptions, {"sequence", "time", "agent", "x"}),
-    "vehicles": (VehicleTableOptions, {"vehicle", "time", "x"}),
+    "pairs": (PairOptions, set(pairs.REQUIRED)),
+    "table": (TableOptions, set(table.REQUIRED)),
+    "vehicles": (VehicleTableOptions, set(vehicles.REQUIRED)),
 }
 #: Columns of pairs whose positions are integrated.
-SPACED = {"time", "spacing", "v_follower", "v_leader"}
-#: Meanings that readers call by another name.
-_CALLED = {"vehicle": "agent", "run": "recording"}
+SPACED = {"time", *pairs.INTEGRATED}
 #: Options that say units, by the quantity.
 UNIT = {"position": "position_unit", "time": "time_unit", "speed": "speed_unit"}
-
-
-@dataclass(frozen=True)
-class Recognised:
-    """How a table is read.
-
-    Attributes:
-        group: of the options, as in ``conf/data``.
-        options: that read the table.
-        table: what they read; None: the file that they name.
-        line: what was recognised, in words; empty where names and units are those of the format.
-    """
-
-    group: str
-    options: DataOptions
-    table: Table | None
-    line: str
 
 
 def recognised(
@@ -76,29 +64,39 @@ def recognised(
     """
     if domain not in (None, "traffic", "crowd"):
         raise ConfigError(f"data.domain={domain}: expected traffic or crowd")
-    memory = isinstance(source, pd.DataFrame)
-    if isinstance(source, pd.DataFrame):
-        raw = Raw(Path("table"), table=Table(source), separator="")
-    else:
-        raw = read_raw(Path(source).expanduser())
+    raw, memory = _raw(source), isinstance(source, pd.DataFrame)
     if raw.table is None:
         return _native(raw)
-    return _of_table(in_seconds(raw), memory, domain, dict(given or {}))
+    found = _of_table(in_seconds(raw), memory, domain, dict(given or {}))
+    if not memory:
+        return found
+    return replace(
+        found,
+        options=replace(found.options, path=""),  # type: ignore[call-arg]
+        table=raw.table,
+    )
+
+
+def _raw(source: pd.DataFrame | str | Path) -> Raw:
+    if isinstance(source, pd.DataFrame):
+        return Raw(Path("table"), table=Table(source), separator="")
+    return read_raw(Path(source).expanduser())
 
 
 def _of_table(
     raw: Raw, memory: bool, domain: Domain | None, given: Mapping[str, Any]
 ) -> Recognised:
     """How columns are read; ``memory`` says that the table comes from no file."""
-    assert raw.table is not None
-    exact = _exact(raw.table, given)
+    exact = _exact(raw, given)
     if exact == "table":
         return _tidy(raw, domain, given)
     found = _with_given(raw, meanings(raw), given)
     if exact is None and not memory and (native := native_source(raw, found)) is not None:
         return _native(replace(raw, native=native))
-    if exact is None:
-        _clear(raw, found)
+    unclear = rivals(found) if exact is None else {}
+    for meaning in ("agent", "time", "frame", "x", "y", "sequence", "lane"):
+        if meaning in unclear:
+            raise ConfigError(f"{raw.path}: {unclear[meaning]}")
     rate = given.get("frame_rate")
     told = {what: str(given[key]) for what, key in UNIT.items() if key in given}
     try:
@@ -108,30 +106,24 @@ def _of_table(
             raise
         return _by_name(raw, exact, given)
     if exact is None:
-        _sure_enough(raw, seen, rate or raw.rate, told)
-    elif told or _si(seen.scale) or _share(seen) < SURE:
+        _check_units(raw, seen, rate or raw.rate, told)
+    elif told or _si(seen.scale) or seen.share < SURE:
         return _by_name(raw, exact, given)
     found = seen.meanings
-    read = source_of(raw, found, seen.scale, seen.tracks)
-    line = _line(raw, found, seen, read.group)
-    if not memory:
-        return Recognised(read.group, read.options, None, line)
-    options = replace(read.options, path="")  # type: ignore[call-arg]
-    return Recognised(read.group, options, raw.table, line)
+    read = source_of(raw, seen)
+    return replace(read, line=_line(raw, found, seen, read.group))
 
 
 def _native(raw: Raw) -> Recognised:
     """A file of a format whose reader knows its columns and units."""
-    read = source_of(raw)
-    return Recognised(read.group, read.options, None, f"{raw.path}: read as data={read.group}")
+    read = source_of_native(raw)
+    return replace(read, line=f"{raw.path}: read as data={read.group}")
 
 
 def _by_name(raw: Raw, group: str, given: Mapping[str, Any]) -> Recognised:
     """A table with the columns of a format, in the units that the format has by default."""
-    memory = raw.path == Path("table")
-    options = NEEDED[group][0](path="" if memory else str(raw.path))  # type: ignore[call-arg]
-    options = replace(options, columns=dict(given.get("columns") or {}))  # type: ignore[call-arg]
-    return Recognised(group, options, raw.table if memory else None, "")
+    columns = dict(given.get("columns") or {})
+    return Recognised(group, NEEDED[group][0](path=str(raw.path), columns=columns))  # type: ignore[call-arg]
 
 
 def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[str, Any]) -> bool:
@@ -139,26 +131,26 @@ def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[st
 
     What is no table, or no file, has them: its reader says what is wrong.
     """
-    if isinstance(source, pd.DataFrame):
-        names = {str(name).strip() for name in source.columns}
-    else:
-        path = Path(source).expanduser()
-        if not path.is_file():
-            return True
-        try:
-            table = read_raw(path).table
-        except NNodeError:
-            return True
-        if table is None:
-            return True
-        names = set(map(str, table.frame.columns))
-    names |= set(given.get("columns") or {})
+    try:
+        raw = _raw(source)
+    except NNodeError:
+        return True
+    return raw.table is None or _fits(group, _names(raw, given))
+
+
+def _names(raw: Raw, given: Mapping[str, Any]) -> set[str]:
+    """Columns under their own names, and the meanings of those that are given."""
+    assert raw.table is not None
+    return set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+
+
+def _fits(group: str, names: set[str]) -> bool:
     return names >= NEEDED[group][1] or (group == "pairs" and names >= SPACED)
 
 
-def _exact(table: Table, given: Mapping[str, Any]) -> str | None:
+def _exact(raw: Raw, given: Mapping[str, Any]) -> str | None:
     """The format whose columns a table has under their own names, or under those given."""
-    names = set(map(str, table.frame.columns)) | set(given.get("columns") or {})
+    names = _names(raw, given)
     if names >= SPACED and not names & {"x", "x_follower", "x_leader"}:
         return "pairs"
     if "vehicle" in names and "sequence" not in names and "x_follower" not in names:
@@ -168,8 +160,7 @@ def _exact(table: Table, given: Mapping[str, Any]) -> str | None:
 
 def _tidy(raw: Raw, domain: Domain | None, given: Mapping[str, Any]) -> Recognised:
     """A tidy table: its units are those that are documented, or given."""
-    assert raw.table is not None
-    names = set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+    names = _names(raw, given)
     chosen: Domain = domain or ("crowd" if "y" in names else "traffic")
     read, line = _by_name(raw, "table", given), ""
     if not any(key in given for key in UNIT.values()):
@@ -178,10 +169,10 @@ def _tidy(raw: Raw, domain: Domain | None, given: Mapping[str, Any]) -> Recognis
         except (DataError, ConfigError):
             return replace(read, options=replace(read.options, domain=chosen))
         best = seen.scale
-        if not _si(best) and _share(seen) >= SURE:
+        if not _si(best) and seen.share >= SURE:
             line = (
                 f"{raw.path}: a tidy table is read in m and s, and its numbers look like "
-                f"{_words(best)}; {_how(best)} reads it so"
+                f"{best}; {best.options} reads it so"
             )
     return replace(read, options=replace(read.options, domain=chosen), line=line)
 
@@ -195,7 +186,7 @@ def _with_given(
     columns: Mapping[str, str | None] = given.get("columns") or {}
     own: dict[str, Meaning] = {}
     for key, column in columns.items():
-        meaning = _CALLED.get(str(key), str(key))
+        meaning = CALLED.get(str(key), str(key))
         if column is None:
             found = {m: one for m, one in found.items() if m != meaning}
             continue
@@ -213,73 +204,26 @@ def _with_given(
     return {m: one for m, one in found.items() if one.column not in taken} | own
 
 
-def _clear(raw: Raw, found: Mapping[str, Meaning]) -> None:
-    """Refuse columns that may be two things.
+def _check_units(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, str]) -> None:
+    """Refuse units, or rates of frames, that may be two things.
 
     Raises:
         ConfigError: names both.
     """
-    for meaning, one in found.items():
-        if one.rivals and meaning in ("agent", "time", "frame", "x", "y", "sequence", "lane"):
-            raise ConfigError(
-                f"{raw.path}: the column of {meaning} may be {one.column} or "
-                f"{' or '.join(one.rivals)}, which hold different values; say which, as in "
-                f"data.columns.{meaning}={one.column}"
-            )
-
-
-def _sure_enough(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, str]) -> None:
-    """Refuse units that may be two things.
-
-    Raises:
-        ConfigError: names both.
-    """
-    best = seen.scale
-    if _share(seen) < LIKELY and not told:
-        other = next(one for one in seen.scales if unit_names(one) != unit_names(best))
-        raise ConfigError(
-            f"{raw.path}: its numbers may be {_words(best)} or {_words(other)}; say which, with "
-            f"{_how(best)} or {_how(other)}"
-        )
-    if best.rate is not None and rate is None:
-        rates = {
-            one.rate: one.probability
-            for one in seen.scales
-            if one.rate and unit_names(one) == unit_names(best) and one.probability > FAIR
-        }
-        if len(rates) > 1:
-            listed = " or ".join(f"{one:g}" for one in sorted(rates))
-            raise ConfigError(
-                f"{raw.path}: times are frames of a rate that it does not tell; {listed} frames/s "
-                f"fit: say which, as in data.frame_rate={best.rate:g}"
-            )
+    doubts = seen.doubts(rate)
+    if "units" in doubts and not told:
+        raise ConfigError(f"{raw.path}: {doubts['units']}")
+    if len(seen.rates(rate)) > 1:
+        raise ConfigError(f"{raw.path}: {doubts['rate']}")
 
 
 def _si(scale: Scale) -> bool:
     return (scale.position, scale.time, scale.rate, scale.speed) == ("m", "s", None, "m/s")
 
 
-def _share(seen: Scaled) -> float:
-    """Probability of the units, whatever the rate of frames."""
-    return sum(s.probability for s in seen.scales if unit_names(s) == unit_names(seen.scale))
-
-
-def _words(scale: Scale) -> str:
-    clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
-    people = "people" if scale.domain == "crowd" else "vehicles"
-    return f"{people}, positions in {scale.position}, times in {clock}, speeds in {scale.speed}"
-
-
-def _how(scale: Scale) -> str:
-    """Options that say units."""
-    said = [f"data.position_unit={scale.position}", f"data.time_unit={scale.time}"]
-    said += [f"data.frame_rate={scale.rate:g}"] if scale.rate else []
-    return " ".join(said)
-
-
 def _line(raw: Raw, found: Mapping[str, Meaning], seen: Scaled, group: str) -> str:
     named = ", ".join(f"{meaning} = {one.column}" for meaning, one in found.items())
-    words, scale = f"{_words(seen.scale)} ({sure(_share(seen))})", seen.scale
+    words, scale = f"{seen.scale} ({sure(seen.share)})", seen.scale
     if scale.rate is not None and raw.rate not in (None, scale.rate):
-        words = f"{_words(replace(scale, rate=raw.rate))} as it tells; {scale.rate:g} frames/s fit"
+        words = f"{replace(scale, rate=raw.rate)} as it tells; {scale.rate:g} frames/s fit"
     return f"{raw.path}: recognised {named}; {words}; read as data={group}"

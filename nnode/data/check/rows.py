@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from nnode.data.check.columns import Meaning, numbers
+from nnode.data.check.columns import Meaning, are_pairs, clock_of, is_spaced, numbers
 from nnode.data.check.raw import Raw
-from nnode.data.check.scale import Medians, Scale, medians, scales
-from nnode.data.check.source import are_pairs, is_spaced
-from nnode.data.check.tracks import LAG, Tracks, tracks_of
+from nnode.data.check.scale import FAIR, LAG, LIKELY, Medians, Scale, medians, scales
 from nnode.data.sequence import Domain
+from nnode.data.trajectories import Trajectories
 from nnode.errors import DataError
 
 #: Columns whose names tell a unit.
-_TELL: dict[str, tuple[str, ...]] = {
-    "position": ("x", "x_follower", "spacing"),
-    "time": (),
-    "speed": ("speed", "vx", "v_follower"),
-}
+_TELL = {"position": ("x", "x_follower", "spacing"), "speed": ("speed", "vx", "v_follower")}
 
 
 @dataclass(frozen=True)
@@ -32,198 +27,248 @@ class Scaled:
         meanings: column by meaning; that of pairs' columns is found beside a leader's.
         scales: combinations of units, the most probable first.
         known: medians in the file's own units.
-        tracks: rows in SI units.
-        agent, time: of every row, in the file's own units.
-        clock: the meaning of the column that times are from, ``time`` or ``frame``.
+        table: rows as they stand, in the file's own units; of pairs the followers' and then the
+            leaders'.
+        rows: those that can be used, in order and in SI units.
     """
 
     meanings: dict[str, Meaning]
     scales: list[Scale]
     known: Medians
-    tracks: Tracks
-    agent: np.ndarray
-    time: np.ndarray
-    clock: str
+    table: Trajectories
+    rows: Trajectories
 
     @property
     def scale(self) -> Scale:
         """The units that are taken."""
         return self.scales[0]
 
+    @property
+    def share(self) -> float:
+        """Probability of the units, whatever the rate of frames."""
+        return sum(s.probability for s in self.scales if s.units == self.scale.units)
+
+    def rates(self, told: float | None) -> list[float]:
+        """Frames per second that fit, where times are frames and nothing tells their rate."""
+        if told is not None or self.scale.rate is None:
+            return []
+        same = (s for s in self.scales if s.units == self.scale.units and s.probability > FAIR)
+        return sorted({s.rate for s in same if s.rate})
+
+    def doubts(self, told: float | None) -> dict[str, str]:
+        """What may be two things, ``units`` and ``rate``, in words.
+
+        Args:
+            told: frames per second as the file or the user tells.
+        """
+        sentences, best = {}, self.scale
+        if self.share < LIKELY:
+            other = next(s for s in self.scales if s.units != best.units)
+            sentences["units"] = (
+                f"its numbers may be {best} or {other}; say which, with {best.options} or "
+                f"{other.options}"
+            )
+        if rates := self.rates(told):
+            fit = " or ".join(f"{rate:g}" for rate in rates)
+            sentences["rate"] = (
+                f"times are frames of a rate that the file does not tell; {fit} frames/s fit: say "
+                f"the right one, as in data.frame_rate={best.rate:g}"
+            )
+        return sentences
+
 
 def scaled(
     raw: Raw,
-    found: Mapping[str, Meaning],
+    meanings: Mapping[str, Meaning],
     domain: Domain | None,
     rate: float | None,
-    told: Mapping[str, str] | None = None,
+    told_units: Mapping[str, str] | None = None,
 ) -> Scaled:
     """Rows of a table, and its units.
 
     Args:
-        found: column by meaning.
+        meanings: column by meaning.
         domain, rate: see :func:`examine`.
-        told: units by ``position``, ``time``, ``speed``, as the user tells them.
+        told_units: units by ``position``, ``time``, ``speed``, as the user tells them.
 
     Raises:
         DataError: a column that is needed was not recognised, or nothing moves.
     """
-    table = raw.table
+    meanings = _counted(raw, _of_pairs(raw, dict(meanings)))
+    table = _rows(raw, meanings)
+    clock = clock_of(meanings)
+    rows = table.in_order()
+    if len(rows) < 2 or not rows.steps.size:
+        number = len(_cells(raw))
+        raise DataError(
+            f"{raw.path}: {number} row{'s' * (number != 1)}, in which no agent of column "
+            f"{meanings.get('agent', meanings[clock]).column!r} has numbers at two times; "
+            "nothing moves that could be looked at"
+        )
+    units = {"time": "s" if meanings[clock].column in raw.dated else meanings[clock].unit}
+    for what, tellers in _TELL.items():
+        units[what] = next((u for m in tellers if m in meanings and (u := meanings[m].unit)), "")
+    units |= {"position": raw.unit} if raw.unit else {}
+    units |= told_units or {}
+    if clock == "frame":
+        units["time"] = "frame"
+    domain_medians = {d: medians(rows, d) for d in _domains(meanings, rows, domain)}
+    every = scales(
+        domain_medians,
+        {what: unit for what, unit in units.items() if unit},
+        frames=clock == "frame" or bool((rows.time % 1 == 0).all()),
+        rate=rate or raw.rate,
+        speeds=rows.v is not None,
+    )
+    scale = every[0]
+    si = replace(
+        rows,
+        time=rows.time * scale.seconds,
+        x=rows.x * scale.metres,
+        v=None if rows.v is None else rows.v * scale.per_second,
+        length=None if rows.length is None else rows.length * scale.metres,
+    )
+    return Scaled(meanings, every, domain_medians[scale.domain], table, si)
+
+
+def _cells(raw: Raw) -> pd.DataFrame:
+    assert raw.table is not None
+    return raw.table.frame
+
+
+def _counted(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
+    """Meanings without a time that is nothing but the number of the frame."""
+    assert raw.table is not None
+    if not {"time", "frame"} <= set(meanings):
+        return meanings
+    time, frame = (numbers(raw.table.frame, meanings[m].column) for m in ("time", "frame"))
+    if not np.array_equal(time, frame, equal_nan=True):
+        return meanings
+    return {m: meaning for m, meaning in meanings.items() if m != "time"}
+
+
+def _domains(
+    meanings: Mapping[str, Meaning], rows: Trajectories, asked: Domain | None
+) -> list[Domain]:
+    if rows.x.shape[1] == 1:
+        return ["traffic"]
+    if asked:
+        return [asked]
+    names = {m.column.lower() for m in meanings.values()}
+    if any(word in name for name in names for word in ("ped", "person")):
+        return ["crowd"]
+    return ["traffic"] if "lane" in meanings else ["crowd", "traffic"]
+
+
+def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
+    """The rows as they stand: what tells recordings and sequences apart is part of the name."""
+    table, pairs = raw.table, are_pairs(found)
     assert table is not None
-    found = _of_pairs(raw, dict(found))
-    pairs = are_pairs(found)
-    found = _counted(raw, found)
-    clock = next((m for m in ("time", "frame") if m in found), None)
-    lacking = [] if clock else ["a time or a frame"]
-    lacking += [] if pairs or "x" in found else ["a position x"]
-    lacking += [] if pairs or "agent" in found else ["an agent"]
-    if lacking or clock is None:
-        listed = ", ".join(map(str, table.frame.columns[:20]))
-        taken = ", ".join(f"{m.column} as {meaning}" for meaning, m in found.items())
+    _check_needed(raw, found, pairs)
+
+    def cells(*meanings: str) -> list[np.ndarray]:
+        return [numbers(table.frame, found[m].column) for m in meanings if m in found]
+
+    def names(*meanings: str) -> list[np.ndarray]:
+        return [table.names(found[m].column, empty=True) for m in meanings if m in found]
+
+    parts = names("recording", "sequence")
+    (time,) = cells(clock_of(found))
+    if pairs:
+        pair = _pairs(raw, found)
+        leads = ["follower", "leader"]
+        x = _integrated(raw, found) if is_spaced(found) else cells("x_follower", "x_leader")
+        v = cells("v_follower", "v_leader")
+        return Trajectories(
+            path=raw.path,
+            name=raw.path.stem,
+            where=lambda i: table.row(i % len(table)),
+            agent=np.concatenate([pair + f" {who}" for who in leads]),
+            time=np.tile(time, 2),
+            x=np.concatenate(x)[:, None],
+            v=np.abs(np.concatenate(v))[:, None] if len(v) == 2 else None,
+            lane=np.tile(pair, 2),
+        )
+    (agent,) = names("agent")
+    agents = _joined([*parts, agent])
+    agents[agent == ""] = None
+    # along the lane where there are lanes
+    x = cells("x") if "lane" in found else cells("x", "y")
+    v = cells("vx", "vy")[: len(x)]
+    speed = [np.sqrt(sum(part**2 for part in v))] if len(v) == len(x) else cells("speed")
+    part = _joined(parts) if parts else None
+    lane = names("lane") or ([part] if part is not None and len(x) == 1 else [])
+    return Trajectories(
+        path=raw.path,
+        name=raw.path.stem,
+        where=table.row,
+        agent=agents,
+        time=time,
+        x=np.stack(x, -1),
+        v=np.abs(speed[0])[:, None] if speed else None,
+        recording=part,
+        lane=lane[0] if lane else None,
+        length=next(iter(cells("length")), None),
+    )
+
+
+def _check_needed(raw: Raw, meanings: Mapping[str, Meaning], pairs: bool) -> None:
+    """Refuse a table without the columns that are needed."""
+    lacking = [] if {"time", "frame"} & set(meanings) else ["a time or a frame"]
+    lacking += [] if pairs or "x" in meanings else ["a position x"]
+    lacking += [] if pairs or "agent" in meanings else ["an agent"]
+    if lacking:
+        listed = ", ".join(map(str, _cells(raw).columns[:20]))
+        taken = ", ".join(f"{m.column} as {meaning}" for meaning, m in meanings.items())
         raise DataError(
             f"{raw.path}: no column was recognised as {' nor as '.join(lacking)}; it has {listed} "
             f"(taken: {taken or 'none'}); name the columns agent, time, x (and y), see docs/data.md"
         )
-    time = numbers(table.frame, found[clock].column)
-    files = _agents(raw, found, pairs)
-    x, speed, length, lane = _places(raw, found, pairs)
-    if pairs:
-        time = np.concatenate([time, time])
-    tracks = tracks_of(files, time, x, speed, lane, length, None if pairs else _parts(raw, found))
-    if len(tracks) < 2 or not tracks.steps.size:
-        raise DataError(
-            f"{raw.path}: {len(table)} row{'s' * (len(table) != 1)}, in which no agent of column "
-            f"{found.get('agent', found[clock]).column!r} has numbers at two times; "
-            "nothing moves that could be looked at"
-        )
-    units: dict[str, str] = {}
-    for what, tellers in _TELL.items():
-        for meaning in (*tellers, clock) if what == "time" else tellers:
-            if not units.get(what) and meaning in found:
-                units[what] = found[meaning].unit
-    if raw.unit:
-        units["position"] = raw.unit
-    units |= told or {}
-    if clock == "frame":
-        units["time"] = "frame"
-    if found[clock].column in raw.dated:
-        units["time"] = "s"
-    rate = rate or raw.rate
-    known = {d: medians(tracks, d) for d in _domains(found, tracks, domain)}
-    frames = clock == "frame" or bool((tracks.time % 1 == 0).all())
-    every = scales(
-        known,
-        {k: v for k, v in units.items() if v},
-        frames=frames,
-        rate=rate,
-        speeds=speed is not None,
-    )
-    scale = every[0]
-    si = tracks.scaled(scale.metres, scale.seconds, scale.per_second)
-    return Scaled(found, every, known[scale.domain], si, files, time, clock)
 
 
-def _counted(raw: Raw, found: dict[str, Meaning]) -> dict[str, Meaning]:
-    """Meanings without a time that is nothing but the number of the frame."""
+def _joined(columns: list[np.ndarray]) -> np.ndarray:
+    return np.array([" ".join(cells) for cells in zip(*columns, strict=True)], dtype=object)
+
+
+def _pairs(raw: Raw, meanings: Mapping[str, Meaning]) -> np.ndarray:
+    """``(rows,)`` names of the pairs that rows are of."""
     assert raw.table is not None
-    if not {"time", "frame"} <= set(found):
-        return found
-    time, frame = (numbers(raw.table.frame, found[m].column) for m in ("time", "frame"))
-    if not np.array_equal(time, frame, equal_nan=True):
-        return found
-    return {m: one for m, one in found.items() if m != "time"}
+    who = ("pair",) if "pair" in meanings else ("follower", "leader")
+    whose = [m for m in ("recording", "sequence", *who) if m in meanings]
+    parts = [
+        raw.table.names(meanings[m].column, empty=m not in ("follower", "leader")) for m in whose
+    ]
+    if not set(who) & set(meanings):
+        parts.append(np.full(len(raw.table), "pair", dtype=object))
+    return _joined(parts)
 
 
-def _domains(found: Mapping[str, Meaning], tracks: Tracks, asked: Domain | None) -> list[Domain]:
-    if tracks.x.shape[1] == 1:
-        return ["traffic"]
-    if asked:
-        return [asked]
-    names = {m.column.lower() for m in found.values()}
-    if any(word in name for name in names for word in ("ped", "person")):
-        return ["crowd"]
-    return ["traffic"] if "lane" in found else ["crowd", "traffic"]
-
-
-def _agents(raw: Raw, found: Mapping[str, Meaning], pairs: bool) -> np.ndarray:
-    """Whose row it is: what tells recordings and sequences apart is part of the name."""
-    assert raw.table is not None
-    whose = ("recording", "sequence", "pair") if pairs else ("recording", "sequence", "agent")
-    parts = [raw.table.names(found[m].column, empty=True) for m in whose if m in found]
-    if pairs and "pair" not in found:
-        own = [raw.table.names(found[m].column) for m in ("follower", "leader") if m in found]
-        parts += own or [np.full(len(raw.table), "pair", dtype=object)]
-    names = np.array([" ".join(cells) for cells in zip(*parts, strict=True)], dtype=object)
-    blank = parts[-1] == "" if not pairs else np.zeros(len(names), dtype=bool)
-    names[blank] = None
-    if pairs:
-        return np.concatenate([names + " follower", names + " leader"])
-    return names
-
-
-_Places = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray | None]
-
-
-def _places(raw: Raw, found: Mapping[str, Meaning], pairs: bool) -> _Places:
-    """Positions, speeds, lengths and lanes of the rows."""
-    assert raw.table is not None
-    frame = raw.table.frame
-
-    def cells(meaning: str) -> np.ndarray | None:
-        return numbers(frame, found[meaning].column) if meaning in found else None
-
-    if pairs:
-        if is_spaced(found):
-            both = _integrated(raw, found)
-        else:
-            both = [numbers(frame, found[m].column) for m in ("x_follower", "x_leader")]
-        x = np.concatenate(both)[:, None]
-        own, other = cells("v_follower"), cells("v_leader")
-        speed = None if own is None or other is None else np.abs(np.concatenate([own, other]))
-        pair = _agents(raw, found, pairs)
-        both_in = np.array([name.rpartition(" ")[0] for name in pair], dtype=object)
-        return x, speed, None, both_in
-    axes = [m for m in ("x", "y") if m in found]
-    if "lane" in found and "y" in found:
-        axes = ["x"]  # along the lane
-    x = np.stack([numbers(frame, found[m].column) for m in axes], -1)
-    speed = cells("speed")
-    lane: np.ndarray | None = None
-    parts = [v for m in ("vx", "vy")[: len(axes)] if (v := cells(m)) is not None]
-    if len(parts) == len(axes):
-        speed = np.sqrt(sum(v**2 for v in parts))
-    if "lane" in found:
-        lane = raw.table.names(found["lane"].column, empty=True)
-    if lane is None and len(axes) == 1:
-        lane = _parts(raw, found)
-    return x, None if speed is None else np.abs(speed), cells("length"), lane
-
-
-def _of_pairs(raw: Raw, found: dict[str, Meaning]) -> dict[str, Meaning]:
+def _of_pairs(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
     """Meanings with those that columns have only beside a leader's."""
     assert raw.table is not None
-    if {"spacing", "v_leader", "speed"} <= set(found) and "v_follower" not in found:
-        changed = {"v_follower" if m == "speed" else m: one for m, one in found.items()}
-        found = changed if is_spaced(changed) else found
-    if are_pairs(found) and {"pair", "split"} <= set(found) and "recording" not in found:
-        both = [raw.table.names(found[m].column, empty=True) for m in ("pair", "split")]
-        names = set(zip(*both, strict=True))
+    if {"spacing", "v_leader", "speed"} <= set(meanings) and "v_follower" not in meanings:
+        changed = {"v_follower" if m == "speed" else m: meaning for m, meaning in meanings.items()}
+        meanings = changed if is_spaced(changed) else meanings
+    if are_pairs(meanings) and {"pair", "split"} <= set(meanings) and "recording" not in meanings:
+        columns = [raw.table.names(meanings[m].column, empty=True) for m in ("pair", "split")]
+        names = set(zip(*columns, strict=True))
         if len({pair for pair, _ in names}) < len(names):  # counted anew on either side
-            found = {**found, "recording": found["split"]}
-    return found
+            meanings = {**meanings, "recording": meanings["split"]}
+    return meanings
 
 
-def _integrated(raw: Raw, found: Mapping[str, Meaning]) -> list[np.ndarray]:
+def _integrated(raw: Raw, meanings: Mapping[str, Meaning]) -> list[np.ndarray]:
     """Positions of followers and leaders in the unit of the spacing, by the reader's rule.
 
     What distance a unit of speed times time is follows from how spacings change with the speeds:
     the ratio of root mean squares of both changes.
     """
     assert raw.table is not None
-    clock = found["time" if "time" in found else "frame"].column
-    columns = (clock, *(found[m].column for m in ("spacing", "v_follower", "v_leader")))
+    columns = [
+        meanings[m].column for m in (clock_of(meanings), "spacing", "v_follower", "v_leader")
+    ]
     time, spacing, follower, leader = (numbers(raw.table.frame, c) for c in columns)
-    pair = pd.factorize(_agents(raw, found, True)[: len(time)])[0]
+    pair = pd.factorize(_pairs(raw, meanings))[0]
     order = np.lexsort((time, pair))
     same = np.diff(pair[order]) == 0
 
@@ -235,23 +280,10 @@ def _integrated(raw: Raw, found: Mapping[str, Meaning]) -> list[np.ndarray]:
     whole = pair[order][lag:] == pair[order][:-lag]
     change = (spacing[order][lag:] - spacing[order][:-lag])[whole]
     said = (relative[lag:] - relative[:-lag])[whole]
-    known = np.isfinite(change)
-    unit = float(np.sqrt((change[known] ** 2).sum() / max((said[known] ** 2).sum(), 1e-300)))
-    if not (known.any() and 0 < unit < 1e6):
+    finite = np.isfinite(change)
+    unit = float(np.sqrt((change[finite] ** 2).sum() / max((said[finite] ** 2).sum(), 1e-300)))
+    if not (finite.any() and 0 < unit < 1e6):
         unit = 1.0
     x = np.empty(len(time))
     x[order] = unit * gone(leader)
     return [x - spacing, x]
-
-
-def _parts(raw: Raw, found: Mapping[str, Meaning]) -> np.ndarray | None:
-    """Names of the recordings and sequences that the rows are of, where the table has such."""
-    assert raw.table is not None
-    whose = [
-        raw.table.names(found[m].column, empty=True)
-        for m in ("recording", "sequence")
-        if m in found
-    ]
-    if not whose:
-        return None
-    return np.array([" ".join(one) for one in zip(*whose, strict=True)], dtype=object)

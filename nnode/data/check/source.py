@@ -1,18 +1,17 @@
-"""Which data source reads a file, with which options; or how to make a file that one reads."""
+"""Which data source reads a file, with which options."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.check.columns import Meaning
+from nnode.data.check.columns import NAMES, Meaning, are_pairs, clock_of
 from nnode.data.check.raw import Raw
-from nnode.data.check.scale import Scale
-from nnode.data.check.tracks import Tracks
+from nnode.data.check.rows import Scaled
 from nnode.data.options import (
     Agents,
     DataOptions,
@@ -26,29 +25,44 @@ from nnode.data.options import (
     VehicleTableOptions,
     WalkwayOptions,
 )
+from nnode.data.readers import jupedsim, pairs, table, vehicles
+from nnode.data.readers.columns import Table
 from nnode.data.readers.highd import TRACKS
-from nnode.data.trajectories import usual_interval
+from nnode.data.trajectories import Trajectories
 
 _NGSIM = {"Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID"}
 
-_TABLE = {"sequence", "time", "agent", "x"}
 _RUNS = {"run", "position", "t", "v", "gap"}
+
+#: Meanings that readers call by another name.
+CALLED = {"vehicle": "agent", "run": "recording"}
+#: Options and readers of tables by the group.
+_TABLES: dict[str, tuple[type[DataOptions], Any]] = {
+    "vehicles": (VehicleTableOptions, vehicles),
+    "table": (TableOptions, table),
+    "pedpy": (WalkwayOptions, jupedsim),
+    "pairs": (PairOptions, pairs),
+}
 
 
 @dataclass(frozen=True)
-class Source:
-    """A data source.
+class Recognised:
+    """How a file or a table is read.
 
     Attributes:
-        group: its name in ``conf/data``.
-        options: that read the file.
+        group: name of the data source, as in ``conf/data``.
+        options: that read it.
+        table: what they read; None: the file that they name.
+        line: what was recognised, in words; empty where names and units are those of the format.
     """
 
     group: str
     options: DataOptions
+    table: Table | None = None
+    line: str = ""
 
 
-def native_source(raw: Raw, found: Mapping[str, Meaning]) -> str | None:
+def native_source(raw: Raw, meanings: Mapping[str, Meaning]) -> str | None:
     """The source with a reader for exactly these columns."""
     assert raw.table is not None
     names = {str(name) for name in raw.table.frame.columns}
@@ -56,39 +70,22 @@ def native_source(raw: Raw, found: Mapping[str, Meaning]) -> str | None:
         return "ngsim"
     if raw.path.name.endswith(TRACKS):
         return "highd"
-    if names >= _RUNS and "agent" not in found:
+    if names >= _RUNS and "agent" not in meanings:
         return "astazero"
     return None
 
 
-def are_pairs(found: Mapping[str, Meaning]) -> bool:
-    """Whether rows are of a follower and its leader, with or without positions."""
-    return {"x_follower", "x_leader"} <= set(found) or is_spaced(found)
-
-
-def is_spaced(found: Mapping[str, Meaning]) -> bool:
-    """Whether rows are of pairs whose positions follow from spacing and speeds."""
-    return {"spacing", "v_follower", "v_leader"} <= set(found) and not (
-        {"x", "x_follower", "x_leader"} & set(found)
-    )
-
-
-def source_of(
-    raw: Raw,
-    found: Mapping[str, Meaning] | None = None,
-    scale: Scale | None = None,
-    tracks: Tracks | None = None,
-) -> Source:
-    """The source of a file.
-
-    Args:
-        found: column by meaning, where the format does not fix them.
-        scale: units.
-        tracks: the rows in SI units.
-    """
+def source_of_native(raw: Raw) -> Recognised:
+    """What reads a file of a format whose reader knows its columns and units."""
     path = str(raw.path.absolute())
     if raw.native == "esimas":
-        return _esimas(raw.path)
+        name = raw.path.stem.removeprefix("sequence_data")
+        least = 2 if name.startswith("_") else 3
+        folder = str(raw.path.absolute().parent)
+        return Recognised(
+            "esimas",
+            EsimasOptions(source=folder, recording=name.lstrip("_"), min_vehicles=least),
+        )
     natives: dict[str, DataOptions] = {
         "ngsim": NgsimOptions(path=path),
         "highd": HighDOptions(path=path),
@@ -97,166 +94,95 @@ def source_of(
         "openacc": OpenAccOptions(path=path, agents=Agents["global"]),
         "astazero": OpenAccOptions(name="astazero", path=path, agents=Agents["global"]),
     }
-    if raw.native:
-        return Source(raw.native, natives[raw.native])
-    assert found is not None
-    assert scale is not None
-    assert tracks is not None
-    if are_pairs(found):
-        return _pairs(raw, found, scale, path)
+    return Recognised(raw.native, natives[raw.native])
+
+
+def source_of(raw: Raw, scaled_table: Scaled) -> Recognised:
+    """What reads a table.
+
+    Args:
+        scaled_table: its columns and units.
+    """
+    columns, scale, rows = scaled_table.meanings, scaled_table.scale, scaled_table.rows
+    cut = "sequence" in columns
+    if are_pairs(columns):
+        return _of_table("pairs", raw, scaled_table)
     if scale.domain == "crowd":
-        return _people(raw, found, scale, tracks, path)
-    return _vehicles(raw, found, scale, tracks, path)
+        if cut and "frame" not in columns:
+            return _of_table("table", raw, scaled_table, domain=scale.domain)
+        return _people(raw, scaled_table)
+    start, end = rows.ends()
+    back = bool(np.median(rows.x[end, 0] - rows.x[start, 0]) < 0)
+    exact = all(name in columns and columns[name].column == name for name in table.REQUIRED)
+    if cut and "lane" not in columns and not back and (exact or _together(rows)):
+        return _of_table("table", raw, scaled_table, domain=scale.domain)
+    options: dict[str, Any] = {}
+    if rows.dt > VehicleTableOptions.dt:
+        options["dt"] = float(f"{rows.dt:.6g}")
+    if back:
+        options["direction"] = -1
+    each = {"time": np.round(rows.time / rows.dt)}
+    each |= {n: getattr(rows, n) for n in ("lane", "recording") if getattr(rows, n) is not None}
+    # the greatest number of vehicles in one lane at one time
+    most = int(pd.DataFrame(each).groupby(list(each)).size().max())
+    if most < VehicleTableOptions.min_vehicles:
+        options["min_vehicles"] = max(most, 1)
+    return _of_table("vehicles", raw, scaled_table, **options)
 
 
-def _esimas(path: Path) -> Source:
-    name = path.stem.removeprefix("sequence_data")
-    least = 2 if name.startswith("_") else 3
-    folder = str(path.absolute().parent)
-    options = EsimasOptions(source=folder, recording=name.lstrip("_"), min_vehicles=least)
-    return Source("esimas", options)
+def _of_table(group: str, raw: Raw, scaled_table: Scaled, **options: Any) -> Recognised:
+    """A table's reader, its columns where they have other names than it gives them, and units."""
+    assert raw.table is not None
+    kind, reader = _TABLES[group]
+    columns = {m: recognised.column for m, recognised in scaled_table.meanings.items()}
+    if scaled_table.scale.domain == "traffic":
+        columns.pop("y", None)
+    held = set(map(str, raw.table.frame.columns))
+    named: dict[str, str | None] = {}
+    for name in (*reader.REQUIRED, *reader.OPTIONAL):
+        meaning = clock_of(columns) if name == "time" else CALLED.get(name, name)
+        # a column of that name that means something else must not be read for it
+        other = name in held and meaning in NAMES
+        if columns.get(meaning) != name and (meaning in columns or other):
+            named[name] = columns.get(meaning)
+    options |= {"columns": named, "position_unit": scaled_table.scale.position}
+    options |= {"time_unit": scaled_table.scale.time, "frame_rate": scaled_table.scale.rate}
+    if {"speed", "v_follower"} & set(columns) and hasattr(kind, "speed_unit"):
+        options["speed_unit"] = scaled_table.scale.speed
+    return Recognised(group, kind(path=str(raw.path.absolute()), **options))  # type: ignore[call-arg]
 
 
-def _people(
-    raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
-) -> Source:
-    columns = {meaning: one.column for meaning, one in found.items()}
-    if "sequence" in columns and "frame" not in columns:
-        return _tidy(raw, found, scale, path)
-    dt = usual_interval(tracks.steps)
+def _people(raw: Raw, scaled_table: Scaled) -> Recognised:
+    scale, rows = scaled_table.scale, scaled_table.rows
+    columns = {meaning: recognised.column for meaning, recognised in scaled_table.meanings.items()}
+    dt = rows.dt
     if scale.rate is not None and raw.rate is not None:  # what the file tells is taken
         dt *= scale.rate / raw.rate
         scale = replace(scale, rate=raw.rate)
     steps = max(2, round(1 / dt))
-    whole = abs(1 / dt - steps) < 1e-3
-    own: dict[str, Any] = {} if whole else {"t_seq": float(f"{steps * dt:.9g}")}
-    if np.ptp(tracks.x[:, 1]) > np.ptp(tracks.x[:, 0]):
-        own["walking_axis"] = "y"
-    order = [raw.table.frame.columns.get_loc(columns[m]) for m in columns] if raw.table else []
+    options: dict[str, Any] = {}
+    if abs(1 / dt - steps) >= 1e-3:
+        options["t_seq"] = float(f"{steps * dt:.9g}")
+    if np.ptp(rows.x[:, 1]) > np.ptp(rows.x[:, 0]):
+        options["walking_axis"] = "y"
+    order = [raw.table.frame.columns.get_loc(c) for c in columns.values()] if raw.table else []
     ordered = list(columns) == ["agent", "frame", "x", "y"] and order == [0, 1, 2, 3]
     every = scale.rate is not None and abs(dt * scale.rate - 1) < 1e-6  # frame by frame
     text = not raw.named and raw.separator == " " and ordered and scale.position in ("cm", "m")
     if text and every:
         if raw.rate is None:
-            own["frame_rate"] = scale.rate
+            options["frame_rate"] = scale.rate
         if raw.unit is None:
-            own["unit"] = scale.position
-        return Source("pedpy", WalkwayOptions(path=path, **own))
-    meant = {name: name for name in ("agent", "x", "y", "recording", "sequence")}
-    meant["time"] = "time" if "time" in columns else "frame"
-    own |= {"columns": _named(raw, columns, meant), "frame_rate": scale.rate}
-    own |= {"position_unit": scale.position, "time_unit": scale.time}
-    return Source("pedpy", WalkwayOptions(path=path, **own))
+            options["unit"] = scale.position
+        return Recognised("pedpy", WalkwayOptions(path=str(raw.path.absolute()), **options))
+    return _of_table("pedpy", raw, replace(scaled_table, scales=[scale]), **options)
 
 
-def _together(tracks: Tracks) -> bool:
+def _together(rows: Trajectories) -> bool:
     """Whether most agents are in their part of the table from its first to its last time."""
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks)) - 1
-    part = np.zeros(len(tracks), dtype=int) if tracks.part is None else tracks.part
-    first, last = np.full(part.max() + 1, np.inf), np.full(part.max() + 1, -np.inf)
-    np.minimum.at(first, part, tracks.time)
-    np.maximum.at(last, part, tracks.time)
-    near = tracks.dt / 2
-    begins = tracks.time[start] - first[part[start]] < near
-    ends = last[part[end]] - tracks.time[end] < near
+    start, end = rows.ends()
+    part = np.zeros(len(rows)) if rows.recording is None else rows.recording
+    clock = pd.Series(rows.time).groupby(part)
+    begins = (rows.time - clock.transform("min").to_numpy())[start] < rows.dt / 2
+    ends = (clock.transform("max").to_numpy() - rows.time)[end] < rows.dt / 2
     return bool((begins & ends).mean() > 0.5)
-
-
-def _tidy(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:
-    """Sequences that are cut already."""
-    columns = {meaning: one.column for meaning, one in found.items()}
-    meant = {"time": "time" if "time" in columns else "frame"}
-    axes = ("x", "y") if scale.domain == "crowd" else ("x",)
-    meant |= {name: name for name in ("sequence", "agent", *axes, "length", "kind", "recording")}
-    named = _named(raw, columns, meant)
-    if scale.domain == "traffic" and raw.table is not None and "y" in raw.table.frame.columns:
-        named["y"] = None
-    own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
-    own |= {"time_unit": scale.time, "frame_rate": scale.rate, "domain": scale.domain}
-    return Source("table", TableOptions(path=path, **own))
-
-
-def _named(raw: Raw, columns: Mapping[str, str], meant: Mapping[str, str]) -> dict[str, str | None]:
-    """A reader's columns by their meaning to it, where they have other names than that.
-
-    A table's own column of a name that means something else must not be read for it.
-    """
-    held = set() if raw.table is None else {str(name) for name in raw.table.frame.columns}
-    return {
-        name: columns.get(m)
-        for name, m in meant.items()
-        if (name != columns[m] if m in columns else name in held)
-    }
-
-
-def _vehicles(
-    raw: Raw, found: Mapping[str, Meaning], scale: Scale, tracks: Tracks, path: str
-) -> Source:
-    columns = {meaning: one.column for meaning, one in found.items()}
-    start = np.flatnonzero(np.diff(tracks.agent, prepend=-1) != 0)
-    end = np.append(start[1:], len(tracks)) - 1
-    back = bool(np.median(tracks.x[end, 0] - tracks.x[start, 0]) < 0)
-    exact = all(columns.get(name) == name for name in _TABLE)
-    cut = "sequence" in columns and "lane" not in columns
-    if cut and not back and (exact or _together(tracks)):
-        return _tidy(raw, found, scale, path)
-    clock = "time" if "time" in columns else "frame"
-    meant = {"vehicle": "agent", "time": clock} | {
-        name: name for name in ("x", "lane", "speed", "length", "kind", "recording", "sequence")
-    }
-    named = _named(raw, columns, meant)
-    own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
-    if "speed" in columns:
-        own["speed_unit"] = scale.speed
-    own |= {"time_unit": scale.time}
-    if scale.rate is not None:
-        own["frame_rate"] = scale.rate
-    if tracks.dt > VehicleTableOptions.dt:
-        own["dt"] = float(f"{tracks.dt:.6g}")
-    if back:
-        own["direction"] = -1
-    if _most(tracks) < VehicleTableOptions.min_vehicles:
-        own["min_vehicles"] = max(_most(tracks), 1)
-    return Source("vehicles", VehicleTableOptions(path=path, **own))
-
-
-def _most(tracks: Tracks) -> int:
-    """The greatest number of vehicles in one lane at one time."""
-    where = np.zeros(len(tracks)) if tracks.lane is None else tracks.lane
-    part = np.zeros(len(tracks)) if tracks.part is None else tracks.part
-    each = np.stack([np.round(tracks.time / tracks.dt), where, part])
-    return int(np.unique(each, axis=1, return_counts=True)[1].max())
-
-
-def _pairs(raw: Raw, found: Mapping[str, Meaning], scale: Scale, path: str) -> Source:
-    meant = {
-        "time": "time",
-        "run": "recording",
-        "lane": "lane",
-        **{
-            name: name
-            for name in (
-                "pair",
-                "x_follower",
-                "x_leader",
-                "v_follower",
-                "v_leader",
-                "leader_length",
-                "spacing",
-                "follower",
-                "leader",
-                "split",
-                "leader_kind",
-            )
-        },
-    }
-    columns = {m: one.column for m, one in found.items()}
-    named = {name: columns[m] for name, m in meant.items() if m in columns and name != columns[m]}
-    own: dict[str, Any] = {"columns": named, "position_unit": scale.position}
-    if "v_follower" in columns:
-        own["speed_unit"] = scale.speed
-    if "time" not in columns and columns.get("frame", "time") != "time":
-        named["time"] = columns["frame"]
-    own |= {"time_unit": scale.time, "frame_rate": scale.rate}
-    return Source("pairs", PairOptions(path=path, **own))

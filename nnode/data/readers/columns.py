@@ -17,7 +17,7 @@ from nnode.errors import ConfigError, DataError
 from nnode.files import csv_cell
 
 #: Whole numbers below this are exact as floating-point numbers.
-_EXACT = 2.0**53
+EXACT = 2.0**53
 #: s; times beyond this (three years) count from a calendar's origin. Float64 resolves them to
 #: 1e-8 s and less, which is a relative error of 1e-6 in intervals of 0.02 s.
 EPOCH = 1e8
@@ -387,22 +387,43 @@ class Table:
                 f"{self.path}, {self.row(i)}: column {column!r} is empty; expected a name or number"
             )
         whole = pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all()
-        if whole and (cells.dropna().abs() < _EXACT).all():
+        if whole and (cells.dropna().abs() < EXACT).all():
             cells = cells.astype("Int64")
         try:
             text = cells.astype("string").fillna("")
+            marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
+            if marked.any():
+                text = text.where(~marked, text[marked].map(csv_cell))
+            # NumPy takes text with zero characters behind it for the same text without them
+            text = text.str.rstrip("\0").str.strip()
         except (TypeError, ValueError):  # bytes that are no text, or lists in cells
-            i = next(i for i, cell in enumerate(cells) if not absent[i] and _no_text(cell))
+            known = map(int, np.flatnonzero(~absent))
+            i = next((i for i in known if not _is_text(cells, i)), 0)
             raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {quoted(cells.iloc[i])}; "
+                f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells, i)}; "
                 "expected a name or number"
             ) from None
-        marked = text.str.startswith("'") if self.by_line else np.zeros(1, dtype=bool)
-        if marked.any():
-            text = text.where(~marked, text[marked].map(csv_cell))
-        # NumPy takes text with zero characters behind it for the same text without them
-        text = text.str.rstrip("\0").str.strip()
         return np.asarray(text, dtype=object)
+
+    def check_constant(self, column: str, values: np.ndarray, owner: np.ndarray, rule: str) -> None:
+        """Refuse a value that changes within what it belongs to.
+
+        Args:
+            values: ``(rows,)`` of the column.
+            owner: ``(rows,)`` numbers from 0 of what they belong to.
+            rule: what is expected, in words.
+
+        Raises:
+            DataError: names the row.
+        """
+        first = np.unique(owner, return_index=True)[1][owner]
+        differs = (values != values[first]) & ~(pd.isna(values) & pd.isna(values[first]))
+        if differs.any():
+            i = int(np.flatnonzero(differs)[0])
+            raise DataError(
+                f"{self.path}, {self.row(i)}: column {column!r} holds {values[i]!s}, before it "
+                f"{values[first[i]]!s}; {rule}"
+            )
 
     def row(self, i: int) -> str:
         """Where the i-th row stands in the file, in words."""
@@ -441,12 +462,19 @@ def _float(cell: Any) -> float:
         return np.nan
 
 
-def _no_text(cell: Any) -> bool:
+def _is_text(cells: pd.Series, i: int) -> bool:
     try:
-        pd.Series([cell], dtype=object).astype("string")
+        pd.Series([cells.iloc[i]], dtype=object).astype("string")
     except (TypeError, ValueError):
-        return True
-    return False
+        return False
+    return True
+
+
+def _quoted(cells: pd.Series, i: int) -> str:
+    try:
+        return quoted(cells.iloc[i])
+    except ValueError:
+        return "bytes that are no text"
 
 
 def quoted(cell: Any) -> str:

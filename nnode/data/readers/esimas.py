@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from nnode.data.cut import Reading, by_sequence
 from nnode.data.options import EsimasOptions
 from nnode.data.readers.matlab import read_matlab
-from nnode.data.readers.recordings import raw_files
-from nnode.data.sequence import Sequence
+from nnode.data.readers.recordings import natural, raw_files
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: Start of a file's name, by the least number of cars of the family's sequences.
@@ -48,13 +49,13 @@ def esimas_files(options: EsimasOptions) -> dict[str, Path]:
     )
 
 
-def read_esimas(path: Path, options: EsimasOptions | None = None) -> list[Sequence]:
+def read_esimas(path: Path, options: EsimasOptions | None = None) -> Reading:
     """Read one file.
 
     Args:
         path: a file whose name is ``sequence_data`` or ``sequence_data_``, the recording, and
             ``.mat``.
-        options: not looked at; a file says all that is needed.
+        options: ``fill`` and ``smooth`` are read.
 
     Returns:
         The sequences in the order of the file, cars in the order of its rows, named
@@ -75,7 +76,7 @@ def read_esimas(path: Path, options: EsimasOptions | None = None) -> list[Sequen
     cells = _load(path)
     if not cells:
         raise DataError(f"{path}: 'sequences' is empty; expected at least one sequence")
-    found = []
+    columns: dict[str, list[np.ndarray]] = {"sequence": [], "agent": [], "time": [], "x": []}
     for number, cell in enumerate(cells):
         where = f"{path}, sequence {number}"
         x = _field(cell, "Xarr", where)
@@ -84,15 +85,20 @@ def read_esimas(path: Path, options: EsimasOptions | None = None) -> list[Sequen
             raise DataError(
                 f"{where}: expected Xarr (cars, K) and Tarr (K), found {x.shape} and ({time.size},)"
             )
-        found.append(
-            Sequence(
-                name=f"{recording}/{number:03d}",
-                recording=recording,
-                time=time,
-                x=x.T[:, :, None],
-            )
-        )
-    return found
+        cars, samples = x.shape
+        columns["sequence"].append(np.full(x.size, f"{number:03d}", dtype=object))
+        columns["agent"].append(np.repeat(np.arange(cars).astype(str).astype(object), samples))
+        columns["time"].append(np.tile(time, cars))
+        columns["x"].append(x.reshape(-1, 1))
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    rows = Trajectories(
+        path=path,
+        name=recording,
+        where=lambda i: f"sequence {whole['sequence'][i]}, car {whole['agent'][i]}",
+        recording=np.full(len(whole["time"]), recording, dtype=object),
+        **whole,
+    )
+    return by_sequence(rows, options or EsimasOptions(), natural, ordered=True, named=False)
 
 
 def _load(path: Path) -> list[Any]:

@@ -18,13 +18,12 @@ import shapely
 from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
-from nnode.data.options import WalkwayOptions, one_of
-from nnode.data.readers.columns import Table, opened
+from nnode.data.options import WalkwayOptions
+from nnode.data.readers.columns import EXACT, Table, opened
 from nnode.data.readers.juelich import People, cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
-from nnode.data.readers.vehicles import LENGTH_UNITS, recordings, seconds_per_unit
+from nnode.data.readers.vehicles import table_rows
 from nnode.data.sequence import check_interval
-from nnode.data.trajectories import Trajectories, usual_step
 from nnode.errors import ConfigError, DataError
 
 #: First bytes of every SQLite database.
@@ -36,18 +35,19 @@ PEOPLE, GEOMETRY = "trajectories", "geometry"
 #: Rows that are converted together.
 _AT_ONCE = 100_000
 
-#: Whole numbers below this are exact as floating-point numbers.
-_WHOLE = 2**53
-
 #: Endings of files that are tables.
 TABLES = (".csv", ".parquet", ".pq")
+
+#: Columns of a table.
+REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
 
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
-def walkway_files(options: WalkwayOptions) -> dict[str, Path]:
-    """The trajectories' path, and that of the walkable area where it has a file of its own."""
-    files = {PEOPLE: table_path(options, "path", options.path)}
+def walkway_files(options: WalkwayOptions, table: Table | None = None) -> dict[str, Path | Table]:
+    """The trajectories, or their path, and the path of the walkable area where it has a file of
+    its own."""
+    files = {PEOPLE: table or table_path(options, "path", options.path)}
     if options.geometry is not None:
         files[GEOMETRY] = table_path(options, "geometry", options.geometry)
     return files
@@ -97,18 +97,9 @@ def read_walkway(
 
 def _of_table(table: Table, options: WalkwayOptions) -> People:
     """Rows agent, time, x, y of any table, and their sampling interval."""
-    names = table.choose(("agent", "time", "x", "y"), ("recording", "sequence"), options.columns)
-    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
-    rows = Trajectories(
-        path=table.path,
-        name=table.path.stem,
-        where=table.row,
-        recording=recordings(table, names),
-        agent=table.names(names["agent"]),
-        time=table.times(names["time"], seconds_per_unit(options))[1],
-        x=np.stack([table.measured(names[axis]) for axis in ("x", "y")], -1) * metres,
-    )
-    dt = usual_step(rows)
+    names = table.choose(REQUIRED, OPTIONAL, options.columns)
+    rows = table_rows(table, names, options, ("x", "y"))
+    dt = rows.dt
     if not np.isfinite(dt):
         raise DataError(f"{table.path}: nobody has rows at two times; nothing moves here")
     check_interval(dt, f"{table.path}: rows of a person")
@@ -236,7 +227,7 @@ def _numbers(path: Path, rows: list[tuple[object, ...]]) -> np.ndarray:
     whole = values[:, :2]
     good = np.isfinite(values).all(axis=1)
     with np.errstate(invalid="ignore"):
-        good &= ((whole % 1 == 0) & (np.abs(whole) < _WHOLE)).all(axis=1)
+        good &= ((whole % 1 == 0) & (np.abs(whole) < EXACT)).all(axis=1)
     if not good.all():
         i = int(np.flatnonzero(~good)[0])
         raise DataError(

@@ -18,14 +18,14 @@ import numpy as np
 
 from nnode.data.cut import Reading, by_lane, check_cutting
 from nnode.data.options import NgsimOptions, VehicleTableOptions
-from nnode.data.readers.columns import Table
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.columns import EXACT, Table
+from nnode.data.readers.vehicles import LENGTH_UNITS, read_vehicles
 from nnode.data.trajectories import Trajectories
 from nnode.errors import DataError
 
 log = logging.getLogger(__name__)
 
-FOOT = 0.3048
+FOOT = LENGTH_UNITS["ft"]
 
 _HEAD = [
     *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time"),
@@ -66,9 +66,6 @@ RECONSTRUCTED = {
 #: The starts of a location's periods are a quarter of an hour apart or more, those that the rows
 #: of one period tell differ by rounding: half of it (ms) parts them.
 APART = 7.5 * 60e3
-
-#: ms since 1970 that are exact as floating-point numbers.
-_LATEST = 2.0**53
 
 #: Hours by which the clocks of both freeways, in April and June, were behind UTC.
 BEHIND_UTC = 7
@@ -160,7 +157,7 @@ def _periods(table: Table) -> Trajectories:
     )
     roads = _roads(table, place, number.pop("Direction", None))
     start = number["Global_Time"] - 100 * number["Frame_ID"]  # ms at frame 0
-    odd = np.flatnonzero(~(np.abs(start) < _LATEST))
+    odd = np.flatnonzero(~(np.abs(start) < EXACT))
     if odd.size:
         raise DataError(
             f"{table.path}, {table.row(int(odd[0]))}: Global_Time and Frame_ID put frame 0 at "

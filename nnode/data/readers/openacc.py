@@ -10,32 +10,43 @@ Source: Makridis, Mattas, Anesiadou & Ciuffo 2021, OpenACC, Transportation Resea
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from nnode.data.cut import by_spacing
 from nnode.data.options import OpenAccOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import raw_files, tables_below
-from nnode.data.readers.track import KNOWN, Run, check_laps, cut_run
 from nnode.data.sequence import Sequence
+from nnode.data.trajectories import Trajectories, driven
 from nnode.errors import ConfigError, DataError
+
+log = logging.getLogger(__name__)
 
 #: The five lines above the columns.
 HEAD = ("Date", "Vehicle_order", "Number_of_vehicles", "ACC", "Distance_setting")
 
-#: Times of a run, with those that no row stands for.
-MOST_TIMES = 10**6
-
 #: Places in a platoon; its vehicles are tens.
 MOST_VEHICLES = 1000
 
-#: Times and places of a run may be so many, or so many times the rows that stand there.
-_CELLS, _SPARSE = 10**7, 10
+#: What may be told of a vehicle.
+KNOWN = ("make", "setting", "acc", "order")
 
 _FLAT = ("run", "position", "t", "v", "gap")
+
+#: Share by which a lap may be longer than another, or than the coordinates tell.
+CLOSED = 0.01
+
+#: m within which a vehicle is back where it was: the breadth of a road.
+BACK = 10.0
+#: m that a vehicle must have been away by in between.
+AWAY = 50.0
 
 
 def openacc_files(options: OpenAccOptions) -> dict[str, Path]:
@@ -76,23 +87,23 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Seq
             times, or no sequence at all.
     """
     _check(options)
-    runs = [run for key, path in files.items() for run in _runs(key, path)]
+    runs = [run for key, path in files.items() for run in _runs(key, path, options)]
     asked = wanted(options.recording)
     if asked is not None and options.path is not None:
         check_known(asked, [run.name for run in runs])
         runs = [run for run in runs if run.name in asked]
-    found: list[Sequence] = []
+    sequences: list[Sequence] = []
     for run in runs:
         check_laps(run)
-        found += cut_run(run, options)
-    if not found:
+        sequences += by_spacing(run, options)
+    if not sequences:
         raise DataError(
             f"{next(iter(files.values()))}: no sequence; in {len(runs)} runs there are nowhere "
             f"{options.min_vehicles} vehicles behind each other for "
             f"{options.window or options.min_duration:g} s; lower data.min_vehicles and "
             f"data.{'window' if options.window else 'min_duration'}"
         )
-    return found
+    return sequences
 
 
 def _check(options: OpenAccOptions) -> None:
@@ -108,25 +119,25 @@ def _check(options: OpenAccOptions) -> None:
         raise ConfigError("data.min_vehicles must be at least 1")
 
 
-def _runs(key: str, path: Path) -> Iterator[Run]:
+def _runs(key: str, path: Path, options: OpenAccOptions) -> Iterator[Trajectories]:
     name = re.sub(r"\.[^./]*$", "", key).replace("/", "_")
     first = ""
     if path.suffix.lower() not in (".parquet", ".pq") and path.is_file():
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             first = file.readline()
     if first.startswith(HEAD[0] + ","):
-        yield _published_run(name, path)
+        yield _published_run(name, path, options)
     else:
-        yield from _flat_runs(path)
+        yield from _flat_runs(path, options)
 
 
-def _published_run(name: str, path: Path) -> Run:
+def _published_run(name: str, path: Path, options: OpenAccOptions) -> Trajectories:
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         head = [file.readline().strip().rstrip(",").split(",") for _ in HEAD]
     for number, (cells, expected) in enumerate(zip(head, HEAD, strict=True), start=1):
         if cells[0] != expected:
             raise DataError(f"{path}, line {number}: expected {expected},…, found {cells[0]!r}")
-    make = tuple(cell.strip() for cell in head[1][1:])
+    make = [cell.strip() for cell in head[1][1:]]
     said = head[2][1] if len(head[2]) > 1 else ""
     if said != str(len(make)):
         raise DataError(
@@ -137,105 +148,200 @@ def _published_run(name: str, path: Path) -> Run:
     table.choose(("Time",))
     held, n = set(table.frame.columns), len(make)
 
-    def column(word: str, i: int) -> np.ndarray:
-        name = f"{word}{i + 1}"
-        return table.numbers(name, empty=True) if name in held else np.full(len(table), np.nan)
+    def cells_of(word: str, first: int = 1) -> np.ndarray:
+        """``(rows * n,)``, vehicle by vehicle, NaN where the file has no column."""
+        names = [f"{word}{i + first}" for i in range(n)]
+        nowhere = np.full(len(table), np.nan)
+        return np.concatenate(
+            [table.numbers(c, empty=True) if c in held else nowhere for c in names]
+        )
 
-    nowhere = np.full(len(table), np.nan)
-    v = np.stack([column("Speed", i) for i in range(n)], 1)
-    gap = np.stack([nowhere, *(column("IVS", i) for i in range(n - 1))], 1)
-    place = np.stack([np.stack([column(w, i) for i in range(n)], 1) for w in ("E", "N")], -1)
     acc = len(head[3]) > 1 and head[3][1] == "1"
     setting = head[4][1] if acc and len(head[4]) > 1 and head[4][1] else "none"
-    start, dt, (v, gap, place) = _gridded(path, table.numbers("Time"), v, gap, place)
-    return Run(name, path, start, dt, v, gap, place, make, acc, setting)
+    return _run(
+        path,
+        name,
+        place=np.repeat(np.arange(n), len(table)),
+        make=make,
+        told={"acc": "ACC" if acc else "people", "setting": setting},
+        options=options,
+        where=lambda i: table.row(i % len(table)),
+        time=np.tile(table.numbers("Time"), n),
+        x=np.stack([cells_of("E"), cells_of("N")], -1),
+        v=cells_of("Speed")[:, None],
+        # the first has nobody in front
+        spacing=cells_of("IVS", 0),
+    )
 
 
-def _flat_runs(path: Path) -> Iterator[Run]:
+def _flat_runs(path: Path, options: OpenAccOptions) -> Iterator[Trajectories]:
     table = Table(path)
     names = table.choose(_FLAT, ("make", "acc", "setting"))
     run, position = table.names("run"), _positions(table)
-    time, v, gap = (
-        table.numbers("t"),
-        table.numbers("v", empty=True),
-        table.numbers("gap", empty=True),
-    )
+    time = table.numbers("t")
+    v, gap = (table.numbers(name, empty=True) for name in ("v", "gap"))
     words = {n: table.names(n, empty=True) for n in ("make", "acc", "setting") if n in names}
     for name in dict.fromkeys(run):
-        own = np.flatnonzero(run == name)
-        times, k = np.unique(np.round(time[own], 6), return_inverse=True)
-        order, i = np.unique(position[own], return_inverse=True)
-        # a vehicle without a row has its place in the platoon all the same
-        shape = (len(times), int(order[-1]))
-        _check_size(path, shape, len(own))
-        place_of = order[i] - 1
-        wide = {w: np.full(shape, np.nan) for w in ("v", "gap")}
-        count = np.zeros(shape, int)
-        np.add.at(count, (k, place_of), 1)
-        if count.max() > 1:
-            raise DataError(
-                f"{path}: run {name} has two rows of one position at one time; expected one row "
-                "per vehicle and time"
-            )
-        wide["v"][k, place_of], wide["gap"][k, place_of] = v[own], gap[own]
-        make = [str(p + 1) for p in range(shape[1])]
-        for row, p in zip(own, place_of, strict=True):
-            if "make" in words:
-                make[p] = words["make"][row]
-        acc = "acc" not in words or words["acc"][own[0]].lower() in ("true", "1")
-        setting = words["setting"][own[0]] if "setting" in words and acc else "none"
-        nowhere = np.full((*shape, 2), np.nan)
-        start, dt, (sv, sg, sp) = _gridded(path, times, wide["v"], wide["gap"], nowhere)
-        yield Run(str(name), path, start, dt, sv, sg, sp, tuple(make), acc, setting or "none")
+        rows = np.flatnonzero(run == name)
+        rows = rows[np.argsort(position[rows], kind="stable")]
+        make = [str(p + 1) for p in range(int(position[rows[-1]]))]
+        for row in rows if "make" in words else ():
+            make[position[row] - 1] = words["make"][row]
+        first = int(np.flatnonzero(run == name)[0])
+        acc = "acc" not in words or words["acc"][first].lower() in ("true", "1")
+        setting = words["setting"][first] if "setting" in words and acc else "none"
+        # nobody follows a vehicle that is not the next in front of it
+        alone = ~np.isin(position[rows] - 1, position[rows])
+        yield _run(
+            path,
+            str(name),
+            place=position[rows] - 1,
+            make=make,
+            told={"acc": "ACC" if acc else "people", "setting": setting or "none"},
+            options=options,
+            where=lambda i, rows=rows: table.row(int(rows[i])),
+            time=time[rows],
+            x=np.full((len(rows), 2), np.nan),
+            v=v[rows, None],
+            spacing=np.where(alone, np.nan, gap[rows]),
+        )
+
+
+def _run(
+    path: Path,
+    name: str,
+    place: np.ndarray,
+    make: list[str],
+    told: dict[str, str],
+    options: OpenAccOptions,
+    **columns: Any,
+) -> Trajectories:
+    """A run's rows, vehicle by vehicle.
+
+    Args:
+        place: ``(R,)`` in the platoon, 0 leads.
+        make: of every place.
+        told: of followers; nothing of the vehicle in front.
+        columns: further ones.
+    """
+    names = [m if make.count(m) == 1 else f"{m}_{i + 1}" for i, m in enumerate(make)]
+    words = {key: ["", *[value] * (len(make) - 1)] for key, value in told.items()}
+    words |= {"make": make, "order": [str(i + 1) for i in range(len(make))]}
+
+    def column(what: str | None) -> np.ndarray | None:
+        values = words[what] if what is not None else []
+        return np.array(values, dtype=object)[place] if any(values) else None
+
+    return Trajectories(
+        path=path,
+        name=name,
+        agent=np.array(names, dtype=object)[place],
+        length=None if options.length is None else np.full(len(place), options.length),
+        kind=column(options.kind),
+        group=column(options.group),
+        **columns,
+    )
 
 
 def _positions(table: Table) -> np.ndarray:
     """Places in the platoon, counted from 1."""
-    found = table.numbers("position")
-    odd = np.flatnonzero(~((found >= 1) & (found <= MOST_VEHICLES) & (found % 1 == 0)))
+    positions = table.numbers("position")
+    odd = np.flatnonzero(~((positions >= 1) & (positions <= MOST_VEHICLES) & (positions % 1 == 0)))
     if odd.size:
         i = int(odd[0])
         raise DataError(
-            f"{table.path}, {table.row(i)}: position is {found[i]:g}; expected the place in the "
-            f"platoon, a whole number from 1 to {MOST_VEHICLES}"
+            f"{table.path}, {table.row(i)}: position is {positions[i]:g}; expected the place in "
+            f"the platoon, a whole number from 1 to {MOST_VEHICLES}"
         )
-    return found.astype(int)
+    return positions.astype(int)
 
 
-def _check_size(path: Path, shape: tuple[int, int], rows: int) -> None:
-    """Refuse a time or a position that is wrong before a table is made for it."""
-    if shape[0] * shape[1] > max(_CELLS, _SPARSE * rows):
-        raise DataError(
-            f"{path}: {rows} rows stand at {shape[0]} equally spaced times of {shape[1]} vehicles; "
-            "look for a time or a position that is wrong, or cut the file"
-        )
+def check_laps(run: Trajectories) -> None:
+    """Say what the laps of the foremost vehicle with coordinates tell of integrated speeds.
+
+    Args:
+        run: rows with coordinates (east and north, m) as positions.
+    """
+    located = np.flatnonzero(np.isfinite(run.x).all(axis=1))
+    if not len(located) or run.v is None:
+        return
+    rows = np.flatnonzero(run.agent == run.agent[located[0]])
+    rows = rows[np.argsort(run.time[rows], kind="stable")]
+    with np.errstate(over="ignore", invalid="ignore"):  # of coordinates that are none
+        laps = find_laps(driven(run.time[rows], run.v[rows, 0]), run.x[rows])
+    if not len(laps.driven):
+        return
+    text = (
+        f"{run.name}: complete laps of {run.agent[located[0]]}: {len(laps.driven)}, "
+        f"{laps.driven.min():.1f} to {laps.driven.max():.1f} m by its speed, "
+        f"{laps.path.min():.1f} to {laps.path.max():.1f} m by its coordinates"
+    )
+    if max(laps.spread, abs(laps.excess)) > CLOSED:
+        log.warning("%s: they differ by more than %g %%", text, 100 * CLOSED)
+    else:
+        log.info("%s", text)
 
 
-def _gridded(
-    path: Path, time: np.ndarray, *columns: np.ndarray
-) -> tuple[float, float, list[np.ndarray]]:
-    """Rows at all equally spaced times, NaN where the file has none."""
-    step = np.diff(time)
-    if not len(step) or step.min() <= 0:
-        i = int(np.argmin(step)) if len(step) else 0
-        raise DataError(f"{path}: times do not grow from {time[i]:g} s on; expected rows in order")
-    dt = float(np.median(step))
-    if not (time[-1] - time[0]) / dt < MOST_TIMES:
-        raise DataError(
-            f"{path}: times go from {time[0]:g} to {time[-1]:g} s in steps of {dt:g} s; expected "
-            f"at most {MOST_TIMES:.0e} steps: look for a time that is wrong"
-        )
-    at = (time - time[0]) / dt
-    k = np.round(at).astype(int)
-    odd = np.flatnonzero(np.abs(at - k) > 0.1)
-    if odd.size or (np.diff(k) == 0).any():
-        i = int(odd[0]) if odd.size else int(np.argmin(np.diff(k)))
-        raise DataError(
-            f"{path}: the time {time[i]:g} s is no whole number of steps of {dt:g} s from the "
-            f"first, {time[0]:g} s"
-        )
-    _check_size(path, (int(k[-1]) + 1, columns[0].shape[1]), columns[0].size)
-    full = [np.full((k[-1] + 1, *c.shape[1:]), np.nan) for c in columns]
-    for wide, column in zip(full, columns, strict=True):
-        wide[k] = column
-    return float(time[0]), round(dt, 9), full
+@dataclass(frozen=True)
+class Laps:
+    """A vehicle's complete laps.
+
+    Attributes:
+        driven: m per lap, by integrated speed.
+        path: m per lap, along the measured coordinates.
+    """
+
+    driven: np.ndarray
+    path: np.ndarray
+
+    @property
+    def spread(self) -> float:
+        """Greatest deviation of a lap from their median, as a share of it; 0 without two laps."""
+        usual = np.median(self.driven) if len(self.driven) else 1.0
+        return float(np.abs(self.driven / usual - 1).max()) if len(self.driven) > 1 else 0.0
+
+    @property
+    def excess(self) -> float:
+        """By which share more is driven than the coordinates tell; 0 without a lap."""
+        return float(self.driven.sum() / self.path.sum() - 1) if len(self.driven) else 0.0
+
+
+def find_laps(driven: np.ndarray, place: np.ndarray) -> Laps:
+    """Laps between passes of the point where a vehicle is first known to be.
+
+    Args:
+        driven: ``(K,)`` m, integrated speed.
+        place: ``(K, 2)`` m, coordinates; NaN where they are unknown.
+    """
+    located = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(driven))
+    if not len(located):
+        return Laps(np.empty(0), np.empty(0))
+    driven, place = driven[located], place[located]
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
+    start = int(np.argmax(driven - driven[0] > BACK))  # not while it stands before it starts
+    apart = np.linalg.norm(place - place[start], axis=1)
+    passes, k = [start], start
+    while True:
+        away = np.flatnonzero(apart[k:] > AWAY)
+        near = np.flatnonzero(apart[k + away[0] :] < BACK) if len(away) else away
+        if not len(near):
+            break
+        first = k + int(away[0]) + int(near[0])
+        leaves = np.flatnonzero(apart[first:] >= BACK)
+        if not len(leaves):
+            break
+        k = first + int(np.argmin(apart[first : first + int(leaves[0])]))
+        passes.append(k)
+    # within a step the pass is where the way there and the way on are closest to the point
+    at = [_along(place, i, place[start]) for i in passes]
+    samples = np.arange(len(driven))
+    return Laps(np.diff(np.interp(at, samples, driven)), np.diff(np.interp(at, samples, path)))
+
+
+def _along(place: np.ndarray, i: int, point: np.ndarray) -> float:
+    """Where the track passes a point, in samples, near sample ``i``."""
+    ahead = place[min(i + 1, len(place) - 1)] - place[max(i - 1, 0)]
+    length = float(ahead @ ahead)
+    steps = min(i + 1, len(place) - 1) - max(i - 1, 0)
+    shift = float((point - place[i]) @ ahead) / length * steps if length else 0.0
+    return i + float(np.clip(shift, -1.0, 1.0))

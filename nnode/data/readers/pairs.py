@@ -9,50 +9,34 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
+import pandas as pd
 
-from nnode.data.cut import (
-    Member,
-    Reading,
-    chosen_lanes,
-    sequence_of,
-    spans,
-    told_uneven,
-    windows,
-)
-from nnode.data.options import Gaps, PairOptions, check_known, one_of, positive, wanted
+from nnode.data.cut import Reading, by_pair, chosen_lanes, told_uneven
+from nnode.data.options import PairOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, place_below, tables_below
 from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS, seconds_per_unit
-from nnode.data.sequence import Sequence
-from nnode.data.trajectories import (
-    UNEVEN,
-    Grid,
-    Record,
-    Trajectories,
-    measured_times,
-    records,
-    usual_step,
-)
+from nnode.data.trajectories import Record, Trajectories, driven
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
 
-_REQUIRED = ("time", "x_follower", "x_leader")
+REQUIRED = ("time", "x_follower", "x_leader")
 #: What positions follow from where there are none.
-_INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
-_METRES = ("leader_length", "follower_length", "spacing")
+INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
+_LENGTHS = ("leader_length", "follower_length")
 _SPEEDS = ("v_follower", "v_leader")
 _WHO = ("follower", "leader")
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
+OPTIONAL = (*_LENGTHS, "spacing", *_SPEEDS, *_WORDS)
 
 #: Key of the table that lists the files.
 INDEX = "index"
@@ -62,37 +46,29 @@ INDEX = "index"
 UNSTEADY = 0.5
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """A pair's rows in one file, follower and leader, and what belongs to it as a whole.
-
-    Its times count from ``origin`` (ns).
-    """
-
-    words: dict[str, str]
-    origin: int
-    rows: Trajectories
-
-
-def pair_files(options: PairOptions) -> dict[str, Path]:
+def pair_files(options: PairOptions, table: Table | None = None) -> dict[str, Path | Table]:
     """The tables by their path below the folder; a single file by its name; and the index.
+
+    Args:
+        table: takes the place of files.
 
     Raises:
         ConfigError: no path, or ``data.source`` is an address.
         DataError: no such file or folder, one without a table, or an index that names a file that
             is not there.
     """
+    if table is not None:
+        return {table.path.stem: table}
     place = place_below(options, options.path)
     listed = place / options.index if options.index is not None and place.is_dir() else None
     if listed is None or not listed.is_file():
-        return tables_below(options, options.path, options.files)
-    table = Table(listed)
-    files = {INDEX: listed}
-    for i, name in enumerate(table.names(table.choose(("path",))["path"])):
-        files[name] = place / name
-        if not files[name].is_file():
-            raise DataError(f"{listed}, {table.row(i)}: there is no file {files[name]}")
-    return files
+        return {**tables_below(options, options.path, options.files)}
+    index = Table(listed)
+    names = index.names(index.choose(("path",))["path"])
+    for i, name in enumerate(names):
+        if not (place / name).is_file():
+            raise DataError(f"{listed}, {index.row(i)}: there is no file {place / name}")
+    return {INDEX: listed, **{name: place / name for name in names}}
 
 
 def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Reading:
@@ -124,49 +100,52 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             ``gaps=error``, or no pair at all.
     """
     _check(options)
-    asked = wanted(options.recording)
     listed = _listed(files.get(INDEX))
-    pairs = [
-        pair
+    tables = [
+        _rows(key, opened(path), options, listed.get(key, {}))
         for key, path in files.items()
         if key != INDEX
-        for pair in _pairs(key, opened(path), options, listed.get(key, {}))
     ]
+    start = min((origin for origin, _ in tables), default=0)
+    pairs: list[tuple[str, str, str, Trajectories]] = [
+        (*names, pair)  # type: ignore[misc]
+        for origin, rows in tables
+        for names, pair in replace(rows, time=rows.time + (origin - start) / 1e9).parts(
+            "recording", "sequence", "lane"
+        )
+    ]
+    asked = wanted(options.recording)
     if asked is not None:
-        check_known(asked, [pair.words["run"] for pair in pairs])
-    lanes = _lanes(options, pairs)
-    start = min((pair.origin for pair in pairs), default=0)
-    dt = options.dt or _usual([pair.rows for pair in pairs])
-    found: list[Sequence] = []
+        check_known(asked, [run for run, *_ in pairs])
+    lanes = chosen_lanes(options.lane, {lane for _, _, lane, _ in pairs}, "the pairs have")
+    steps = [rows.dt for *_, rows in pairs if np.isfinite(rows.dt)]
+    dt = options.dt or (float(np.median(steps)) if steps else 1.0)
+    reading = Reading()
     taken: dict[str, Path] = {}
-    short: list[dict[str, str]] = []
     every: list[Record] = []
-    for pair in sorted(pairs, key=lambda p: (natural(p.words["run"]), natural(p.words["pair"]))):
-        run, lane = pair.words["run"], pair.words.get("lane", "")
-        if (asked is not None and run not in asked) or (lanes and lane not in lanes):
+    for run, number, lane, rows in sorted(pairs, key=lambda p: (natural(p[0]), natural(p[1]))):
+        if (asked is not None and run not in asked) or lane not in lanes:
             continue
-        name = f"{run}/{pair.words['pair']}"
+        name = f"{run}/{number}"
         if name in taken:
             raise DataError(
-                f"{pair.rows.path}: pair {pair.words['pair']} of run {run} stands in {taken[name]} "
-                "as well; give pairs names of their own (data.columns.pair, data.pattern)"
+                f"{rows.path}: pair {number} of run {run} stands in {taken[name]} as well; give "
+                "pairs names of their own (data.columns.pair, data.pattern)"
             )
-        taken[name] = pair.rows.path
-        late = (pair.origin - start) / 1e9
-        rows = replace(pair.rows, time=pair.rows.time + late)
-        made, own = _sequences(name, rows, pair.words, dt, options)
-        every += own
-        if not made:
-            short.append({"name": name, "why": _too_short(rows, options)})
-        found += made
-    if not found:
+        taken[name] = rows.path
+        made, records = by_pair(rows, dt, options)
+        every += records
+        reading.add(made)
+    if not reading:
         raise DataError(
             f"{options.path}: no sequence; none of {len(pairs)} pairs has "
             f"{options.min_samples} equally spaced times"
             + (f" or lasts for {options.window:g} s" if options.window else "")
             + "; lower data.min_samples or data.window"
         )
-    anonymous = sum(not (p.words.get("follower") or p.words.get("leader")) for p in pairs)
+    anonymous = sum(
+        all(f"{number} {who}" in rows.agent for who in _WHO) for _, number, _, rows in pairs
+    )
     if anonymous:
         log.info(
             "%d of %d pairs name neither follower nor leader and are taken as independent of each "
@@ -174,13 +153,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             anonymous,
             len(pairs),
         )
-    return Reading(found, short, told_uneven(every, dt))
-
-
-def _usual(tables: list[Trajectories]) -> float:
-    """The sampling interval (s) of most pairs."""
-    steps = [step for table in tables if np.isfinite(step := usual_step(table))]
-    return float(np.median(steps)) if steps else 1.0
+    reading.notes = told_uneven(every, dt)
+    return reading
 
 
 def _check(options: PairOptions) -> None:
@@ -189,11 +163,10 @@ def _check(options: PairOptions) -> None:
             positive(name, getattr(options, name))
     if options.min_samples < 2:
         raise ConfigError(f"data.min_samples={options.min_samples}: expected at least 2")
-    columns = (*_REQUIRED, *_METRES, *_SPEEDS, *_WORDS)
-    for option, known in (("constant", _WORDS), ("columns", columns)):
+    for option, valid in (("constant", _WORDS), ("columns", (*REQUIRED, *OPTIONAL))):
         for key in getattr(options, option):
-            if key not in known:
-                raise ConfigError(f"data.{option}.{key} is unknown; expected {', '.join(known)}")
+            if key not in valid:
+                raise ConfigError(f"data.{option}.{key} is unknown; expected {', '.join(valid)}")
     try:
         groups = re.compile(options.pattern or "").groupindex
     except re.error as error:
@@ -225,89 +198,102 @@ def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
     cells = {name: table.names(column, empty=True) for name, column in names.items()}
     files = cells.pop("path")
     return {
-        str(file): {name: str(own[i]) for name, own in cells.items() if own[i]}
+        str(file): {name: str(values[i]) for name, values in cells.items() if values[i]}
         for i, file in enumerate(files)
     }
 
 
-def _pairs(key: str, table: Table, options: PairOptions, listed: dict[str, str]) -> Iterator[_Pair]:
+def _rows(
+    key: str, table: Table, options: PairOptions, listed: dict[str, str]
+) -> tuple[int, Trajectories]:
+    """The rows of a file's followers and then those of their leaders; times count from an origin
+    (ns)."""
     names, integrated = _columns(table, options)
     metres = _unit("position_unit", options.position_unit, table.path, LENGTH_UNITS)
     speeds = _unit("speed_unit", options.speed_unit, table.path, SPEED_UNITS)
     origin, time = table.times(names["time"], seconds_per_unit(options))
-    x = v = None
+    x, v = np.full((len(table), 2), np.nan), None
     if not integrated:
         x = np.stack([table.measured(names[n]) for n in ("x_follower", "x_leader")], -1) * metres
     if all(name in names for name in _SPEEDS):
         speed = table.numbers if integrated else table.measured
         v = np.stack([speed(names[name]) for name in _SPEEDS], -1) * speeds
-    own = {n: table.positive(names[n]) * metres for n in _METRES[:2] if n in names}
-    if "spacing" in names:
-        own["spacing"] = table.numbers(names["spacing"], empty=not integrated) * metres
     words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
-    everywhere = _everywhere(key, table.path, options, listed, set(words))
-    label = np.array(["\0".join(cells) for cells in zip(*_keys(words), strict=True)], dtype=object)
-    codes = np.unique(label, return_inverse=True)[1] if len(label) else np.zeros(len(table), int)
-    first = [int(np.flatnonzero(codes == code)[0]) for code in range(codes.max() + 1)]
-    for code in np.argsort(first):
-        rows = np.flatnonzero(codes == code)
-        rows = rows[np.argsort(time[rows], kind="stable")]
-        said = dict(everywhere)
-        for name, cells in words.items():
-            _steady(table, names[name], cells, rows)
-            said[name] = str(cells[rows[0]])
-        if x is None:
+    same = _everywhere(key, table.path, options, listed, set(words))
+    for name, value in same.items():
+        words.setdefault(name, np.full(len(table), value, dtype=object))
+    unknown = np.full(len(table), np.nan)
+    follower = table.positive(names[_LENGTHS[1]]) * metres if _LENGTHS[1] in names else unknown
+    leader, spacing = unknown.copy(), unknown
+    if _LENGTHS[0] in names:
+        leader = table.positive(names[_LENGTHS[0]]) * metres
+    if "spacing" in names:
+        spacing = table.numbers(names["spacing"], empty=not integrated) * metres
+    pair = pd.DataFrame({n: words[n] for n in ("run", "pair")}).groupby(["run", "pair"], sort=False)
+    rule = (
+        "it belongs to the pair and must be the same in all its rows: name pairs that are to be "
+        "told apart (data.columns.pair)"
+    )
+    for name in (word for word in _WORDS if word in names):
+        table.check_constant(names[name], words[name], pair.ngroup().to_numpy(), rule)
+    for place in pair.indices.values():
+        rows = np.asarray(place)[np.argsort(time[place], kind="stable")]
+        length = float(leader[rows[0]])
+        if integrated:
             assert v is not None
-            leader = float(own["leader_length"][rows[0]]) if "leader_length" in own else np.nan
-            leader = float(options.length or np.nan) if np.isnan(leader) else leader
-            place = _integrated(time[rows], v[rows, 1], own["spacing"][rows], leader)
-        else:
-            place, leader = x[rows], _leader(table, own, x, rows)
-        lengths = np.array([_follower(own, rows), leader])
-        yield _Pair(said, origin, _rows(table, rows, said, options, time, place, v, lengths))
+            length = float(options.length or np.nan) if np.isnan(length) else length
+            x[rows] = _integrated(time[rows], v[rows, 1], spacing[rows], length)
+        elif _LENGTHS[0] not in names:
+            length = _leader(table, x[rows, 1] - x[rows, 0] - spacing[rows], rows)
+        leader[rows] = length
+    return origin, _both(
+        table,
+        options,
+        words,
+        time=np.tile(time, 2),
+        x=x.T.reshape(-1, 1),
+        v=None if v is None else v.T.reshape(-1, 1),
+        length=np.concatenate([follower, leader]),
+    )
 
 
-def _rows(
-    table: Table,
-    rows: np.ndarray,
-    words: dict[str, str],
-    options: PairOptions,
-    time: np.ndarray,
-    x: np.ndarray,
-    v: np.ndarray | None,
-    length: np.ndarray,
+def _both(
+    table: Table, options: PairOptions, words: dict[str, np.ndarray], **columns: Any
 ) -> Trajectories:
-    """The rows of a pair's follower, and then those of its leader."""
-    n = len(rows)
+    """Rows of followers and leaders, with what belongs to a pair as a whole.
+
+    Args:
+        words: ``(R,)`` by their meaning.
+        columns: ``(2 R, ...)`` further ones.
+    """
     kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
-    codes = [words.get(f"{who}_kind", "") for who in _WHO]
-    # one without an identifier is in no other pair
-    agents = [words.get(who) or f"{words['pair']} {who}" for who in _WHO]
+    none = np.full(len(table), "", dtype=object)
+    codes = np.concatenate([words.get(f"{who}_kind", none) for who in _WHO])
+    agents = []
+    for who in _WHO:
+        # one without an identifier is in no other pair
+        identifiers = words.get(who, none)
+        agents.append(np.where(identifiers == "", words["pair"] + f" {who}", identifiers))
+    names = {"recording": "run", "sequence": "pair", "lane": "lane", "split": "split"}
+    columns |= {field: np.tile(words[n], 2) for field, n in names.items() if n in words}
     return Trajectories(
         path=table.path,
-        name=words["run"],
-        where=lambda i: table.row(int(rows[i % n])),
-        agent=np.repeat(np.array(agents, dtype=object), n),
-        sequence=np.full(2 * n, words["pair"], dtype=object),
-        time=np.tile(time[rows], 2),
-        x=x.T.reshape(-1, 1),
-        v=None if v is None else v[rows].T.reshape(-1, 1),
-        length=np.repeat(length, n),
-        kind=np.repeat(np.array([kinds.get(c, c) for c in codes], dtype=object), n)
-        if any(codes)
-        else None,
+        name=options.name,
+        where=lambda i: table.row(i % len(table)),
+        agent=np.concatenate(agents),
+        kind=np.array([kinds.get(c, c) for c in codes], dtype=object) if any(codes) else None,
+        **columns,
     )
 
 
 def _columns(table: Table, options: PairOptions) -> tuple[dict[str, str], bool]:
     """Columns by meaning, and whether positions are to be integrated."""
-    further = (*_METRES, *_SPEEDS, *_WORDS)
-    places = _REQUIRED[1:]
-    names = table.choose(_REQUIRED[:1], (*places, *further), options.columns)
-    if set(names) >= _INTEGRATED and not any(place in names for place in places):
+    places = REQUIRED[1:]
+    names = table.choose(REQUIRED[:1], (*places, *OPTIONAL), options.columns)
+    if set(names) >= INTEGRATED and not any(place in names for place in places):
         return names, True
     try:
-        return table.choose(_REQUIRED, further, options.columns), False
+        return table.choose(REQUIRED, OPTIONAL, options.columns), False
     except DataError as error:
         raise DataError(
             f"{error}; without positions, spacing, v_follower and v_leader are needed, from which "
@@ -319,15 +305,8 @@ def _integrated(
     time: np.ndarray, v_leader: np.ndarray, spacing: np.ndarray, length: float
 ) -> np.ndarray:
     """``(K, 2)`` m, fronts of follower and leader, see :func:`read_pairs`."""
-    leader = cumulative_trapezoid(v_leader, time, initial=0.0)
+    leader = driven(time, v_leader)
     return np.stack([leader - np.nan_to_num(length) - spacing, leader], -1)
-
-
-def _keys(words: dict[str, np.ndarray]) -> list[np.ndarray]:
-    """The columns that tell pairs apart: their names, else the two vehicles."""
-    if "pair" in words:
-        return [words[n] for n in ("run", "pair") if n in words]
-    return [words[n] for n in ("run", "follower", "leader") if n in words]
 
 
 def _everywhere(
@@ -350,27 +329,12 @@ def _everywhere(
     return said
 
 
-def _steady(table: Table, column: str, cells: np.ndarray, rows: np.ndarray) -> None:
-    other = rows[cells[rows] != cells[rows[0]]]
-    if other.size:
-        raise DataError(
-            f"{table.path}, {table.row(int(other[0]))}: column {column!r} holds "
-            f"{cells[other[0]]!s}, before it {cells[rows[0]]!s}; it belongs to the pair and must "
-            "be the same in all its rows: name pairs that are to be told apart (data.columns.pair)"
-        )
+def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
+    """The leader's length (m): what is left of the distance without the spacing.
 
-
-def _follower(own: dict[str, np.ndarray], rows: np.ndarray) -> float:
-    return float(own["follower_length"][rows[0]]) if "follower_length" in own else float("nan")
-
-
-def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.ndarray) -> float:
-    """The leader's length (m): given, or what is left of the distance without the spacing."""
-    if "leader_length" in own:
-        return float(own["leader_length"][rows[0]])
-    if "spacing" not in own:
-        return float("nan")
-    length = x[rows, 1] - x[rows, 0] - own["spacing"][rows]
+    Args:
+        length: ``(K,)`` m by the row, NaN where it is unknown.
+    """
     if np.isnan(length).all():
         return float("nan")
     usual = float(np.nanmedian(length))
@@ -390,68 +354,3 @@ def _leader(table: Table, own: dict[str, np.ndarray], x: np.ndarray, rows: np.nd
             "data.columns.spacing=null, or correct it"
         )
     return usual
-
-
-def _lanes(options: PairOptions, pairs: list[_Pair]) -> list[str]:
-    if options.lane is None:
-        return []
-    present = {pair.words.get("lane", "") for pair in pairs}
-    return chosen_lanes(options.lane, present, "the pairs have")
-
-
-def _too_short(rows: Trajectories, options: PairOptions) -> str:
-    """Why there is no sequence of a pair."""
-    if len(rows) // 2 < options.min_samples:
-        return f"fewer than data.min_samples={options.min_samples} times"
-    if options.window is not None:
-        return f"no data.window={options.window:g} s without a gap"
-    return f"no data.min_samples={options.min_samples} times without a gap"
-
-
-def _sequences(
-    name: str, rows: Trajectories, words: dict[str, str], dt: float, options: PairOptions
-) -> tuple[list[Sequence], list[Record]]:
-    """A pair's sequences, one for every part without a gap or every window, and its records."""
-    usual = usual_step(rows)
-    if options.dt is not None and dt < usual * (1 - UNEVEN):
-        raise ConfigError(
-            f"data.dt={dt:g} s is finer than the {usual:g} s of {rows.path}: pair "
-            f"{words['pair']}; expected no more times than were measured"
-        )
-    grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
-    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    both = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
-    for record in found:
-        both[record.row >= len(rows) // 2].records.append(record)
-    parts = spans(both)
-    if len(parts) > 1 and options.gaps is Gaps.error:
-        end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
-        row = int(np.flatnonzero(rows.time >= start - dt / 2)[0])
-        raise DataError(
-            f"{rows.path}: pair {words['pair']} steps from {end:g} s to {start:g} s "
-            f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
-            "data.gaps=cut cuts the pair there"
-        )
-    if options.window is not None:
-        steps = round(options.window / dt)
-        if steps < 1 or abs(options.window / dt - steps) > 1e-6 * steps:
-            raise ConfigError(
-                f"data.window={options.window:g} s is no whole number of steps of {dt:g} s"
-            )
-        parts = [piece for part in parts for piece in windows(*part, steps)]
-    parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
-    split = words.get("split", "").lower()
-    made = [
-        sequence_of(
-            name if len(parts) == 1 else f"{name}_{number:03d}",
-            rows,
-            both,
-            first,
-            last,
-            grid,
-            time=measured_times(rows, grid, first, last),
-            split=split,
-        )
-        for number, (first, last) in enumerate(parts)
-    ]
-    return made, found

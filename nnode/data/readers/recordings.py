@@ -102,45 +102,36 @@ def table_path(options: DataOptions, option: str, path: str) -> Path:
         ConfigError: the path is not set, or ``data.source`` is an address.
         DataError: there is no such file.
     """
-    if not path or path == "???":
-        raise ConfigError(f"data.{option} is not set; expected the path of a table")
-    place = Path(path).expanduser()
-    if options.source is not None and not place.is_absolute() and not place.is_file():
-        if "://" in options.source:
-            raise ConfigError(
-                f"data.source={options.source}: tables are read from a folder; download the "
-                "table and set data.source to its folder"
-            )
-        place = Path(options.source).expanduser() / place
+    place = place_below(options, path, option)
     if not place.is_file():
-        found = "is a folder, expected a file" if place.is_dir() else "is not there"
         raise DataError(
-            f"data.{option}: {place} {found}; set data.{option} to a table of your own, tables "
-            "are not downloaded"
+            f"data.{option}: {place} is a folder, expected a file; set data.{option} to a table of "
+            "your own"
         )
     return place
 
 
-def place_below(options: DataOptions, path: str) -> Path:
-    """A file or a folder: as ``data.path`` gives it, or else below ``data.source``.
+def place_below(options: DataOptions, path: str, option: str = "path") -> Path:
+    """A file or a folder: as an option gives it, or else below ``data.source``.
 
     Raises:
         ConfigError: no path, or ``data.source`` is an address.
         DataError: there is no such thing.
     """
     if not path or path == "???":
-        raise ConfigError("data.path is not set; expected a table, or a folder of tables")
+        raise ConfigError(f"data.{option} is not set; expected the path of a table")
     place = Path(path).expanduser()
     if options.source is not None and not place.is_absolute() and not place.exists():
         if "://" in options.source:
             raise ConfigError(
-                f"data.source={options.source}: tables are read from a folder, not an address"
+                f"data.source={options.source}: tables are read from a folder; download the "
+                "table and set data.source to its folder"
             )
         place = Path(options.source).expanduser() / place
     if not place.exists():
         raise DataError(
-            f"data.path: {place} is not there; expected a table or a folder of tables"
-            f"{_published(options.name)}"
+            f"data.{option}: {place} is not there; set data.{option} to a table of your own, "
+            f"tables are not downloaded{_published(options.name)}"
         )
     return place
 

@@ -8,32 +8,26 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, Reading, members, sequence_of, spans, told_uneven
+from nnode.data.cut import Reading, by_sequence
 from nnode.data.exits import destinations, exits_of, read_exits
-from nnode.data.options import TableOptions, check_known, one_of, wanted
+from nnode.data.options import TableOptions, check_known, wanted
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import natural, table_path
-from nnode.data.readers.vehicles import LENGTH_UNITS, seconds_per_unit
-from nnode.data.sequence import Sequence
-from nnode.data.trajectories import Grid, Record, Trajectories, measured_times, records, usual_step
+from nnode.data.readers.vehicles import LENGTH_UNITS, table_rows
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
-#: A sequence's times times its agents, present or not.
-MOST_CELLS = 10**8
-#: Fewest times of a part of a sequence.
-LEAST = 3
-
-_REQUIRED = ("sequence", "time", "agent", "x")
-_OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
+REQUIRED = ("sequence", "time", "agent", "x")
+OPTIONAL = ("y", "length", "kind", "group", "dest_x", "dest_y", "recording")
 _WALL = ("x1", "y1", "x2", "y2")
 
 #: Keys of the files of a table.
 TABLE, WALLS = "table", "walls"
 
 
-def table_files(options: TableOptions) -> dict[str, Path]:
-    """The table's path, and that of the walls where there are such."""
-    files = {TABLE: table_path(options, "path", options.path)}
+def table_files(options: TableOptions, table: Table | None = None) -> dict[str, Path | Table]:
+    """The table, or its path, and the path of the walls where there are such."""
+    files = {TABLE: table or table_path(options, "path", options.path)}
     if options.walls is not None:
         files[WALLS] = table_path(options, "walls", options.walls)
     return files
@@ -67,66 +61,50 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
     rows = _rows(opened(source), options)
     asked = wanted(options.recording)
     if asked is not None:
-        check_known(asked, () if rows.recording is None else rows.recording)
+        assert rows.recording is not None
+        check_known(asked, rows.recording)
+        rows = rows.at(np.flatnonzero(np.isin(rows.recording, asked)))
     segments = None if walls is None else _segments(walls)
-    dt = usual_step(rows)
-    found: list[Sequence] = []
-    notes: list[str] = []
-    every: list[Record] = []
-    parts = sorted(rows.parts("recording", "sequence"), key=lambda p: [*map(natural, p[0])])
-    for (run, number), own in parts:
-        if asked is None or run in asked:
-            name = number if number.startswith(f"{run}/") else f"{run}/{number}"
-            made, its, note = _sequences(name, own, dt, options)
-            found += [replace(s, recording=run, walls=segments) for s in made]
-            every += its
-            notes += note
-    return Reading(found, notes=[*told_uneven(every, dt), *told_parts(notes)])
-
-
-def told_parts(notes: list[str], most: int = 3) -> list[str]:
-    """The first of some sentences, and how many more there are."""
-    more = [f"and {len(notes) - most} more such sequences"] if len(notes) > most else []
-    return notes[:most] + more
+    found = by_sequence(rows, options, natural)
+    found[:] = [replace(s, walls=segments) for s in found]
+    return found
 
 
 def _rows(table: Table, options: TableOptions) -> Trajectories:
     """The table's columns, by what they mean."""
     crowd, path = _is_crowd(options), table.path
     axes = ("x", "y") if crowd else ("x",)
-    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
-    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
+    names = table.choose(REQUIRED, OPTIONAL, options.columns)
     if crowd != ("y" in names):
         expected = "x and y" if crowd else "x alone (drop y, or set data.domain=crowd)"
         raise DataError(f"{path}: data.domain={options.domain} needs the positions {expected}")
     goals = tuple(f"dest_{axis}" for axis in axes)
     if any(goal in names for goal in goals) and not all(goal in names for goal in goals):
         raise DataError(f"{path}: a destination needs the columns {' and '.join(goals)}")
-    sequence, agent = table.names(names["sequence"]), table.names(names["agent"])
-    time = table.times(names["time"], seconds_per_unit(options))[1]
-    x = np.stack([table.measured(names[axis]) for axis in axes], -1) * metres
+    sequence = table.names(names.pop("sequence"))
+    recording = names.pop("recording", "")
+    rows = table_rows(table, names, options, axes)
     destination = None
     if goals[0] in names:
+        metres = LENGTH_UNITS[options.position_unit]
         destination = np.stack([table.numbers(names[goal]) for goal in goals], -1) * metres
-    rows = Trajectories(
-        path=path,
-        name=path.stem,
-        where=table.row,
-        recording=table.names(names["recording"])
-        if "recording" in names
+    rows = replace(
+        rows,
+        recording=table.names(recording)
+        if recording
         else np.full(len(table), path.stem, dtype=object),
         sequence=sequence,
-        agent=agent,
-        time=time,
-        x=x,
-        length=table.positive(names["length"]) * metres if "length" in names else None,
-        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
-        group=table.names(names["group"], empty=True) if "group" in names else None,
         destination=destination,
     )
-    for key in ("length", "kind", "group", *goals):
-        if key in names:
-            _constant(rows, key, names[key])
+    belongings = {key: getattr(rows, key) for key in ("length", "kind", "group")}
+    if destination is not None:
+        belongings |= dict(zip(goals, destination.T, strict=True))
+    whose = pd.DataFrame({"r": rows.recording, "s": sequence, "a": rows.agent})
+    owner = whose.groupby(["r", "s", "a"], sort=False).ngroup().to_numpy()
+    rule = "it belongs to the agent and must be the same in all its rows of a sequence"
+    for key, values in belongings.items():
+        if values is not None:
+            table.check_constant(names[key], values, owner, rule)
     if options.exits:
         if not crowd or destination is not None:
             raise ConfigError(
@@ -134,65 +112,6 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
             )
         rows = replace(rows, destination=_goals(rows, options))
     return rows
-
-
-def _sequences(
-    name: str, rows: Trajectories, dt: float, options: TableOptions
-) -> tuple[list[Sequence], list[Record], list[str]]:
-    """One sequence of the table, or its parts; its records; and what was cut, in words."""
-    if not np.isfinite(dt):  # of single samples
-        dt = 1.0
-    grid = Grid(dt, float(rows.time.min()))
-    found = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    of = sorted(members(rows, found), key=lambda member: natural(member.agent))
-    first, last = 0, round((float(rows.time.max()) - grid.origin) / dt)
-    if (last + 1) * len(of) > MOST_CELLS:
-        raise DataError(
-            f"{rows.path}: sequence {name} has {last + 1} times and {len(of)} agents in "
-            f"{len(rows)} rows, expected at most {MOST_CELLS:.0e} times x agents; cut it into "
-            "shorter sequences"
-        )
-    crowd = rows.x.shape[1] == 2
-    parts = _occupied(found) if crowd else spans(of)
-    if crowd and any(record.uneven.any() for record in found):
-        # people begin and end between two times of the grid
-        parts = [(a + 1, b - 1) for a, b in parts]
-    whole = [(a, b) for a, b in parts if b - a + 1 >= LEAST]
-    lost = last + 1 - sum(b - a + 1 for a, b in whole)
-    note = []
-    if whole and lost * dt > options.fill + dt / 2:
-        who = "nobody is" if crowd else "not all vehicles are"
-        note = [
-            f"sequence {name}: {who} there at {lost} of {last + 1} times, for longer than "
-            f"data.fill={options.fill:g} s; cut into {len(whole)} "
-            f"sequence{'s' * (len(whole) > 1)} without these times"
-        ]
-    made = []
-    for number, (a, b) in enumerate(whole or [(first, last)]):
-        called = name if len(whole) < 2 else f"{name}_{number:03d}"
-        ordered = of if crowd else sorted(of, key=lambda member: _place(member, a))
-        time = measured_times(rows, grid, a, b)
-        made.append(sequence_of(called, rows, ordered, a, b, grid, time=time))
-    return made, found, note
-
-
-def _occupied(found: list[Record]) -> list[tuple[int, int]]:
-    """First and last times of the intervals in which anybody is there."""
-    parts: list[tuple[int, int]] = []
-    for record in sorted(found, key=lambda r: r.first):
-        if parts and record.first <= parts[-1][1] + 1:
-            parts[-1] = parts[-1][0], max(parts[-1][1], record.last)
-        else:
-            parts.append((record.first, record.last))
-    return parts
-
-
-def _place(member: Member, at: int) -> float:
-    """m, where a vehicle is at a time, or first."""
-    for record in member.records:
-        if record.last >= at:
-            return float(record.x[max(at - record.first, 0), 0])
-    return np.inf
 
 
 def _goals(rows: Trajectories, options: TableOptions) -> np.ndarray:
@@ -216,28 +135,6 @@ def _is_crowd(options: TableOptions) -> bool:
             f"data.domain={options.domain}: expected traffic (positions x) or crowd (x and y)"
         )
     return options.domain == "crowd"
-
-
-def _constant(rows: Trajectories, key: str, column: str) -> None:
-    """Refuse a property of an agent that changes within a sequence."""
-    values: np.ndarray
-    if key.startswith("dest_"):
-        assert rows.destination is not None
-        values = rows.destination[:, "xy".index(key[-1])]
-    else:
-        values = getattr(rows, key)
-    names = {"r": rows.recording, "s": rows.sequence, "a": rows.agent}
-    owner = pd.DataFrame(names).groupby(["r", "s", "a"], sort=False).ngroup().to_numpy()
-    first = np.unique(owner, return_index=True)[1][owner]
-    differs = values != values[first]
-    if values.dtype.kind == "f":
-        differs &= ~(np.isnan(values) & np.isnan(values[first]))
-    if differs.any():
-        row = int(np.flatnonzero(differs)[0])
-        raise DataError(
-            f"{rows.path}, {rows.where(row)}: column {column!r} holds {values[row]!s}; it belongs "
-            "to the agent and must be the same in all its rows of a sequence"
-        )
 
 
 def _segments(path: Path) -> np.ndarray:

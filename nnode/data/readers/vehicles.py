@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from nnode.data.options import (
 from nnode.data.readers.columns import Table, opened
 from nnode.data.readers.recordings import table_path
 from nnode.data.sequence import TIME_UNITS, check_interval
-from nnode.data.trajectories import Trajectories, usual_step
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError
 
 #: Metres per unit of length.
@@ -28,12 +29,14 @@ LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
 #: Metres per second per unit of speed.
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 
-_REQUIRED = ("vehicle", "time", "x")
-_OPTIONAL = ("lane", "speed", "length", "kind", "recording", "sequence")
+REQUIRED = ("vehicle", "time", "x")
+OPTIONAL = ("lane", "speed", "length", "kind", "recording", "sequence")
 
 
-def vehicle_files(options: LaneOptions) -> dict[str, Path]:
-    """The table's path."""
+def vehicle_files(options: LaneOptions, table: Table | None = None) -> dict[str, Path | Table]:
+    """The table, or its path."""
+    if table is not None:
+        return {table.path.stem: table}
     path = table_path(options, "path", options.path)
     return {path.stem: path}
 
@@ -54,17 +57,10 @@ def read_vehicles(source: Path | Table, options: VehicleTableOptions) -> Reading
         raise ConfigError(f"data.direction={options.direction}: expected 1 or -1")
     check_cutting(options)
     table = opened(source)
-    rows = _rows(table, options)
-    check_interval(usual_step(rows), f"{table.path}: rows of a vehicle")
+    rows = table_rows(table, table.choose(REQUIRED, OPTIONAL, options.columns), options)
+    rows = replace(rows, x=options.direction * rows.x)
+    check_interval(rows.dt, f"{table.path}: rows of a vehicle")
     return by_lane(rows, options)
-
-
-def recordings(table: Table, names: Mapping[str, str]) -> np.ndarray | None:
-    """``(rows,)`` names of what never meets: recordings, sequences, or both; None: all is one."""
-    known = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
-    if len(known) < 2:
-        return known[0] if known else None
-    return np.array([" ".join(cells) for cells in zip(*known, strict=True)], dtype=object)
 
 
 def seconds_per_unit(
@@ -81,34 +77,51 @@ def seconds_per_unit(
     return scale
 
 
-def _seconds(table: Table, column: str, options: VehicleTableOptions) -> np.ndarray:
-    dates = table.instants(column)
-    if dates is None:  # numbers keep their origin, with which the time grid begins
-        return table.numbers(column) * seconds_per_unit(options)
-    return np.asarray((dates - dates.min()) / 1e9)
+def table_rows(
+    table: Table,
+    names: Mapping[str, str],
+    options: VehicleTableOptions | TableOptions | WalkwayOptions,
+    axes: tuple[str, ...] = ("x",),
+) -> Trajectories:
+    """The columns of any table, by what they mean.
 
+    Rows of different recordings, or of different sequences, never meet: both are the name of the
+    recording.
 
-def _rows(table: Table, options: VehicleTableOptions) -> Trajectories:
-    """The table's columns, by what they mean."""
-    names = table.choose(_REQUIRED, _OPTIONAL, options.columns)
+    Args:
+        names: of the columns by their meaning.
+        axes: meanings of the positions' columns.
+
+    Raises:
+        ConfigError: an unknown unit.
+        DataError: cells that are missing or hold no number; names the row.
+    """
     metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
-    v = length = None
-    if "speed" in names:
-        scale = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
-        v = np.abs(table.numbers(names["speed"]))[:, None] * scale
+
+    def words(key: str) -> np.ndarray | None:
+        return table.names(names[key], empty=True) if key in names else None
+
+    v = length = recording = None
+    if "speed" in names and isinstance(options, VehicleTableOptions):
+        unit = one_of("speed_unit", options.speed_unit, SPEED_UNITS)
+        v = np.abs(table.numbers(names["speed"]))[:, None] * unit
     if "length" in names:
-        unit = options.length_unit or options.position_unit
-        length = table.positive(names["length"]) * one_of("length_unit", unit, LENGTH_UNITS)
+        own_unit = getattr(options, "length_unit", None) or options.position_unit
+        length = table.positive(names["length"]) * one_of("length_unit", own_unit, LENGTH_UNITS)
+    parts = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
+    if parts:
+        recording = np.array([" ".join(cells) for cells in zip(*parts, strict=True)], dtype=object)
     return Trajectories(
         path=table.path,
         name=table.path.stem,
         where=table.row,
-        agent=table.names(names["vehicle"]),
-        time=_seconds(table, names["time"], options),
-        x=table.numbers(names["x"])[:, None] * metres * options.direction,
+        agent=table.names(names["vehicle" if "vehicle" in names else "agent"]),
+        time=table.times(names["time"], seconds_per_unit(options))[1],
+        x=np.stack([table.measured(names[axis]) for axis in axes], -1) * metres,
         v=v,
-        recording=recordings(table, names),
+        recording=recording,
         lane=table.names(names["lane"]) if "lane" in names else None,
         length=length,
-        kind=table.names(names["kind"], empty=True) if "kind" in names else None,
+        kind=words("kind"),
+        group=words("group"),
     )

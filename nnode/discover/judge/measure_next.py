@@ -96,9 +96,9 @@ def distance(
     template = max(engine.sequences, key=lambda sequence: sequence.n_agents)
     gaps = np.diff(np.median(template.x[..., 0], axis=0))
     start = np.concatenate([-np.cumsum(gaps[::-1])[::-1], [0.0]])
-    paths = _driven(engine, truth, template, time, place[:, None] + start)
+    paths = _driven(truth, _platoon(template, time, place[:, None] + start))
     kept = time >= LASTS - dt / 2
-    found = _engine(engine, template, time[kept], paths[kept])
+    found = engine.of([_platoon(template, time[kept], paths[kept])])
     row = ParameterVector(wrong).row
     residual = found.residuals(wrong, row[None])[0].numpy()
     columns = found.tangents(wrong, row).numpy().T
@@ -108,27 +108,20 @@ def distance(
     return float(rest @ rest)
 
 
-def _driven(
-    engine: TrafficEngine, system: System, template: Sequence, time: np.ndarray, x: np.ndarray
-) -> np.ndarray:
-    """``(K, N)`` paths behind the leader of ``x``, from its starts, m."""
-    found = _engine(engine, template, time, x)
+def _driven(system: System, platoon: Sequence) -> np.ndarray:
+    """``(K, N)`` paths behind the leader of a platoon, from its starts, m."""
+    x = platoon.x[..., 0]
+    found = TrafficEngine([platoon], np.inf, None, np.inf)
     with torch.no_grad():
         states = found.simulate(system, ParameterVector(system).row[None])[0]
-    return np.where(
-        np.arange(x.shape[1]) < x.shape[1] - 1, states[:, 0, : x.shape[1], 0].numpy(), x
-    )
+    leader = np.arange(x.shape[1]) == x.shape[1] - 1
+    return np.where(leader, x, states[:, 0, : x.shape[1], 0].numpy())
 
 
-def _engine(
-    engine: TrafficEngine, template: Sequence, time: np.ndarray, x: np.ndarray
-) -> TrafficEngine:
-    """Of one platoon, in the filter of another engine."""
+def _platoon(template: Sequence, time: np.ndarray, x: np.ndarray) -> Sequence:
+    """The template's vehicles on other paths ``(K, N)``."""
     v = velocity(x[..., None], float(time[1] - time[0]))
-    sequence = replace(template, name="advised", time=time, x=x[..., None], v=v, agents=())
-    found = TrafficEngine([sequence], np.inf, None, np.inf)
-    found.filter = engine.filter
-    return found
+    return replace(template, name="advised", time=time, x=x[..., None], v=v, agents=())
 
 
 def _leaders(engine: TrafficEngine) -> np.ndarray:

@@ -288,6 +288,12 @@ class TrafficEngine:
         sources = [(rates(place) - base) / SMALL for place in range(size)]
         return self._columns(linear, linear.response(torch.stack(sources)))
 
+    def of(self, sequences: list[Sequence]) -> TrafficEngine:
+        """An engine of other sequences, in the filter of this one."""
+        found = TrafficEngine(sequences, np.inf, None, np.inf)
+        found.filter = self.filter
+        return found
+
     def settle(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""
         shortest = int(self.batch.valid.any(-1).sum(0).min())

@@ -182,6 +182,14 @@ class FollowersEngine(TrafficEngine):
         source[-1] = np.stack(found, 1)
         return self._moved(run, self._propagated(run, source))
 
+    def of(self, sequences: list[Sequence]) -> FollowersEngine:
+        """An engine of other sequences, in which the estimates of this one hold."""
+        assert self.population is not None
+        found = FollowersEngine(sequences, large=np.inf, like=self)
+        model = self.population.model
+        found.settle(model.system, ParameterVector(model.system).row)
+        return found
+
     def settle(self, system: System, row: Tensor) -> None:
         """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
         if self._like is not None and self._like.population is not None:

@@ -18,6 +18,7 @@ from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, evaluated, sums
 from nnode.discover.statistics.leverage import orthonormal
+from nnode.errors import SimulationError
 
 #: Engines of paths that a model has made, and what it leaves of them.
 Made = list[tuple[Engine, Fit]]
@@ -32,7 +33,10 @@ def made(engine: Engine, fit: Fit, seed: int) -> Made:
     """
     if not isinstance(engine, FollowersEngine):
         return []
-    drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
+    try:
+        drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
+    except SimulationError:
+        return []
     found: Made = [(one, evaluated(one, fit.system)) for one in drawn]
     return found if all(np.isfinite(own.residual).all() for _, own in found) else []
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,15 +13,13 @@ import torch
 from omegaconf import OmegaConf
 
 from benchmarks.config import BenchmarkConfig
-from benchmarks.speed import floor, memory
+from benchmarks.speed import floor
 from benchmarks.speed.engines import ENGINES
 from benchmarks.speed.memory import peak_memory
 from benchmarks.speed.problems import SHAPES, Shape, pose
 from benchmarks.speed.run import benchmark
 from nnode.errors import ConfigError, SimulationError
 from tests.simulation.kernels.test_lane_code import PACKED, is_vector_code
-
-SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 
 @pytest.fixture
@@ -87,21 +83,6 @@ def test_a_series_is_drawn(engine, series, tmp_path, capsys) -> None:  # type: i
     assert not (again / "benchmark.json").exists()
 
 
-def test_what_was_timed_before_an_error_is_kept(series, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    right = ENGINES["loop"]
-
-    def prepare(problem):  # type: ignore[no-untyped-def]
-        if problem.shape.agents == 100:
-            raise KeyboardInterrupt
-        return right.prepare(problem)
-
-    monkeypatch.setitem(ENGINES, "loop", replace(right, prepare=prepare))
-    with pytest.raises(KeyboardInterrupt):
-        benchmark(options(shapes=["scale"], engines=["loop"]), tmp_path)
-    found = json.loads((tmp_path / "benchmark.json").read_text())
-    assert [row["agents"] for row in found["problems"]] == [50]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -141,14 +122,6 @@ def test_memory_is_that_of_the_call() -> None:
         pytest.skip("the system does not tell")
     assert found["memory_MB"] == pytest.approx(100, abs=10)
     assert found["peak_memory_MB"] > 100
-
-
-def test_memory_where_the_system_does_not_tell(monkeypatch, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr(memory, "_PROCESS", tmp_path / "missing")
-    result, found = peak_memory(lambda: 7)
-    assert result == 7
-    assert found["memory_MB"] is None
-    assert found["peak_memory_MB"] is None or found["peak_memory_MB"] > 10
 
 
 def test_the_floor_is_the_arithmetic_of_a_network() -> None:
@@ -218,18 +191,6 @@ def test_refusals(changes, message, tmp_path) -> None:  # type: ignore[no-untype
         benchmark(options(**changes), tmp_path)
 
 
-def test_script_refuses_unknown_options(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    done = subprocess.run(
-        [sys.executable, str(SCRIPTS / "benchmark.py"), "benchmark.shape=[paper]"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert "did you mean benchmark.shapes" in done.stderr
-
-
 @pytest.mark.thorough  # compiles three methods
 def test_methods_are_timed_beside_their_errors(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     (shape,) = SHAPES["methods"]
@@ -241,32 +202,3 @@ def test_methods_are_timed_beside_their_errors(tmp_path, monkeypatch, capsys) ->
     assert 0 < away[0] < away[1] < row["errors"]["ballistic 0.1 s"]["gradient"]
     assert all(taken["median"] > 0 for taken in row["engines"].values())
     assert "idm: 2 sequences, 3 cars" in capsys.readouterr().out
-
-
-@pytest.mark.thorough  # four new processes that compile
-def test_tangents_of_eight_parameters_are_timed(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
-    (shape,) = SHAPES["tangents"]
-    for model in shape.models:
-        assert len(list(pose(shape, model, torch.float32).system.parameters())) == 8
-    tiny = replace(shape, models=("idm_zone",), sequences=2, agents=3, samples=3)
-    monkeypatch.setitem(SHAPES, "tangents", (tiny,))
-    monkeypatch.setattr(
-        "benchmarks.speed.run.starts",
-        lambda _: {k: {"cold": 9.0, "warm": 0.5} for k in ("forward", "tangents")},
-    )
-    benchmark(options(shapes=["tangents"]), tmp_path)
-    (row,) = json.loads((tmp_path / "benchmark.json").read_text())["problems"]
-    assert row["difference"] < 1e-9
-    assert row["engines"]["tangents"]["median"] > 0
-    assert "idm_zone: 2 sequences, 3 cars" in capsys.readouterr().out
-
-
-def test_tangents_that_are_wrong_are_not_timed(monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    from benchmarks.speed import tangents
-
-    slope = torch.ones(8, 3, 2, 3, dtype=torch.float64)
-    monkeypatch.setattr(tangents, "calls", lambda _: {"tangents": lambda: slope})
-    (shape,) = SHAPES["tangents"]
-    tiny = replace(shape, sequences=2, agents=3, samples=2)
-    with pytest.raises(SimulationError, match="differ from the gradient"):
-        tangents.check(pose(tiny, "idm_zone", torch.float64))

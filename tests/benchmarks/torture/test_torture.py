@@ -10,9 +10,7 @@ import pytest
 
 from benchmarks.torture.fuzz import fuzz
 from benchmarks.torture.jobs import jobs
-from benchmarks.torture.report import Row, keep
 from benchmarks.torture.targets import Target
-from nnode.errors import DataError
 from tests.app.conftest import Script, composed
 
 
@@ -81,53 +79,6 @@ def test_a_reader_that_misbehaves_is_a_loss(
     assert len(found.losses) == 16 - found.read + sum("did open" in w for w in found.losses)
 
 
-def test_a_message_that_is_long_or_that_a_terminal_obeys_is_a_loss(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def read(path: Path) -> None:
-        error = DataError("plain")
-        error.args = (
-            ("x" * 2001, "\x1b[31m", "soft\xad", "größe\n\tm²")[path.read_bytes()[0] % 4],
-        )
-        raise error
-
-    from benchmarks.torture import fuzz as campaign
-
-    bad = Target("bad", "bad.bin", [bytes(8)], lambda data, rng: rng.randbytes(8), read)
-    monkeypatch.setattr(campaign, "targets", lambda *_: [bad])
-    found = fuzz(tmp_path, 24, 0)[0]
-    words = " ".join(found.losses)
-    assert found.tried == found.refused == 24
-    assert "a message of 2001 characters" in words
-    assert r"a message with '\x1b'" in words
-    assert r"a message with '\xad'" in words
-    assert len(found.losses) < 24
-
-
 def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
     for job in jobs(tmp_path / "raw"):
         composed(job.name, *job.first)
-
-
-def test_only_a_training_with_a_checkpoint_is_gone_on_with(tmp_path: Path) -> None:
-    known = {job.name: job for job in jobs(tmp_path / "raw")}
-    run = tmp_path / "run"
-    last = run / "checkpoints" / "last.pt"
-    last.parent.mkdir(parents=True)
-    assert [job.again(run) for job in known.values()] == [None] * len(known)
-    last.touch()
-    assert known["train"].again(run) == [f"resume={last}", f"data.source={tmp_path / 'raw'}"]
-    assert known["prepare_data"].again(run) is None
-
-
-def test_a_campaign_replaces_its_own_rows(tmp_path: Path) -> None:
-    keep(tmp_path, "fuzz", [Row("fuzz", "a", 3, ["lost"]), Row("fuzz", "b", 4)], {})
-    keep(tmp_path, "kills", [Row("kills", "train", 2)], {})
-    rows = keep(tmp_path, "fuzz", [Row("fuzz", "a", 5)], {})
-    assert [(row.campaign, row.what, row.tried) for row in rows] == [
-        ("kills", "train", 2),
-        ("fuzz", "a", 5),
-    ]
-    content = json.loads((tmp_path / "report.json").read_text())
-    assert content["losses"] == 0
-    assert content["tried"] == {"kills": 2, "disk": 0, "folder": 0, "fuzz": 5}

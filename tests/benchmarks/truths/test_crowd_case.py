@@ -52,7 +52,7 @@ def test_equal_cases_give_equal_files_that_the_reader_takes(tmp_path):
 
 @pytest.mark.parametrize("effect", list(EFFECTS))
 def test_an_oracle_explains_sound_data_and_the_base_law_does_not(effect):
-    made = CrowdCase(small(effect, noise=0.0, n_sequences=3))
+    made = CrowdCase(small(effect, noise=0.0))
     costs = made.costs(made.truth)
     assert costs.floor == 0
     assert costs.oracle.mean() < 4e-6

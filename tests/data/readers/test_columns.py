@@ -70,6 +70,14 @@ def test_zero_characters_do_not_make_two_names_of_one(tmp_path: Path) -> None:
     assert not any("\0" in name for name in Table(path).names("agent"))
 
 
+def test_names_of_bytes_that_are_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    lane().replace({"agent": {"c1": "zzqq"}}).to_parquet(path, compression=None)
+    path.write_bytes(path.read_bytes().replace(b"zzqq", b"\xffzqq"))
+    with pytest.raises(DataError, match=r"column 'agent' holds .*; expected a name or number"):
+        Table(path).names("agent")
+
+
 def test_what_nobody_thought_of_names_the_file() -> None:
     with (
         pytest.raises(DataError, match=r"a\.csv cannot be read \(KeyError: 'q'\)"),
@@ -95,7 +103,7 @@ def test_a_place_in_the_platoon_that_is_none(tmp_path: Path, position: str) -> N
 
 
 def test_a_time_that_asks_for_a_table_of_its_own(tmp_path: Path) -> None:
-    path = platoon(tmp_path, "r,1000,90000.0,10,15")
+    path = platoon(tmp_path, "\n".join(f"r,{p},90000.0,10,15" for p in range(4, 16)))
     with pytest.raises(DataError, match=r"wrong, or cut the file"):
         read_openacc({path.name: path}, OpenAccOptions(path=str(path), min_duration=0.3))
 

@@ -46,6 +46,29 @@ def test_reads_one_struct_array_as_well_as_cells(tmp_path: Path) -> None:
     assert [s.x.shape for s in read_esimas(tmp_path / "sequence_dataown.mat")] == [(3, 2, 1)] * 2
 
 
+def test_holes_cut_and_uneven_times_are_interpolated(tmp_path: Path) -> None:
+    time = 0.2 * np.arange(12)
+    x = np.array([[0.0], [30.0]]) + 25 * time
+    late = time + np.where(np.arange(12) == 5, 0.05, 0.0)
+    gone = np.delete(np.arange(12), [5, 6])
+    path = write(
+        tmp_path / "sequence_dataown.mat",
+        [(x, time), (np.array([[0.0], [30.0]]) + 25 * late, late), (x[:, gone], time[gone])],
+    )
+    found = read_esimas(path)
+    assert [(s.name, s.n_samples) for s in found] == [
+        ("own/000", 12),
+        ("own/001", 12),
+        ("own/002_000", 5),
+        ("own/002_001", 5),
+    ]
+    assert all(s.agents == () for s in found)
+    np.testing.assert_allclose(found[1].x, found[0].x, atol=1e-9)
+    uneven, cut = found.notes
+    assert "times are uneven" in uneven
+    assert "sequence own/002: not all vehicles are there at 2 of 12 times" in cut
+
+
 @pytest.mark.real
 @pytest.mark.parametrize(("family", "total", "fewest"), [(3, 265, 3), (2, 832, 2)])
 def test_published_families(real_data: Path, family: int, total: int, fewest: int) -> None:

@@ -233,7 +233,7 @@ def test_one_agent_twice(tmp_path: Path) -> None:
 def test_properties_belong_to_the_agent(tmp_path: Path) -> None:
     part = rows("s", "a", LINE, length=4.5)
     part.loc[2, "length"] = 4.6
-    with pytest.raises(DataError, match=r"line 4: column 'length' holds 4.6; it belongs"):
+    with pytest.raises(DataError, match=r"holds 4.6, before it 4.5; it belongs"):
         read(tmp_path, part)
 
 

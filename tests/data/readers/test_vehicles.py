@@ -196,6 +196,18 @@ def test_long_holes_are_not_interpolated(tmp_path: Path) -> None:
     assert [s.n_samples for s in read(path, fill=2.0)] == [21]
 
 
+def test_an_empty_position_is_a_missing_sample(platoon: Path) -> None:
+    table = pd.read_csv(platoon)
+    whole = read(platoon)[0]
+    table.loc[[10, 12, 61], "x"] = np.nan
+    save(platoon, table)
+    (s,) = read(platoon)
+    assert s.filled == 3
+    np.testing.assert_allclose(s.x, whole.x, atol=1e-9)
+    (*_, last) = read(platoon, fill=0.0)
+    assert last.filled == 0
+
+
 def test_windows_share_their_boundary_sample(platoon: Path) -> None:
     first, second = read(platoon, window=2.0)
     assert first.n_samples == second.n_samples == 11

@@ -25,7 +25,7 @@ from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import State
 from nnode.simulation import alone as simulate
 from nnode.simulation.alone import PersonAlone
-from nnode.study.walking.laws import without_walls
+from studies.walking.laws import without_walls
 from tests.discover import walkers
 
 ROW = torch.tensor([walkers.A, 0.0, 0.0], dtype=torch.float64)

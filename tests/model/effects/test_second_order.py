@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulation import TorchdiffeqSolver
+from tests.builders import lane
 from tests.model.following import DT, accelerations, behind, model, numbers
 
 LONG, TRUCK = 4.0, 10.0
@@ -26,21 +27,10 @@ LIN = {"term": "lin", "name": "lin", "leader": "measured", "v0": 30.0, "L": 6.0,
 
 def platoon() -> Batch:
     """Four vehicles, the second from behind a truck; at 50 s of the clock."""
-    time, v = 50 + DT * np.arange(3), np.array(SPEEDS)
-    x = np.cumsum([0.0, *GAPS]) + v * DT * np.arange(3)[:, None]
-    return collate(
-        [
-            Sequence(
-                name="r/0",
-                recording="r",
-                time=time,
-                x=x[..., None],
-                v=np.broadcast_to(v, x.shape)[..., None].copy(),
-                length=np.where(np.arange(4) == 1, TRUCK, LONG),
-                kind=tuple("truck" if i == 1 else "car" for i in range(4)),
-            )
-        ]
-    )
+    x = np.cumsum([0.0, *GAPS]) + np.array(SPEEDS) * DT * np.arange(3)[:, None]
+    length = np.where(np.arange(4) == 1, TRUCK, LONG)
+    kind = tuple("truck" if i == 1 else "car" for i in range(4))
+    return collate([lane(x, DT, v=SPEEDS, start=50.0, length=length, kind=kind)])
 
 
 def idm(

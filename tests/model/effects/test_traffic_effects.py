@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch.func import functional_call, vmap
 
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import extended, without
 from nnode.simulation import TorchdiffeqSolver
+from tests.builders import lane
 
 NAMES = [effect.name for effect in CATALOGUE.of("traffic")]
 V0, LENGTH = 30.0, 6.0
@@ -24,18 +25,12 @@ V0, LENGTH = 30.0, 6.0
 def batch(vehicles: int = 4, more: int = 0) -> Batch:
     """A platoon with gaps 20, 30, 40 ... m, its leader at 12 m/s; kinds and lengths known."""
     x = np.cumsum([0.0, *(20.0 + 10 * i for i in range(vehicles - 1))])
-    time = 0.2 * np.arange(11)
-    place = x + 12 * time[:, None]
+    way = 12 * 0.2 * np.arange(11)[:, None]
     kind = tuple("truck" if i == 1 else "car" for i in range(vehicles))
     length = np.where(np.arange(vehicles) == 1, 10.0, 4.0)
-    items = [
-        Sequence(
-            name="r/0", recording="r", time=time + 50, x=place[..., None], kind=kind, length=length
-        )
-    ]
+    items = [lane(x + way, start=50.0, kind=kind, length=length)]
     if more:
-        wide = np.arange(vehicles + more) * 25.0 + 12 * time[:, None]
-        items.append(Sequence(name="r/1", recording="r", time=time, x=wide[..., None]))
+        items.append(lane(np.arange(vehicles + more) * 25.0 + way, name="r/1"))
     return collate(items)
 
 
@@ -111,10 +106,7 @@ def test_time_gap_lengthens_with_the_speed_ahead() -> None:
 def ramp(opening: float) -> Batch:
     """One car behind a leader that draws away steadily, over 8 s."""
     time = 0.05 * np.arange(161)
-    own = 10.0 * time
-    lead = 40 + (10 + opening) * time
-    x = np.stack([own, lead], 1)[..., None]
-    return collate([Sequence(name="r/0", recording="r", time=time, x=x)])
+    return collate([lane(np.stack([10.0 * time, 40 + (10 + opening) * time], 1), 0.05)])
 
 
 def test_a_delayed_driver_sees_the_gap_of_before() -> None:

@@ -19,6 +19,7 @@ from nnode.model import Crowd, InteractionForce, Traffic, make_law
 from nnode.model.formula import crowd_of
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import crowds
+from tests.builders import straight
 from tests.simulation.fused.compare import difference
 from tests.simulation.fused.test_crowd import gradient
 
@@ -110,24 +111,13 @@ def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
     """People at one per square metre, of whom many touch, between (two) walls; padding."""
     draw = np.random.default_rng(3)
     side = n**0.5
-    t = dt * np.arange(samples)[:, None, None]
     items = []
-    for name, count in (("a", n), ("b", n - 9)):
-        x0 = draw.uniform(0, side, (count, 2))
+    for name, count, most in (("a", n, walls), ("b", n - 9, walls // 2)):
+        x = draw.uniform(0, side, (count, 2))
         v = np.array([1.3, 0.0]) + 0.2 * draw.standard_normal((count, 2))
-        items.append(
-            Sequence(
-                name=name,
-                recording="r",
-                time=t[:, 0, 0],
-                x=x0 + t * v,
-                v=np.broadcast_to(v, (samples, count, 2)),
-                destination=x0 + np.array([20.0, 0.0]),
-                walls=np.array([[0, 0, side, 0], [side, side, 0, side]])[
-                    : walls if name == "a" else walls // 2
-                ],
-            )
-        )
+        goal = x + np.array([20.0, 0.0])
+        lines = np.array([[0, 0, side, 0], [side, side, 0, side]])[:most]
+        items.append(straight(x, v, samples, dt, name=name, destination=goal, walls=lines))
     return collate(items)
 
 

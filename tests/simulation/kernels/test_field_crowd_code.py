@@ -12,6 +12,7 @@ from nnode.errors import ConfigError
 from nnode.model import System, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.simulation import FusedSolver
+from tests.builders import straight
 from tests.simulation.test_engines import OWN_FORCES
 
 DT = 0.02
@@ -22,17 +23,9 @@ WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.
 def people(n: int, seed: int, samples: int = 6) -> Sequence:
     draw = np.random.default_rng(seed)
     x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
-    time = 0.04 * np.arange(samples)
     wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
-    return Sequence(
-        name=f"{n}-{seed}",
-        recording="r",
-        time=time,
-        x=x + time[:, None, None] * v,
-        v=np.broadcast_to(v, (samples, n, 2)),
-        preferred=wish,
-        walls=WALLS[: seed % 4],
-    )
+    more = {"preferred": wish, "walls": WALLS[: seed % 4]}
+    return straight(x, v, samples, 0.04, name=f"{n}-{seed}", **more)
 
 
 def batch() -> Batch:

@@ -1,0 +1,105 @@
+"""The paper's studies: ``scripts/study.py``."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from nnode.calibrate.interrupt import BreakingGuard, Interrupted
+from nnode.errors import ConfigError
+from nnode.machine import cores, how_made
+from nnode.pages.page import Block, Provenance, write_page
+from studies.cluster import on_cluster
+from studies.options import StudyOptions, checked
+from studies.runner import KEPT
+
+log = logging.getLogger(__name__)
+
+#: The module of each study; imported when it is asked for.
+STUDIES = {
+    name: f"studies.{name}.study"
+    for name in ("traffic", "crowd", "following", "walking", "prediction")
+}
+
+#: Folder of quick studies inside the study's own: they must not replace full results.
+QUICK = "quick"
+
+_PACKAGES = ("torch", "numba", "numpy", "scipy", "pandas", "matplotlib")
+
+
+class Study(Protocol):
+    """A module that makes a page.
+
+    Attributes:
+        TITLE: of the page.
+        SUBTITLE: one sentence in Markdown.
+    """
+
+    TITLE: str
+    SUBTITLE: str
+
+    @staticmethod
+    def run(options: StudyOptions, folder: Path) -> list[Block]:
+        """Compute what is not kept in ``folder`` yet, and make the page's blocks.
+
+        Args:
+            options: checked; ``workers`` is a number.
+            folder: of this study; its results are kept there.
+        """
+        ...
+
+
+def study(config: DictConfig, folder: Path) -> None:
+    """Run a study, write its page, tables and figures, and print where they are.
+
+    Raises:
+        ConfigError: an unknown study, or options that it cannot work with.
+        Interrupted: a signal asked to stop; what is done is kept.
+    """
+    options = cast(StudyOptions, OmegaConf.to_object(config.study))
+    if options.name not in STUDIES:
+        raise ConfigError(
+            f"study.name={options.name} is unknown, expected one of {', '.join(STUDIES)}"
+        )
+    options = checked(options)
+    options.workers = options.workers or cores()
+    folder = folder / QUICK if options.quick else folder
+    start, before = time.monotonic(), len(list((folder / KEPT).glob("*.json")))
+    with BreakingGuard() as guard:
+        try:
+            module = cast(Study, import_module(STUDIES[options.name]))
+            with on_cluster(options.cluster):
+                blocks = module.run(options, folder)
+            made = _made(time.monotonic() - start, options.workers, before)
+            paths = write_page(
+                [*blocks, made],
+                folder,
+                title=module.TITLE + (" (quick)" if options.quick else ""),
+                subtitle=module.SUBTITLE,
+            )
+        except KeyboardInterrupt:
+            number = guard.requested or signal.SIGINT
+            raise Interrupted(
+                f"stopped by {signal.Signals(number).name}: what is done is kept in {folder}; "
+                "the same command goes on from there",
+                number,
+            ) from None
+    for path, what in zip(paths, ("page", "as Markdown"), strict=False):
+        print(f"{what}: {path}")
+    print(f"tables: {sum(p.suffix == '.csv' for p in paths)} CSV files in {folder}")
+    print(f"time: {time.monotonic() - start:.1f} s")
+
+
+def _made(seconds: float, workers: int, before: int) -> Provenance:
+    """How this run made the page, and how many results an earlier one had left."""
+    facts = how_made(_PACKAGES)
+    time_taken = f"{seconds:.0f} s in this run with {workers} worker process(es), which " + (
+        f"went on from {before} results of earlier ones" if before else "began with no results"
+    )
+    return Provenance({**facts, "Time": time_taken})

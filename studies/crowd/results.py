@@ -1,0 +1,390 @@
+"""Tables and figures of the crowd study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nnode.data.store import Store
+from nnode.model.system import System
+from nnode.pages.replay import ReplayBlock
+from nnode.plots.crowd import force_contours
+from nnode.plots.settings import SETTINGS, Setting, six_settings
+from studies.crowd import figures, forces, printed
+from studies.crowd.data import (
+    ALL,
+    GROUP,
+    RECORDING,
+    chosen,
+    mean_speed,
+    sequences,
+    time_groups,
+)
+from studies.crowd.fit import NAMES, named, system_of
+from studies.crowd.tasks import KINDS
+from studies.frame import by_unit, differences, means, numbers, tidy
+from studies.options import CrowdStudyOptions
+from studies.replay import player, scenes, spread
+from studies.runner import Task
+
+#: How the page calls what was simulated.
+LABELS = {
+    "sf": "SF",
+    "nn": "NN",
+    "wall": "NN, walls alone",
+    "relaxation": "relaxation alone",
+    "constant_velocity": "constant velocity",
+    "even_pace": "even pace to the end",
+    "printed": "SF, printed parameters",
+}
+MODELS = ("sf", "nn", "wall")
+#: What is compared on held-out sequences.
+COMPARED = (("sf", "relaxation"), ("nn", "sf"), ("nn", "wall"), ("wall", "sf"))
+#: Parts of the force that are drawn.
+PARTS = {"sf": ("pair", "wall"), "nn": ("sum", "pair", "wall")}
+#: Models in the player, and how many sequences.
+SHOWN, FEW = ("sf", "nn"), 8
+
+
+@dataclass
+class Crowd:
+    """Options, prepared data by ``main`` or ``others`` and horizon (s), and a row per task."""
+
+    options: CrowdStudyOptions
+    stores: dict[tuple[str, float], Store]
+    found: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+    def add(self, horizon: float, every: list[Task], results: Mapping[str, Any]) -> None:
+        """The results of tasks at a horizon."""
+        more = tidy(every, results).assign(horizon=horizon)
+        self.found = pd.concat([self.found, more], ignore_index=True)
+
+    @property
+    def scopes(self) -> list[str]:
+        """All sequences, and all but each block of time."""
+        return [ALL, *(f"fold-{n}" for n in range(self.options.folds))]
+
+    @cached_property
+    def span(self) -> tuple[float, float]:
+        """First and last time of the paper's recording, s."""
+        index = self.stores["main", self.options.horizons[0]].index
+        return min(e["start"] for e in index), max(e["end"] for e in index)
+
+    @property
+    def step(self) -> float:
+        """Sampling interval of the paper's recording, s."""
+        return float(self.stores["main", self.options.horizons[0]].manifest["dt"])
+
+    def folder(self, part: str, horizon: float) -> str:
+        """Of the prepared sequences."""
+        return str(self.stores[part, horizon].folder)
+
+    def take(self, task: str, horizon: float) -> Any:
+        """The rows of one function at a horizon."""
+        return self.found[(self.found["task"] == task) & (self.found["horizon"] == horizon)]
+
+    def fits(self, kind: str, scope: str, horizon: float) -> Any:
+        """Calibrations from all starts, least training cost first."""
+        found = self.take("fit", horizon)
+        return found[(found["kind"] == kind) & (found["scope"] == scope)].sort_values("J")
+
+    def best(self, model: str, scope: str, horizon: float) -> Any:
+        """The calibration of least training cost.
+
+        The network of the walls alone is the model with people's network at zero: where that
+        trains better, the search among both networks stopped at worse minima.
+        """
+        kinds = ("nn", "wall") if model == "nn" else (model,)
+        return pd.concat(self.fits(k, scope, horizon) for k in kinds).sort_values("J").iloc[0]
+
+    def system(self, model: str, horizon: float) -> System:
+        """A model as calibrated to all sequences."""
+        one = self.best(model, ALL, horizon)
+        return system_of(KINDS[one["kind"]], one["row"])
+
+    def costs(self, horizon: float, *, heldout: bool) -> pd.DataFrame:
+        """Costs by sequence (m² s), a column per model and baseline.
+
+        Args:
+            heldout: of models that were calibrated without a sequence's block of time, in place of
+                all sequences training.
+        """
+        columns: dict[str, Any] = {}
+        for model in MODELS:
+            if heldout:
+                each = (self.best(model, scope, horizon)["heldout"] for scope in self.scopes[1:])
+                columns[LABELS[model]] = pd.concat(map(pd.Series, each))
+            else:
+                columns[LABELS[model]] = pd.Series(self.best(model, ALL, horizon)["train"])
+        names = columns["SF"].index
+        simple = self.take("baselines", horizon)["costs"].iloc[0]
+        columns |= {LABELS[m]: pd.Series(each)[names] for m, each in simple.items()}
+        every = sequences(self.folder("main", horizon))
+        group = dict(zip((s.name for s in every), time_groups(every), strict=True))
+        columns = {label: values[names] for label, values in columns.items()}
+        order = {label: columns[label] for label in LABELS.values()}
+        return by_unit(order, [group[name] for name in names], names)
+
+    # -- tables ------------------------------------------------------------------------------
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """By their names in the template."""
+        along = self._settings_along()
+        return {
+            "crowd_data": self._data(),
+            "crowd_parameters": self._parameters(),
+            "crowd_costs": self._costs(),
+            "crowd_horizons": self._horizons(),
+            "crowd_differences": self._differences(),
+            "crowd_blocks": self._blocks(),
+            "crowd_heldout_runs": self._other_runs(),
+            "crowd_restarts": self._restarts(),
+            "crowd_pull": self._pull(),
+            **{f"settings_{m}": printed.settings(m, self._settings(m)[1]) for m in PARTS},
+            "settings_nn_along": along[1],
+            "parameters": self._every_parameter(),
+        }
+
+    def _data(self) -> pd.DataFrame:
+        rows = {}
+        for (part, horizon), store in self.stores.items():
+            people = [entry["n_agents"] for entry in store.index]
+            rows[RECORDING if part == "main" else "other two-way runs", f"{horizon:g} s"] = {
+                "sequences": len(people),
+                "left out as faulty": store.manifest["counts"]["dropped"],
+                "people, mean": float(np.mean(people)),
+                "people, most": max(people),
+            }
+        return _labelled(rows, "recording", "length")
+
+    def _parameters(self) -> pd.DataFrame:
+        """A, k, kappa by horizon with 95 % intervals, printed ones first."""
+        rows: dict[str, dict[str, float]] = {"printed, 1 s": dict(printed.PARAMETERS)}
+        for horizon in self.options.horizons:
+            drawn = self.take("resample", horizon).sort_values("first")["rows"]
+            low, high = np.quantile(np.concatenate(list(drawn)), [0.025, 0.975], axis=0)
+            best = self.best("sf", ALL, horizon)["row"]
+            rows[f"here, {horizon:g} s"] = {
+                label: value
+                for name, *ends in zip(NAMES, best, low, high, strict=True)
+                for label, value in zip((name, f"{name} from", f"{name} to"), ends, strict=True)
+            }
+        order = [f"{name}{end}" for name in NAMES for end in ("", " from", " to")]
+        return pd.DataFrame(rows).T.reindex(columns=order)
+
+    def _costs(self) -> pd.DataFrame:
+        found = means(self.costs(self.options.horizons[0], heldout=False), self.options.seed)
+        told = pd.Series({LABELS[m]: cost for m, cost in printed.COSTS.items()})
+        return pd.DataFrame(
+            {
+                "printed (m²)": told.reindex(found.index),
+                "here (m²)": found["mean"] / self.step,
+                "here (m² s)": found["mean"],
+                "from": found["low"],
+                "to": found["high"],
+            }
+        )
+
+    def _horizons(self) -> pd.DataFrame:
+        parts = {
+            name: pd.DataFrame(
+                {f"{h:g} s": self.costs(h, heldout=out).mean() for h in self.options.horizons}
+            )
+            for name, out in (("training", False), ("held out", True))
+        }
+        return pd.concat(parts, names=["", "model"])
+
+    def _differences(self) -> pd.DataFrame:
+        pairs = [(LABELS[a], LABELS[b]) for a, b in COMPARED]
+        parts = {
+            f"{h:g} s": differences(self.costs(h, heldout=True), pairs, self.options.seed)
+            for h in self.options.horizons
+        }
+        return pd.concat(parts, names=["horizon", "model", "minus"])
+
+    def _blocks(self) -> pd.DataFrame:
+        """Held-out cost of each block of time, m² s."""
+        rows = {}
+        for horizon in self.options.horizons:
+            costs = self.costs(horizon, heldout=True).droplevel("cluster")
+            every = {s.name: s for s in sequences(self.folder("main", horizon))}
+            for number, scope in enumerate(self.scopes[1:], 1):
+                names = list(self.best("sf", scope, horizon)["heldout"])
+                mean = costs.loc[names, [LABELS[m] for m in (*MODELS, "relaxation")]].mean()
+                rows[f"{horizon:g} s", f"{number}"] = {
+                    "sequences": len(names),
+                    "people": float(np.mean([every[name].n_agents for name in names])),
+                    "speed": mean_speed(every[name] for name in names),
+                    **mean,
+                }
+        return _labelled(rows, "horizon", "block")
+
+    def _other_runs(self) -> pd.DataFrame:
+        """Mean cost of a sequence in other runs, m² s."""
+        rows = {}
+        for horizon in self.options.horizons:
+            every = sequences(self.folder("others", horizon))
+            for run, one in self.take("transfer", horizon)["runs"].iloc[0].items():
+                rows[f"{horizon:g} s", run] = {
+                    "sequences": len(one["people"]),
+                    "people": float(np.mean(one["people"])),
+                    "speed": mean_speed(s for s in every if s.recording == run),
+                    **{
+                        LABELS[m]: float(np.mean(list(one["costs"][m].values())))
+                        for m in list(LABELS)[:-1]
+                    },
+                }
+        return _labelled(rows, "horizon", "run")
+
+    def _every_parameter(self) -> pd.DataFrame:
+        """All calibrations, one row per number: what is needed to compute their costs again."""
+        fits = self.found[self.found["task"] == "fit"]
+        rows = [
+            [*(one[k] for k in ("kind", "scope", "horizon", "seed")), name, place, value]
+            for one in fits.to_dict("records")
+            for name, place, value in numbers(named(KINDS[one["kind"]], one["row"]))
+        ]
+        names = ["model", "trained on", "horizon (s)", "start", "parameter", "index", "value"]
+        return pd.DataFrame(rows, columns=names).set_index(names[:4])
+
+    # -- forces at the first horizon, all sequences training -----------------------------------
+
+    @cached_property
+    def measured(self) -> forces.Measured:
+        """States and pairs of the people at the first horizon."""
+        folder = self.folder("main", self.options.horizons[0])
+        return forces.Measured.of(chosen(folder, range(len(sequences(folder)))))
+
+    @cached_property
+    def starts(self) -> dict[str, list[tuple[Any, System, dict[str, np.ndarray]]]]:
+        """By kind, all calibrations, least cost first, with system and people's accelerations."""
+        found: dict[str, list[tuple[Any, System, dict[str, np.ndarray]]]] = {}
+        for kind in MODELS:
+            fits = self.fits(kind, ALL, self.options.horizons[0]).to_dict("records")
+            for one in fits:
+                system = system_of(KINDS[kind], one["row"])
+                parts = forces.accelerations(system, self.measured)
+                found.setdefault(kind, []).append((one, system, parts))
+        return found
+
+    def _restarts(self) -> pd.DataFrame:
+        rows = {}
+        for kind, every in self.starts.items():
+            for one, _, parts in every:
+                row = {"J (m² s)": one["J"], "evaluations": one["evaluations"]}
+                row |= dict(zip(NAMES, one["row"], strict=True)) if kind == "sf" else {}
+                for part in ("pair", "wall", "sum"):
+                    row[f"size, {part}"] = forces.size(parts[part])
+                    row[f"likeness, {part}"] = forces.likeness(parts[part], every[0][2][part])
+                rows[LABELS[kind], one["seed"]] = row
+        return _labelled(rows, "model", "start")
+
+    def _pull(self) -> pd.DataFrame:
+        rows = {LABELS[kind]: forces.slope(every[0][2]) for kind, every in self.starts.items()}
+        return pd.DataFrame(rows, index=["rate (1/s)", "to the speed (m/s)"]).T
+
+    def _settings(self, model: str) -> tuple[Figure, pd.DataFrame]:
+        return six_settings(self.system(model, self.options.horizons[0]))
+
+    def _settings_along(self) -> tuple[Figure, pd.DataFrame]:
+        """The six settings with x and y exchanged: people walk as those of the recording do."""
+        settings = [
+            Setting(s.name, s.x_blue[::-1], s.x_red[::-1], s.v_blue[::-1], s.v_red[::-1])
+            for s in SETTINGS["long"]
+        ]
+        system = self.system("nn", self.options.horizons[0])
+        figure, total = six_settings(system, settings)
+        parts = {p: six_settings(system, settings, part=p)[1] for p in ("pair", "wall")}
+        rows = {
+            (setting.name, person): {
+                f"F_{letter}, {part}": table[f"force_{person}"].iloc[i][c]
+                for c, letter in enumerate("xy")
+                for part, table in {**parts, "sum": total}.items()
+            }
+            for i, setting in enumerate(settings)
+            for person in ("blue", "red")
+        }
+        return figure, _labelled(rows, "setting", "person")
+
+    # -- figures -----------------------------------------------------------------------------
+
+    def figures(self) -> dict[str, Figure | ReplayBlock]:
+        """By their names in the template."""
+        first, starts = self.options.horizons[0], self.starts
+        curves = {
+            LABELS[k]: [forces.away_by_distance(system, self.measured) for _, system, _ in every]
+            for k, every in (("sf", starts["sf"][:1]), ("nn", starts["nn"]))
+        }
+        speeds = {LABELS[k]: forces.along_by_speed(every[0][2]) for k, every in starts.items()}
+        found: dict[str, Figure | ReplayBlock] = {
+            "crowd_horizons": self._by_horizon(),
+            "crowd_range": figures.forces_by_distance(curves),
+            "crowd_speed": figures.acceleration_by_speed(speeds),
+            "settings_nn_along": self._settings_along()[0],
+            "replay": self._replay(),
+        }
+        for model, parts in PARTS.items():
+            found[f"settings_{model}"] = self._settings(model)[0]
+            for part in parts:
+                for i, letter in enumerate("xy"):
+                    drawn = force_contours(self.system(model, first), i, part=part)  # type: ignore[arg-type]
+                    found[f"{model}_{part}_{letter}"] = drawn
+        return found
+
+    def _by_horizon(self) -> Figure:
+        shown = [LABELS[m] for m in ("relaxation", *MODELS, "constant_velocity", "even_pace")]
+        found = {
+            f"{h:g} s": means(self.costs(h, heldout=True), self.options.seed).loc[shown]
+            for h in self.options.horizons
+        }
+        mean, low, high = (
+            pd.DataFrame({h: table[what] for h, table in found.items()})
+            for what in ("mean", "low", "high")
+        )
+        return figures.horizon_costs(self.options.horizons, mean, low, high)
+
+    def _replay(self) -> ReplayBlock:
+        horizon = self.options.horizons[-1]
+        every = sequences(self.folder("main", horizon))
+        systems = {LABELS[m]: self.system(m, horizon) for m in SHOWN}
+        what = (
+            f"Some sequences of {horizon:g} s of the paper's recording, beside "
+            f"{' and '.join(systems)} as calibrated to all of them."
+        )
+        return player("replay", scenes(spread(every, FEW), systems), what, len(every))
+
+    def values(self) -> dict[str, Any]:
+        """What else the template refers to."""
+        exact = printed.settings(
+            "sf", six_settings(system_of("sf", list(printed.PARAMETERS.values())))[1]
+        )
+        dv, dx = np.abs(self.measured.dv[:, 1]), np.abs(self.measured.dx[:, 1])
+        folder = self.folder("main", self.options.horizons[0])
+        return {
+            "options": self.options,
+            "step": self.step,
+            "width": (self.span[1] - self.span[0]) / self.options.folds,
+            "group": GROUP,
+            "labels": LABELS,
+            "models": [LABELS[m] for m in MODELS],
+            "parts": PARTS,
+            "speed": mean_speed(sequences(folder)),
+            "away": max(
+                float((exact[f] - exact[f"{f} printed"]).abs().max()) for f in ("F_x", "F_y")
+            ),
+            "far": forces.FAR,
+            "fast": 100 * float((dv >= 1.0).mean()),
+            "wide": float(dx.max()),
+        }
+
+
+def _labelled(rows: dict[Any, dict[str, Any]], *names: str) -> pd.DataFrame:
+    found = pd.DataFrame.from_dict(rows, orient="index")
+    found.index = pd.MultiIndex.from_tuples(list(rows), names=names)
+    return found

@@ -1,0 +1,109 @@
+"""Section 6 of the paper: social force and networks, and what the paper leaves open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from nnode.pages.page import Block
+from studies.crowd import tasks
+from studies.crowd.data import ALL, prepare_horizon
+from studies.crowd.results import Crowd
+from studies.options import CrowdStudyOptions
+from studies.page import page
+from studies.runner import Task, hash_of, run_tasks
+
+TITLE = "Crowd: social force and networks in a two-way corridor"
+SUBTITLE = (
+    "Section 6 of Göttlich & Totzeck, *Optimal control for interacting particle systems driven "
+    "by neural networks*, on the same recording, printed numbers beside ours."
+)
+
+#: Resamples in one task.
+CHUNK = 10
+#: Relative times of the calibrations.
+_COSTS = {"sf": 3.0, "nn": 20.0, "wall": 10.0}
+
+
+def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
+    """Compute what is missing and make the page.
+
+    Horizons are calibrated one after the other, each from what the shorter one found.
+
+    Raises:
+        DataError: recordings that cannot be read, or a horizon longer than anyone is in view.
+        StudyError: tasks failed.
+    """
+    download = options.download or str(folder / "data" / "raw")
+    stores = {
+        (kind, h): prepare_horizon(
+            options.source, download, h, folder / "data" / f"{kind}-{h:g}s", others=kind == "others"
+        )
+        for h in options.horizons
+        for kind in ("main", "others")
+    }
+    fingerprint = hash_of({f"{kind}-{h:g}": store for (kind, h), store in stores.items()})
+    study = Crowd(options, stores)
+    assert options.workers is not None
+    for number, horizon in enumerate(options.horizons):
+        for what, make in (("calibration", calibrations), ("intervals, other runs", evaluations)):
+            every = make(study, number)
+            found = run_tasks(
+                every,
+                folder,
+                workers=options.workers,
+                fingerprint=fingerprint,
+                title=f"crowd study, {horizon:g} s: {what}",
+            )
+            study.add(horizon, every, found)
+    return page("crowd", study.tables(), study.figures(), stores.values(), **study.values())
+
+
+def starts(restarts: int, kind: str, scope: str, first: bool) -> int:
+    """Starts of one model at the first horizon; fewer, the best ones, go on to longer ones."""
+    if scope == ALL:
+        number = restarts if kind != "wall" else max(1, restarts // 2)
+        return number if first else max(1, number // 2)
+    return max(1, restarts // 4) if first and kind == "nn" else 1
+
+
+def calibrations(study: Crowd, number: int) -> list[Task]:
+    """Model × part that trains × start at horizon ``number``, and what needs no calibration."""
+    options, horizon = study.options, study.options.horizons[number]
+    where: dict[str, Any] = {"folder": study.folder("main", horizon)}
+    found = [Task(f"baselines-{horizon:g}s", tasks.baselines, where)]
+    fit = where | {"folds": options.folds, "span": list(study.span), "steps": options.steps}
+    for kind in tasks.KINDS:
+        for scope in study.scopes:
+            count = starts(options.restarts, kind, scope, number == 0)
+            begin: list[tuple[int, list[float] | None]]
+            begin = [(options.seed + i, None) for i in range(count)]
+            if number:
+                before = study.fits(kind, scope, options.horizons[number - 1])
+                begin = list(zip(before["seed"], before["row"], strict=True))[:count]
+            for seed, row in begin:
+                how = {"kind": kind, "scope": scope, "seed": int(seed), "start": row}
+                key = f"fit-{kind}-{scope}-{horizon:g}s-{seed}"
+                cost = _COSTS[kind] * (0.4 if number else 1.0)
+                found.append(Task(key, tasks.fit, fit | how, cost=cost))
+    return found
+
+
+def evaluations(study: Crowd, number: int) -> list[Task]:
+    """Refits to resampled stretches of time, and costs in other runs."""
+    options, horizon = study.options, study.options.horizons[number]
+    rows = {kind: study.fits(kind, ALL, horizon)["row"].iloc[0] for kind in tasks.KINDS}
+    where = {"folder": study.folder("main", horizon), "row": rows["sf"]}
+    where |= {"draws": options.bootstrap, "seed": options.seed}
+    found = [
+        Task(
+            f"resample-{horizon:g}s-{first}",
+            tasks.resample,
+            where | {"first": first, "last": min(first + CHUNK, options.bootstrap)},
+            cost=5.0,
+        )
+        for first in range(0, options.bootstrap, CHUNK)
+    ]
+    rows["nn"] = study.best("nn", ALL, horizon)["row"]
+    other = {"folder": study.folder("others", horizon), "rows": rows}
+    return [*found, Task(f"transfer-{horizon:g}s", tasks.transfer, other, cost=8.0)]

@@ -1,0 +1,143 @@
+"""OpenACC's platoons: every follower behind its measured leader, by itself."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.pooling import best_alone
+from nnode.calibrate.problem import ResidualProblem
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.model.build import build_model
+from nnode.model.laws import CAR_FOLLOWING_LAWS
+from nnode.simulation.fused import FusedSolver
+from studies.following import data, printed
+from studies.following.candidates import Candidate, decay, starts
+from studies.following.data import gap_of
+from studies.following.fit import at_limits, costs_of, named
+
+Result = dict[str, Any]
+
+#: Laws that are tried on commercial cars, and what is added to those that say an acceleration.
+LAWS = ("idm", "gipps", "ovm", "fvdm", "helly", "krauss", "newell", "a2", "a4")
+LATE = ("inertia", "reaction_delay")
+CANDIDATES = {
+    one.name: one
+    for law in LAWS
+    for one in (
+        Candidate(law),
+        *(Candidate(law, (e,)) for e in LATE if law not in ("krauss", "newell", "a2", "a4")),
+    )
+}
+#: Steps of one calibration.
+STEPS = 60
+
+
+def followers(folder: str, run: str | None = None) -> list[Sequence]:
+    """Pairs of all followers of a run, or of all runs."""
+    every = data.sequences(folder)
+    return [
+        pair
+        for platoon in every
+        if run is None or platoon.recording == run
+        for pair in data.behind(platoon)
+    ]
+
+
+def own_rows(
+    candidate: Candidate, batch: Batch, restarts: int, seed: int
+) -> tuple[ResidualProblem, np.ndarray, np.ndarray]:
+    """Every pair by itself: the cost, ``(B, P)`` best rows of several starts, ``(B,)`` costs."""
+    cost = costs_of(candidate, batch)
+    begin = starts(candidate, cost, restarts, seed)
+    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=1e-7, penalty=decay(cost))
+    return cost, rows, cost.costs(rows)
+
+
+def reproduced(folder: str) -> Result:
+    """By make, the error (m) of the published parameters on the last part: ``law`` as it is
+    simulated here, ``stopped`` with the published rule for collisions."""
+    found: Result = {"law": {}, "stopped": {}}
+    for pair in followers(folder, printed.PLATOON):
+        make = pair.agents[0]
+        values = printed.PLATOON_PARAMETERS[make]
+        described = printed.clipped(CAR_FOLLOWING_LAWS["ovm"], printed.CLIPPED["ovm"], values)
+        system = build_model(
+            {"term": "formula", "name": "ovm", "leader": "measured", "law": described}
+        )
+        rest = pair.part(printed.FIRST, 1.0)
+        cost = ResidualProblem(system, collate([rest]), FusedSolver(), Convention.spacing)
+        found["law"][make] = float(cost.costs(cost.start)[0])
+        found["stopped"][make] = collided(rest, values)
+    return found
+
+
+def collided(pair: Sequence, values: dict[str, float]) -> float:
+    """Error of the gap, m, of optimal velocity where a gap below 0.1 m becomes 0.1 m and the
+    speed at most the leader's: no law, but what the published figures were made with.
+
+    Args:
+        values: ``kappa``, ``v0``, ``s_c``, ``w`` in SI units.
+    """
+    least, (low, high) = 0.1, printed.CLIPPED["ovm"]
+    kappa, v0, s_c, w = (values[name] for name in ("kappa", "v0", "s_c", "w"))
+    measured, (own, lead) = gap_of(pair), pair.velocity()[..., 0].T
+    gap, v, found = float(measured[0]), float(own[0]), [float(measured[0])]
+    shift = math.tanh(s_c / w)
+    for now, then in pairwise(lead):
+        wish = v0 * (math.tanh((max(gap, least) - s_c) / w) + shift) / (1 + shift)
+        rate = min(max(kappa * (wish - v), low), high)
+        after = v + rate * pair.dt
+        way = (v + after) / 2 * pair.dt if after > 0 else -v * v / (2 * rate)
+        gap, v = gap + (now + then) / 2 * pair.dt - way, max(after, 0.0)
+        if gap < least:
+            gap, v = least, min(v, then)
+        found.append(gap)
+    return float(np.sqrt(np.mean((np.array(found) - measured) ** 2)))
+
+
+def compare(folder: str, name: str, restarts: int, seed: int) -> Result:
+    """One law on the published platoon.
+
+    Returns:
+        By follower ``chosen``: errors on the last 30 % of the first part, calibrated on what
+        stands before; ``train`` and ``heldout``: calibrated on the whole first part. m.
+    """
+    candidate = CANDIDATES[name]
+    pairs = followers(folder, printed.PLATOON)
+    first = printed.FIRST
+
+    def share(low: float, high: float) -> Batch:
+        return collate([pair.part(low, high) for pair in pairs])
+
+    _, rows, _ = own_rows(candidate, share(0.0, first**2), restarts, seed)
+    chosen = costs_of(candidate, share(first**2, first)).costs(rows)
+    cost, rows, train = own_rows(candidate, share(0.0, first), restarts, seed)
+    heldout = costs_of(candidate, share(first, 1.0)).costs(rows)
+    return {
+        "makes": [pair.agents[0] for pair in pairs],
+        "chosen": chosen.tolist(),
+        "train": train.tolist(),
+        "heldout": heldout.tolist(),
+        "parameters": [named(cost, row) for row in rows],
+        "limits": [at_limits(cost, row) for row in rows],
+    }
+
+
+def every_run(folder: str, name: str, restarts: int, seed: int) -> Result:
+    """One law on every follower of every run, each by itself."""
+    candidate = CANDIDATES[name]
+    pairs = followers(folder)
+    cost, rows, costs = own_rows(candidate, collate(pairs), restarts, seed)
+    return {
+        "runs": [pair.recording for pair in pairs],
+        "makes": [pair.agents[0] for pair in pairs],
+        "settings": [str(pair.group[0]) if pair.group else "" for pair in pairs],
+        "costs": costs.tolist(),
+        "parameters": [named(cost, row) for row in rows],
+        "limits": [at_limits(cost, row) for row in rows],
+    }

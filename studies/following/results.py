@@ -1,0 +1,505 @@
+"""Tables and figures of the study of car following."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nnode.calibrate.problem import ResidualProblem
+from nnode.data.sequence import Sequence, collate
+from nnode.data.store import Store
+from nnode.model.system import System
+from nnode.pages.replay import ReplayBlock
+from nnode.simulation.fused import FusedSolver
+from studies.following import data, figures, leaders, platoons, printed, stability
+from studies.following.candidates import DECAY, EVERY, REFERENCE, key
+from studies.following.data import gap_of
+from studies.following.fit import OBJECTIVES
+from studies.frame import by_unit, differences, versus
+from studies.options import FollowingStudyOptions
+from studies.replay import player, scenes, spread
+
+#: Objectives on a page.
+WITH_UNITS = {
+    "spacing": "gap, RMSE (m)",
+    "gap": "gap, MSE (m²)",
+    "relative_gap": "relative gap, MSE",
+    "log_gap": "log of the gap, MSE",
+    "speed": "speed, MSE (m²/s²)",
+}
+#: Speeds at which platoons are looked at, m/s; the speed, and the period (s) of a swing, drawn.
+SPEEDS, SWING = (3.0, 6.0, 9.0, 12.0), (6.0, 60.0)
+#: Nearly even driving: differences of speed, m/s, and accelerations, m/s², below these.
+EVEN = (0.5, 0.2)
+#: Laws in the figures of stability, where they are there, beside the chosen one.
+FIGURED = ("idm", "ovm", "fvdm", "gipps", "helly")
+#: Settings of the distance in their order; people drive without.
+SETTINGS = {"min": "ACC, min", "max": "ACC, max", "none": "people"}
+#: Parameters up to which their profiles and correlations are shown.
+MANY = 8
+#: Pairs in the player.
+FEW = 10
+
+
+@dataclass
+class Study:
+    """Options, prepared data, and results of tasks by key."""
+
+    options: FollowingStudyOptions
+    stores: dict[str, Store]
+    found: dict[str, dict[str, Any]]
+
+    def one(self, kind: str, name: str) -> dict[str, Any]:
+        """The result of a task of a candidate."""
+        return self.found[f"{kind}-{key(name)}"]
+
+    @property
+    def names(self) -> list[str]:
+        """Candidates that were cross-validated."""
+        return [name for name in EVERY if f"cv-{key(name)}" in self.found]
+
+    @property
+    def order(self) -> list[str]:
+        """Candidates by cross-validated error: no test pair has a say in it."""
+        return list(self.heldout().mean().sort_values().index)
+
+    @property
+    def chosen(self) -> list[str]:
+        """The reference, and the candidate of the least cross-validated error."""
+        return list(dict.fromkeys((REFERENCE, self.order[0])))
+
+    def heldout(self, objective: str = "spacing") -> pd.DataFrame:
+        """Cross-validated costs of the training pairs, a column per candidate."""
+        costs = {name: self.one("cv", name)["heldout"][objective] for name in self.names}
+        return by_unit(costs, self.one("cv", REFERENCE)["clusters"])
+
+    def tested(self) -> pd.DataFrame:
+        """Costs of the test pairs, each a cluster of its own."""
+        costs = {name: self.one("test", name)["spacing"] for name in self.names}
+        return by_unit(costs, range(len(costs[REFERENCE])))
+
+    def away(self, costs: pd.DataFrame) -> pd.DataFrame:
+        """All candidates minus the reference."""
+        pairs = [(name, REFERENCE) for name in self.order]
+        return differences(costs, pairs, self.options.seed).droplevel("second")
+
+    def pairs(self, test: bool = False) -> tuple[Sequence, ...]:
+        """Of one side of the published division."""
+        return data.pairs(str(self.stores[data.PAIRS].folder), test)
+
+    def system(self, name: str) -> System:
+        """A candidate with its parameters from all training pairs."""
+        system = EVERY[name].system()
+        vector = ResidualProblem(system, collate(self.pairs()[:1]), FusedSolver()).vector
+        return vector.fill_(np.array(self.one("cv", name)["row"]))
+
+    # -- tables ------------------------------------------------------------------------------
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """By their names in the template."""
+        found = {
+            "published": self._published(),
+            "candidates": self._candidates(),
+            "objectives_heldout": pd.DataFrame(
+                {label: self.heldout(o).mean() for o, label in WITH_UNITS.items()}
+            )
+            .loc[self.order]
+            .rename_axis("candidate"),
+            "test": self._test(),
+            "sides": self._sides().groupby("side", sort=False).mean(),
+            "equilibrium_gaps": self._equilibrium_gaps(),
+            "stability": self._stability(),
+            "drivers": self._drivers(),
+            "spread": self._spread(),
+            "platoon_published": self._platoon_published(),
+            "platoon": self._platoon(),
+            "time_gaps": self._time_gaps(),
+            "runs": self._runs(),
+            "leaders": self._leaders(),
+            "leaders_heldout": self._leaders_heldout(),
+            "parameters": self._parameters(),
+        }
+        for name in self.chosen:
+            found[f"objectives_{key(name)}"] = self._objectives(name)
+            found[f"precision_{key(name)}"] = self._precision(name)
+        return found
+
+    def _published(self) -> pd.DataFrame:
+        here = self.found["reproduced-pairs"]
+        rows = {
+            (law, objective): {"printed": told, "here": float(np.mean(here[f"{law} {objective}"]))}
+            for law, errors in printed.ERRORS.items()
+            for objective, told in zip(printed.OBJECTIVES, errors, strict=True)
+        }
+        table = _labelled(rows, "law", "minimised")
+        return table.assign(difference=table["here"] - table["printed"])
+
+    def _candidates(self) -> pd.DataFrame:
+        one = {name: self.one("cv", name) for name in self.order}
+        table = versus(self.heldout(), REFERENCE, self.options.seed).loc[self.order]
+        table = table.rename(columns={"mean": "held out"}).drop(columns="p")
+        train = {name: float(np.mean(each["train"]["spacing"])) for name, each in one.items()}
+        table.insert(0, "train", pd.Series(train))
+        table.insert(0, "numbers", pd.Series({n: len(each["row"]) for n, each in one.items()}))
+        return table.assign(**{"at a limit": [", ".join(each["limits"]) for each in one.values()]})
+
+    def _test(self) -> pd.DataFrame:
+        table = versus(self.tested(), REFERENCE, self.options.seed).loc[self.order]
+        table = table.rename(columns={"mean": "test"}).drop(columns="better")
+        table.insert(0, "held out", self.heldout().mean())
+        told = {
+            f"{law}, printed ({objective})": {"test": value}
+            for law, errors in printed.ERRORS.items()
+            for objective, value in zip(printed.OBJECTIVES, errors, strict=True)
+        }
+        both = pd.concat([table, pd.DataFrame.from_dict(told, orient="index")])
+        return both.rename_axis("candidate")
+
+    def _sides(self) -> pd.DataFrame:
+        """Mean speed of the follower (m/s) and mean gap (m) of every pair, by side."""
+        rows = [
+            (side, float(np.mean(pair.velocity()[:, 0])), float(gap_of(pair).mean()))
+            for side in ("train", "test")
+            for pair in self.pairs(side == "test")
+        ]
+        return pd.DataFrame(rows, columns=["side", "speed (m/s)", "gap (m)"])
+
+    def _objectives(self, name: str) -> pd.DataFrame:
+        one = self.one("objectives", name)
+        rows = {}
+        for objective in OBJECTIVES:
+            part = one[objective]
+            shown = {k: v for k, v in part["parameters"].items() if not _weight(k)}
+            limits = {"at a limit": ", ".join(part["limits"])}
+            rows[objective] = {**part["reached"], **shown, **limits}
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("minimised")
+
+    def _precision(self, name: str) -> pd.DataFrame:
+        one, limits = self.one("precision", name), self.one("cv", name)["limits"]
+        names, row, half = one["names"], np.array(one["row"]), np.array(one["half"])
+        table = pd.DataFrame(
+            {
+                "value": row,
+                "from": row - half,
+                "to": row + half,
+                "unit": [printed.UNITS.get(n, "1") for n in names],
+                "at a limit": [n in limits for n in names],
+                "closed below": [
+                    _rises(one["profiles"][n], v, -1) for n, v in zip(names, row, strict=True)
+                ],
+                "closed above": [
+                    _rises(one["profiles"][n], v, 1) for n, v in zip(names, row, strict=True)
+                ],
+            },
+            index=pd.Index(names, name="parameter"),
+        )
+        if len(names) > MANY:
+            return table
+        return table.assign(
+            **{f"r({n})": c for n, c in zip(names, one["correlation"], strict=True)}
+        )
+
+    def _equilibrium_gaps(self) -> pd.DataFrame:
+        v, s = self._even_driving
+        found = {
+            n: stability.equilibrium(self.systems[n], np.array(SPEEDS), self.length)
+            for n in self.figured
+        }
+        measured = [pd.Series(s[np.abs(v - x) < 0.5]) for x in SPEEDS]
+        quarters = {"measured, median": 0.5, "quarter below": 0.25, "quarter above": 0.75}
+        found |= {
+            name: np.array([each.quantile(q) for each in measured]) for name, q in quarters.items()
+        }
+        return pd.DataFrame(found, index=pd.Index(SPEEDS, name="speed (m/s)"))
+
+    def _stability(self) -> pd.DataFrame:
+        rows: dict[str, dict[str, float]] = {}
+        for name, v, _, slope in self._slopes():
+            gain = stability.passed(
+                slope, stability.FREQUENCIES, **stability.lateness(self.systems[name])
+            )
+            row = {f"margin at {v:g} m/s": slope.margin, f"most at {v:g} m/s": float(gain.max())}
+            rows[name] = rows.get(name, {}) | row
+        columns = [f"{what} at {v:g} m/s" for v in SPEEDS for what in ("margin", "most")]
+        found = pd.DataFrame.from_dict(rows, orient="index").reindex(
+            list(self.systems), columns=columns
+        )
+        return found.rename_axis("candidate")
+
+    def _drivers(self) -> pd.DataFrame:
+        one = self.found["halves"]
+        names = ("pooled", "alone", "shrunk")
+        costs = by_unit({name: one[name] for name in names}, one["clusters"])
+        table = versus(costs, "pooled", self.options.seed).drop(columns=["low", "high", "p"])
+        table.insert(1, "median (m)", costs.median())
+        return table.rename(columns={"mean": "second half (m)"}).rename_axis("calibrated")
+
+    def _spread(self) -> pd.DataFrame:
+        one = self.found["halves"]
+        return pd.DataFrame(
+            {
+                "pooled": one["centre"],
+                "spread of single pairs": one["between"],
+                "spread that lasts": one["spread"],
+                "unit": [printed.UNITS.get(n, "1") for n in one["names"]],
+            },
+            index=pd.Index(one["names"], name="parameter"),
+        )
+
+    def _platoon_published(self) -> pd.DataFrame:
+        again = self.found["reproduced-platoon"]
+        table = pd.DataFrame({"printed": printed.PLATOON_ERRORS, "here": again["stopped"]})
+        table["difference"] = table["here"] - table["printed"]
+        table["the law alone"] = pd.Series(again["law"])
+        table.loc["mean"] = table.mean()
+        return table.rename_axis("follower")
+
+    def _platoon(self) -> pd.DataFrame:
+        """Laws by the error inside the first 70 %, and the best law of each follower."""
+        names = [n for n in platoons.CANDIDATES if f"platoon-{key(n)}" in self.found]
+        found = {n: self.one("platoon", n) for n in names}
+        makes = found[names[0]]["makes"]
+        fold = pd.DataFrame({n: one["chosen"] for n, one in found.items()}, index=makes)
+        held = pd.DataFrame({n: one["heldout"] for n, one in found.items()}, index=makes)
+        table = pd.DataFrame({"fold": fold.mean(), "last 30 %": held.mean()})
+        train = pd.Series({n: float(np.mean(one["train"])) for n, one in found.items()})
+        table.insert(1, "first 70 %", train)
+        table = table.join(held.T)
+        table["at a limit"] = pd.Series(
+            {n: sum(map(len, one["limits"])) for n, one in found.items()}
+        )
+        own = {make: str(fold.loc[make].idxmin()) for make in makes}
+        each = pd.Series({make: held.loc[make, own[make]] for make in makes})
+        inside = float(np.mean([fold.loc[make, own[make]] for make in makes]))
+        told = pd.Series(printed.PLATOON_ERRORS)
+        more = {
+            "chosen by follower": {"fold": inside, "last 30 %": each.mean(), **each},
+            "ovm, printed": {"last 30 %": told.mean(), **told},
+        }
+        found_ = pd.concat(
+            [table.sort_values("fold"), pd.DataFrame.from_dict(more, orient="index")]
+        )
+        return found_.rename_axis("law")
+
+    def _runs(self) -> pd.DataFrame:
+        """Every follower of every run by itself."""
+        one = self.found["runs"]
+        frame = pd.DataFrame({"run": one["runs"], "make": one["makes"]})
+        frame["setting"] = [SETTINGS.get(s, s) for s in one["settings"]]
+        frame["error (m)"] = one["costs"]
+        limits = [", ".join(names) for names in one["limits"]]
+        return frame.join(pd.DataFrame(one["parameters"])).assign(**{"at a limit": limits})
+
+    def _time_gaps(self) -> pd.DataFrame:
+        by = self._runs().groupby("setting")
+        table = (
+            by["T"]
+            .agg(["count", "min", "median", "max"])
+            .assign(**{"error (m)": by["error (m)"].mean()})
+        )
+        return table.rename(columns={"count": "followers"}).loc[self._settings]
+
+    @property
+    def _settings(self) -> list[str]:
+        there = set(self._runs()["setting"])
+        return [s for s in SETTINGS.values() if s in there]
+
+    def _leaders(self) -> pd.DataFrame:
+        one = self.found["leaders"]
+        row = {k: np.array(one["rows"][k]) for k in leaders.KINDS}
+        out = {k: np.array(one["without"][k]) for k in leaders.KINDS}
+        columns: dict[str, Any] = {"unit": [printed.UNITS.get(n, "1") for n in one["names"]]}
+        for k in leaders.KINDS:
+            columns |= {k: row[k], f"± {k}": leaders.jackknifed(row[k], out[k])[1]}
+        away = row["CAV"] - row["HV"]
+        half = leaders.jackknifed(away, out["CAV"] - out["HV"])[1]
+        columns |= {"CAV minus HV": away, "from": away - half, "to": away + half}
+        return pd.DataFrame(columns, index=pd.Index(one["names"], name="parameter"))
+
+    def _leaders_heldout(self) -> pd.DataFrame:
+        one = self.found["leaders"]
+        costs = by_unit(one["heldout"], one["clusters"])
+        kind = np.array(one["kinds"])
+        parts = {}
+        for k in leaders.KINDS:
+            table = versus(costs[kind == k], "both", self.options.seed)
+            table = table.rename(columns={"mean": "held out (m)"}).drop(columns=["p", "better"])
+            for name, what in (("gap (m)", "gap"), ("speed (m/s)", "speed")):
+                table.insert(0, name, float(np.array(one[what])[kind == k].mean()))
+            table.insert(0, "pairs", int((kind == k).sum()))
+            parts[f"behind {k}"] = table
+        return pd.concat(parts, names=["pairs", "calibrated on"])
+
+    def _parameters(self) -> pd.DataFrame:
+        order = [*self.chosen, *(n for n in self.names if n not in self.chosen)]
+        rows = [
+            (name, parameter, value)
+            for name in order
+            for parameter, value in self.one("cv", name)["parameters"].items()
+        ]
+        return pd.DataFrame(rows, columns=["candidate", "parameter", "value"])
+
+    # -- equilibria ----------------------------------------------------------------------------
+
+    @cached_property
+    def systems(self) -> dict[str, System]:
+        """Calibrated laws that have slopes; maps have none."""
+        names = [n for n in self.names if not n.startswith(stability.MAPS)]
+        return {name: self.system(name) for name in names}
+
+    @property
+    def figured(self) -> list[str]:
+        """Of these, those in the figures."""
+        return [n for n in dict.fromkeys((*FIGURED, *self.chosen)) if n in self.systems]
+
+    @property
+    def length(self) -> float:
+        """Mean length of the leaders, m."""
+        return float(np.mean([p.length[1] for p in self.pairs() if p.length is not None]))
+
+    @cached_property
+    def _even_driving(self) -> tuple[np.ndarray, np.ndarray]:
+        """Speeds and gaps of training pairs at nearly even driving."""
+        speeds, gaps = [], []
+        for pair in self.pairs():
+            v = pair.velocity()[..., 0]
+            even = np.abs(v[:, 0] - v[:, 1]) < EVEN[0]
+            even &= np.abs(np.gradient(v[:, 0], pair.dt)) < EVEN[1]
+            speeds.append(v[even, 0])
+            gaps.append(gap_of(pair)[even])
+        return np.concatenate(speeds), np.concatenate(gaps)
+
+    def _slopes(self) -> Iterable[tuple[str, float, float, stability.Slopes]]:
+        """Candidate, speed, equilibrium gap and slopes there, where there is an equilibrium."""
+        for name, system in self.systems.items():
+            gaps = stability.equilibrium(system, np.array(SPEEDS), self.length)
+            for v, gap in zip(SPEEDS, map(float, gaps), strict=True):
+                if np.isfinite(gap):
+                    yield name, v, gap, stability.slopes(system, gap, v, self.length)
+
+    # -- figures -----------------------------------------------------------------------------
+
+    def figures(self) -> dict[str, Figure | ReplayBlock]:
+        """By their names in the template."""
+        ends = ["difference", "low", "high"]
+        away = {
+            "held out, clusters resampled": self.away(self.heldout())[ends].to_numpy(),
+            "test, pairs resampled": self.away(self.tested())[ends].to_numpy(),
+        }
+        sides = {
+            str(side): (part["speed (m/s)"].to_numpy(), part["gap (m)"].to_numpy())
+            for side, part in self._sides().groupby("side", sort=False)
+        }
+        runs = self._runs()
+        gaps = {
+            s: {
+                str(m): part["T"].to_numpy()
+                for m, part in runs[runs["setting"] == s].groupby("make")
+            }
+            for s in self._settings
+        }
+        v = self._even_driving[0]
+        speeds = np.linspace(0.25, float(np.quantile(v, 0.995)), 60)
+        curves = {
+            n: stability.equilibrium(self.systems[n], speeds, self.length) for n in self.figured
+        }
+        found: dict[str, Figure | ReplayBlock] = {
+            "candidates": figures.errors(self.order, away, "m", REFERENCE),
+            "sides": figures.sides(sides),
+            "equilibria": figures.equilibria(speeds, curves, self._even_driving, self.length),
+            "amplification": self._amplification(),
+            "time_gaps": figures.by_group(gaps, "time gap T (s)"),
+            "replay": self._replay(),
+        }
+        for name in self.profiled:
+            one = self.one("precision", name)
+            profiles = {
+                n: {k: np.array(x) for k, x in one["profiles"][n].items()}
+                | {"best": np.array(best)}
+                for n, best in zip(one["names"], one["row"], strict=True)
+            }
+            units = {n: printed.UNITS.get(n, "1") for n in one["names"]}
+            found[f"profiles_{key(name)}"] = figures.profiles(profiles, units)
+        return found
+
+    @property
+    def profiled(self) -> list[str]:
+        """Candidates whose profiles are drawn."""
+        return [n for n in self.chosen if len(self.one("precision", n)["names"]) <= MANY]
+
+    def _amplification(self) -> Figure:
+        speed, period = SWING
+        gains, along = {}, {}
+        for name, v, gap, slope in self._slopes():
+            if v != speed or name not in self.figured:
+                continue
+            system, w = self.systems[name], 2 * np.pi / period
+            late = stability.lateness(system)
+            gains[name] = stability.passed(slope, stability.FREQUENCIES, **late)
+            swing = stability.platoon(system, v, gap, self.length, w)
+            theory = float(stability.passed(slope, np.array([w]), **late)[0])
+            along[name] = (swing / swing[0], theory ** np.arange(len(swing)))
+        return figures.amplification(gains, stability.FREQUENCIES, along)
+
+    def _replay(self) -> ReplayBlock:
+        pairs = self.pairs(test=True)
+        systems = {name: self.system(name) for name in self.chosen}
+        what = (
+            f"Some of the test pairs, the leader as measured, beside {' and '.join(systems)} as "
+            "calibrated to all training pairs."
+        )
+        return player("replay", scenes(spread(pairs, FEW), systems), what, len(pairs))
+
+    def values(self) -> dict[str, Any]:
+        """What else the template refers to."""
+        train, test = self.pairs(), self.pairs(test=True)
+        label = data.labels((*train, *test))
+        limits = self.found["floor"]["limits"]
+        tested = self.tested()
+        paired = (tested[self.order[0]] - tested[REFERENCE]).std() / np.sqrt(len(tested))
+        return {
+            "options": self.options,
+            "reference": REFERENCE,
+            "best": self.order[0],
+            "keys": {name: key(name) for name in self.chosen},
+            "profiled": self.profiled,
+            "left": [name for name in EVERY if name not in self.names],
+            "pairs": len(train),
+            "tests": len(test),
+            "clusters": len(set(self.one("cv", REFERENCE)["clusters"])),
+            "shared": int(np.isin(label[len(train) :], label[: len(train)]).sum()),
+            "half": 1.96 * float(tested[REFERENCE].std() / np.sqrt(len(tested))),
+            "seen": 2.8 * float(paired),
+            "decay": DECAY,
+            "floor": float(np.mean(self.found["floor"]["costs"])),
+            "touched": sum(map(bool, limits)),
+            "strengths": sorted(set(self.found["halves"]["strengths"])),
+            "even": EVEN,
+            "length": self.length,
+            "swing": SWING,
+            "objectives": list(OBJECTIVES),
+            "run": printed.PLATOON,
+        }
+
+
+def _weight(name: str) -> bool:
+    """Whether a parameter is a weight of a network."""
+    return name.startswith("n") and name[1:2].isdigit()
+
+
+def _rises(profile: dict[str, list[float]], best: float, side: int) -> bool:
+    """Whether the error rises beyond doubt on a side of the best value within the profile."""
+    values, low = np.array(profile["values"]), np.array(profile["low"])
+    return bool((low[side * (values - best) > 0] > 0).any())
+
+
+def _labelled(rows: dict[Any, dict[str, Any]], *names: str) -> Any:
+    found = pd.DataFrame.from_dict(rows, orient="index")
+    found.index = pd.MultiIndex.from_tuples(list(rows), names=names)
+    return found

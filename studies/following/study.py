@@ -1,0 +1,93 @@
+"""Car following: laws with and without effects on pairs and platoons with published results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from nnode.data.store import Store
+from nnode.pages.page import Block
+from studies.following import fit, inference, leaders, platoons
+from studies.following.candidates import EVERY, REFERENCE, key
+from studies.following.data import LEADERS, PAIRS, PLATOONS, stores
+from studies.following.results import Study
+from studies.options import FollowingStudyOptions
+from studies.page import page
+from studies.runner import Task, hash_of, run_tasks
+
+TITLE = "Car following: laws, effects, drivers"
+SUBTITLE = (
+    "Laws of following with and without effects, calibrated by Gauss and Newton's method "
+    "on exact tangents: NGSIM I-80 with a published division, OpenACC, TGSIM."
+)
+#: Candidates and laws on platoons of a quick study.
+FEW = (REFERENCE, "helly", "idm + memory")
+
+
+def run(options: FollowingStudyOptions, folder: Path) -> list[Block]:
+    """Compute what is missing and make the page.
+
+    A law is chosen by cross-validation over the training pairs; only then are test pairs read.
+
+    Raises:
+        ConfigError: no folder with the recordings.
+        DataError: recordings that cannot be read.
+        StudyError: tasks failed.
+    """
+    prepared = stores(options, folder)
+    assert options.workers is not None
+    how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(prepared)}
+    first = training(options, prepared)
+    study = Study(options, prepared, run_tasks(first, folder, title="cross-validation", **how))
+    rest = after(study)
+    study.found |= run_tasks(rest, folder, title="test, precision, platoons", **how)
+    return page("following", study.tables(), study.figures(), prepared.values(), **study.values())
+
+
+def training(options: FollowingStudyOptions, prepared: Mapping[str, Store]) -> list[Task]:
+    """What chooses a law: nothing here sees a test pair."""
+    where = {"folder": str(prepared[PAIRS].folder), "folds": options.folds}
+    where |= {"restarts": options.restarts, "seed": options.seed}
+    return [
+        Task(
+            f"cv-{key(name)}",
+            fit.cross_validate,
+            where | {"name": name},
+            cost=len(one.effects) + (one.network or 0) + 2.0,
+        )
+        for name, one in EVERY.items()
+        if not options.quick or name in FEW
+    ]
+
+
+def after(study: Study) -> list[Task]:
+    """All that follows the choice of a law."""
+    options = study.options
+    pairs, track, road = (
+        {"folder": str(study.stores[name].folder)} for name in (PAIRS, PLATOONS, LEADERS)
+    )
+    search = {"restarts": options.restarts, "seed": options.seed}
+    idm = {"name": REFERENCE, **search}
+    rows = {name: study.one("cv", name)["row"] for name in study.names}
+    folds = {"row": rows[REFERENCE], "folds": options.folds}
+    tasks = [
+        Task("reproduced-pairs", fit.reproduced, pairs),
+        Task("reproduced-platoon", platoons.reproduced, track),
+        Task("floor", fit.floor, pairs | idm, cost=6.0),
+        Task("halves", inference.halves, pairs | idm | folds, cost=8.0),
+        Task("leaders", leaders.by_leader, road | idm, cost=6.0),
+        Task("runs", platoons.every_run, track | idm, cost=8.0),
+    ]
+    for name in study.names:
+        own = pairs | {"name": name, "row": rows[name]}
+        tasks.append(Task(f"test-{key(name)}", fit.tested, own))
+        if name in study.chosen:
+            where = pairs | {"name": name} | search
+            tasks.append(Task(f"objectives-{key(name)}", fit.objectives, where, cost=6.0))
+            tasks.append(Task(f"precision-{key(name)}", inference.precision, own, cost=4.0))
+    for name in platoons.CANDIDATES:
+        if not options.quick or name in FEW:
+            where = track | {"name": name} | search
+            tasks.append(Task(f"platoon-{key(name)}", platoons.compare, where, cost=5.0))
+    return tasks

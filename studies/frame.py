@@ -1,0 +1,96 @@
+"""Results as tidy frames: a row per task, or per law and unit; means and differences of costs.
+
+A unit is what a cost belongs to: a sequence, a pair of vehicles, a person. Units of one cluster
+share agents or time, and are resampled together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from nnode.calibrate.resampling import DRAWS, group_weights, paired
+from studies.runner import Task
+
+
+def tidy(tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """A row per task: its function's name as ``task``, its arguments and its results."""
+    return pd.DataFrame(
+        [
+            {"key": t.key, "task": t.function.__name__, **t.arguments, **results[t.key]}
+            for t in tasks
+        ]
+    )
+
+
+def by_unit(
+    costs: Mapping[str, Iterable[float]], cluster: Iterable[Any], unit: Iterable[Any] | None = None
+) -> pd.DataFrame:
+    """A column of costs per law, indexed by cluster and unit."""
+    cluster = list(cluster)
+    names = list(unit) if unit is not None else range(len(cluster))
+    index = pd.MultiIndex.from_arrays([cluster, list(names)], names=["cluster", "unit"])
+    return pd.DataFrame({law: list(values) for law, values in costs.items()}, index=index)
+
+
+def clusters(costs: pd.DataFrame) -> np.ndarray:
+    """``(U,)`` number of the cluster of each row of :func:`by_unit`."""
+    return np.asarray(pd.factorize(costs.index.get_level_values("cluster"))[0])
+
+
+def means(costs: pd.DataFrame, seed: int) -> pd.DataFrame:
+    """Mean cost of each law with its 95 % percentile interval, clusters resampled.
+
+    A law with an infinite cost has no interval.
+    """
+    weights = group_weights(clusters(costs), DRAWS, np.random.default_rng(seed))
+    values = costs.to_numpy(float)
+    finite = np.where(np.isfinite(values).all(0), values, np.nan)
+    low, high = np.quantile(weights @ finite, [0.025, 0.975], axis=0)
+    return pd.DataFrame({"mean": costs.mean(), "low": low, "high": high}, index=costs.columns)
+
+
+def differences(costs: pd.DataFrame, pairs: Iterable[tuple[str, str]], seed: int) -> pd.DataFrame:
+    """Paired differences of mean costs, first minus second, clusters resampled.
+
+    Returns:
+        Indexed by both laws: ``difference``, ``low`` and ``high`` of the 95 % interval, two-sided
+        ``p`` from random signs of clusters, and ``better``, the share of units on which the first
+        has the lower cost. Only the difference and ``better`` where a cost is infinite.
+    """
+    rows = {}
+    for first, second in pairs:
+        a, b = (costs[name].to_numpy(float) for name in (first, second))
+        if np.isfinite(a).all() and np.isfinite(b).all():
+            rows[first, second] = vars(paired(a, b, clusters(costs), seed))
+        else:
+            rows[first, second] = {
+                "difference": a.mean() - b.mean(),
+                "better": float((a < b).mean()),
+            }
+    found = pd.DataFrame.from_dict(rows, orient="index")
+    found.index = pd.MultiIndex.from_tuples(list(rows), names=["first", "second"])
+    return found.reindex(columns=["difference", "low", "high", "p", "better"])
+
+
+def versus(costs: pd.DataFrame, reference: str, seed: int) -> pd.DataFrame:
+    """Each law's :func:`means`, and its :func:`differences` from one of them.
+
+    Returns:
+        ``mean``, ``low``, ``high``; ``minus <reference>``, ``from``, ``to``; ``p``, ``better``.
+    """
+    away = differences(costs, [(str(law), reference) for law in costs], seed).droplevel("second")
+    away.columns = pd.Index([f"minus {reference}", "from", "to", "p", "better"])
+    return means(costs, seed).join(away)
+
+
+def numbers(parameters: Mapping[str, Any]) -> list[tuple[str, str, float]]:
+    """Every number of parameters that may be arrays: name, place in the array, value."""
+    return [
+        (name, " ".join(map(str, place)), float(value))
+        for name, array in parameters.items()
+        for place, value in np.ndenumerate(np.array(array))
+    ]

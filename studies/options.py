@@ -1,0 +1,122 @@
+"""Options of the studies, as dataclasses that the configuration is checked against."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
+
+from omegaconf import MISSING
+
+from nnode.errors import ConfigError
+
+Options = TypeVar("Options", bound="StudyOptions")
+
+
+def option(default: Any, *, quick: Any = None, least: float = 0.0, above: bool = False) -> Any:
+    """A field with its value in a quick study and its limit.
+
+    Args:
+        quick: None keeps the value.
+        least: of the value, or of every value of a list.
+        above: the value must exceed ``least``.
+    """
+    metadata = {"quick": quick, "least": least, "above": above}
+    return field(default_factory=lambda: copy.copy(default), metadata=metadata)
+
+
+@dataclass
+class StudyOptions:
+    """What all studies share."""
+
+    name: str = MISSING  # traffic | crowd | following | walking | prediction
+    source: str | None = None  # folder with the raw files; null downloads
+    download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
+    quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
+    workers: int | None = option(None, least=1)  # processes; null: one per core
+    # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead
+    cluster: str | None = None
+    seed: int = 0  # of start parameters and of resampling
+
+
+@dataclass
+class TrafficStudyOptions(StudyOptions):
+    """Five models on the ten ESIMAS recordings."""
+
+    name: str = "traffic"
+    # starts of n4 on the largest recording; smaller ones get more
+    restarts: int = option(32, quick=4, least=1)
+    iterations: int = option(150, quick=30, least=3)  # evaluations of the first search
+    dt: float = option(0.002, above=True)  # Euler step, s
+    box: float = option(1.0, above=True)  # bound on the weights where its effect is studied
+    bootstrap: int = option(100, quick=10, least=2)  # resamples of the sequences
+    folds: int = option(5, quick=2, least=2)  # of cross-validation
+    descent_steps: int = option(1500, quick=30, least=1)  # updates of the paper's optimiser
+    descent_dt: float = option(0.01, above=True)  # Euler step during its updates, s
+    descent_lr: float = option(1.0, above=True)  # factor on them
+    batch_size: int = option(32)  # sequences in its mini-batches; 0: all
+
+
+@dataclass
+class CrowdStudyOptions(StudyOptions):
+    """Social force and networks on two-way flows in a corridor."""
+
+    name: str = "crowd"
+    # start parameters per model; the better half goes on to longer horizons
+    restarts: int = option(8, quick=1, least=1)
+    horizons: list[float] = option([1.0, 2.0, 3.0, 5.0], quick=slice(0, 3, 2), above=True)  # s
+    folds: int = option(4, quick=2, least=2)  # blocks of time, each held out once
+    # of the networks by Levenberg and Marquardt's method, at each length
+    steps: int = option(4, quick=1, least=1)
+    bootstrap: int = option(100, quick=4, least=2)  # resamples of stretches of time
+
+
+@dataclass
+class WalkingStudyOptions(StudyOptions):
+    """Laws of people that the field uses, on two-way flows of other runs."""
+
+    name: str = "walking"
+    horizons: list[float] = option([1.0, 2.0, 3.0, 4.0, 5.0], quick=slice(1), above=True)  # s
+    folds: int = option(2, quick=2, least=2)  # groups of runs, each held out once
+
+
+@dataclass
+class FollowingStudyOptions(StudyOptions):
+    """Laws of car following on pairs and platoons with published results."""
+
+    name: str = "following"
+    # starts of every calibration; networks get as many
+    restarts: int = option(4, quick=1, least=1)
+    folds: int = option(5, quick=2, least=2)  # of cross-validation, by cluster
+
+
+@dataclass
+class PredictionStudyOptions(StudyOptions):
+    """Laws beside published predictions of followers and of people in the open."""
+
+    name: str = "prediction"
+    restarts: int = 6  # starts of every law of car following beside its own
+
+
+def checked(options: Options) -> Options:
+    """Options within their limits, those of a quick study where it is one; lists ascend.
+
+    Raises:
+        ConfigError: an option out of its range.
+    """
+    found = copy.copy(options)
+    for one in fields(options):
+        value, limit = getattr(options, one.name), one.metadata
+        if not limit or value is None:
+            continue
+        values = sorted(set(value)) if isinstance(value, list) else value
+        least, above = limit["least"], limit["above"]
+        each = values if isinstance(values, list) else [values]
+        if not each or min(each) < least or (above and min(each) == least):
+            what = "positive" if above else f"at least {least:g}"
+            raise ConfigError(f"study.{one.name}={value} must be {what}")
+        quick = limit["quick"] if options.quick else None
+        if isinstance(quick, slice):
+            values = values[quick]
+        setattr(found, one.name, values if quick is None or isinstance(quick, slice) else quick)
+    return found

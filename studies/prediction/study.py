@@ -1,0 +1,116 @@
+"""Laws beside published predictions: people behind automated cars, and people in the open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from nnode.calibrate.resampling import group_weights
+from nnode.errors import ConfigError
+from nnode.pages.page import Block
+from studies.frame import tidy
+from studies.options import PredictionStudyOptions
+from studies.page import page
+from studies.prediction import printed, tasks
+from studies.prediction.data import AHEAD, SCENES, SEEN, STEP, stores
+from studies.runner import Task, hash_of, run_tasks
+from studies.walking import tasks as walking
+
+TITLE = "Prediction: laws beside published figures"
+SUBTITLE = (
+    "People who follow automated cars, by the published metric, and people in open scenes, each "
+    "scene predicted by laws that were calibrated on the other four."
+)
+#: Laws of car following, and laws of people with how the page calls them.
+LAWS = ("idm", "fvdm", "ovm", "gipps", "helly", "newell")
+PEOPLE = {"alone": "no interaction", "exponential": "social force", "esf": "elliptical force"}
+#: Predictions that need no calibration.
+SIMPLE = {"constant_velocity": "constant velocity", "preferred": "mean speed with the stream"}
+#: Resamples of an interval.
+DRAWS = 2000
+
+
+def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
+    """Compute what is missing and make the page.
+
+    Raises:
+        ConfigError: no folder with the files.
+        DataError: files that are not there or cannot be read.
+        StudyError: tasks failed.
+    """
+    if options.source is None:
+        raise ConfigError(
+            "study.source is not set; expected a folder with waymo_pairs and eth_ucy, whose files "
+            "have no addresses of their own (NNODE_DATA in the environment sets it)"
+        )
+    assert options.workers is not None
+    prepared = stores(options.source, folder / "data")
+    folders = [str(prepared[name].folder) for name in SCENES]
+    pairs = {"folder": str(prepared["waymo_pairs"].folder), "seed": options.seed}
+    every = [
+        Task(f"follow-{law}", tasks.follow, {"law": law, "starts": options.restarts, **pairs})
+        for law in LAWS[: 2 if options.quick else None]
+    ]
+    for name in SCENES[: 1 if options.quick else None]:
+        where: dict[str, Any] = {"folders": folders, "held": [name]}
+        every.append(Task(f"simple-{name}", walking.baselines, where))
+        for law in list(PEOPLE)[: 1 if options.quick else None]:
+            one = {"law": law, "desired": "direction", **where}
+            every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
+    found = tidy(
+        every,
+        run_tasks(
+            every,
+            folder,
+            workers=options.workers,
+            fingerprint=hash_of(prepared),
+            title="prediction study",
+        ),
+    )
+    distances = _distances(found)
+    tables = {"following": _following(found, options.seed)}
+    tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}
+    people = distances.groupby("scene", sort=False)["people"].first().to_dict()
+    times = {"people": people, "seen": SEEN, "ahead": AHEAD, "step": STEP}
+    return page("prediction", tables, {}, prepared.values(), **times)
+
+
+def _following(found: pd.DataFrame, seed: int) -> pd.DataFrame:
+    """Errors of spacings by law, published ones last."""
+    rows: dict[str, dict[str, Any]] = {}
+    for one in found[found["task"] == "follow"].to_dict("records"):
+        test = one["test"]
+        number = len(test["error"])
+        weights = group_weights(np.arange(number), DRAWS, np.random.default_rng(seed))
+        low, high = np.quantile([tasks.rmspe(test, w) for w in weights], [0.025, 0.975])
+        rows[one["law"]] = {"training": tasks.rmspe(one["train"]), "test": tasks.rmspe(test)}
+        rows[one["law"]] |= {"low": low, "high": high}
+        rows[one["law"]]["parameters"] = ", ".join(f"{k} = {v:.3g}" for k, v in one["row"].items())
+    rows["idm, published"] = dict(zip(("training", "test"), printed.IDM, strict=True))
+    rows["learned, published"] = {"test": printed.LEARNED}
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("law")
+
+
+def _distances(found: pd.DataFrame) -> pd.DataFrame:
+    """A row per law and held-out scene, with the number of people."""
+    rows = []
+    for one in found[found["task"] != "follow"].to_dict("records"):
+        laws = {label: one[name] for name, label in SIMPLE.items()}
+        if one["task"] == "fit":
+            laws = {PEOPLE[one["law"]]: one["errors"]}
+        for law, scenes in laws.items():
+            rows += [{"law": law, "scene": scene, **errors} for scene, errors in scenes.items()]
+    return pd.DataFrame(rows)
+
+
+def _by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
+    """A distance (m) by law and held-out scene, the published one last."""
+    order = distances["law"].unique(), distances["scene"].unique()
+    table = distances.pivot(index="law", columns="scene", values=what).loc[*order]
+    place = ("ade", "fde").index(what)
+    told = {scene: printed.CONSTANT_VELOCITY[scene][place] for scene in map(str, table)}
+    table.loc["constant velocity, published"] = pd.Series(told)
+    return table.rename_axis(index=None, columns=None)

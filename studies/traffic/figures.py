@@ -1,0 +1,167 @@
+"""Figures of the traffic study: leaders' speeds, laws, descent, faulty sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from nnode.data.sequence import Sequence as Recorded
+from nnode.plots.style import GREY, SMALL_FONT, curve_style, dress, new_figure
+
+#: Speeds outside are cut, m/s.
+LIMITS = (-8.0, 38.0)
+
+
+def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> Figure:
+    """Identified speed of the leading vehicle by recording, and its mean by model.
+
+    Args:
+        speeds: km/h; a row per model, a column per recording.
+        low, high: ends of their intervals, the same layout, NaN where there is none.
+
+    Source: Göttlich & Totzeck, figure (veloLength).
+    """
+    figure = new_figure(7.2, 4.0)
+    ax = figure.subplots()
+    place = np.arange(speeds.shape[1])
+    handles = []
+    for i, model in enumerate(speeds.index):
+        style = curve_style(i)
+        x = place + 0.14 * (i - (len(speeds) - 1) / 2)
+        y = speeds.loc[model].to_numpy(float)
+        ends = np.stack([y - low.loc[model].to_numpy(float), high.loc[model].to_numpy(float) - y])
+        ax.errorbar(
+            x,
+            y,
+            yerr=np.nan_to_num(ends).clip(min=0),
+            fmt=style["marker"],
+            color=style["color"],
+            markersize=4.5,
+            elinewidth=0.8,
+        )
+        mean = float(np.nanmean(y))
+        ax.axhline(mean, color=style["color"], linestyle=style["linestyle"], linewidth=1)
+        handles.append(
+            Line2D([], [], **style, markersize=4.5, label=f"{model}: mean {mean:.0f} km/h")
+        )
+    ax.set_xticks(place, [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)])
+    dress(ax, x="recording", y="leader's speed v0 (km/h)")
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=3,
+        frameon=False,
+        fontsize=SMALL_FONT,
+        handlelength=2.6,
+        columnspacing=1.2,
+    )
+    return figure
+
+
+def law_panels(
+    gaps: Sequence[float],
+    speeds: Mapping[str, pd.DataFrame],
+    bands: Mapping[str, Mapping[str, np.ndarray]],
+    measured: Mapping[str, np.ndarray],
+) -> Figure:
+    """Speed against gap, one panel per recording, all models.
+
+    Args:
+        gaps: m.
+        speeds: recording to m/s, a column per model.
+        bands: recording to model to ``(2, G)`` ends of the interval, m/s.
+        measured: recording to measured gaps, m; a bar below shows their middle 90 %.
+
+    Source: Göttlich & Totzeck, figure (interactionForce).
+    """
+    rows = -(-len(speeds) // 5)
+    figure = new_figure(11.0, 2.5 * rows + 0.4)
+    axes = figure.subplots(rows, 5, sharex=True, sharey=True, squeeze=False)
+    models: list[str] = []
+    for n, (name, table) in enumerate(speeds.items()):
+        ax = axes.flat[n]
+        models = [str(model) for model in table.columns]
+        for i, model in enumerate(models):
+            style = {**curve_style(i), "marker": ""}
+            ax.plot(gaps, table[model].clip(-1e3, 1e3), linewidth=1.2, **style)
+            if model in bands.get(name, {}):
+                low, high = np.clip(bands[name][model], -1e3, 1e3)
+                ax.fill_between(gaps, low, high, color=style["color"], alpha=0.10, linewidth=0)
+        span = np.quantile(measured[name], [0.05, 0.95])
+        ax.plot(span, [LIMITS[0] + 1.5] * 2, color=GREY, linewidth=4, solid_capstyle="butt")
+        last = n // 5 == rows - 1
+        dress(
+            ax,
+            x="gap (m)" if last else "",
+            y="speed W (m/s)" if n % 5 == 0 else "",
+            title=f"{n + 1}: {name}",
+        )
+    for ax in axes.flat[len(speeds) :]:
+        ax.set_axis_off()
+    axes[0, 0].set(xlim=(min(gaps), max(gaps)), ylim=LIMITS)
+    handles = [
+        Line2D([], [], **{**curve_style(i), "marker": ""}, label=m) for i, m in enumerate(models)
+    ]
+    handles.append(Line2D([], [], color=GREY, linewidth=4, label="middle 90 % of measured gaps"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    return figure
+
+
+def descents(curves: Mapping[str, np.ndarray]) -> Figure:
+    """Average cost above the least one known, against simulations, one curve per model.
+
+    Args:
+        curves: model to ``(P, 2)`` simulations and excess of the average cost, m² s.
+    """
+    figure = new_figure(5.6, 3.2)
+    ax = figure.subplots()
+    for i, (model, values) in enumerate(curves.items()):
+        ax.plot(*values.T, **{**curve_style(i), "marker": ""}, linewidth=1.3, label=model)
+    ax.set(xscale="log", yscale="log")
+    ax.set_ylim(bottom=1e-3)  # what lies lower is rounding
+    dress(ax, x="simulations", y="average J above the least (m² s)")
+    ax.legend(fontsize=SMALL_FONT, frameon=False)
+    return figure
+
+
+def space_time(
+    sequence: Recorded, simulated: Mapping[str, np.ndarray], marked: Sequence[tuple[int, float]]
+) -> Figure:
+    """One traffic sequence: measured positions and simulated ones.
+
+    Args:
+        simulated: model to ``(K, N)`` positions, m.
+        marked: vehicles and times (s) at which a fault of the measurement was found.
+    """
+    figure = new_figure(6.4, 3.8)
+    ax = figure.subplots()
+    t = sequence.time - sequence.time[0]
+    handles = [Line2D([], [], color=GREY, marker="o", markersize=4, label="measured")]
+    ax.plot(t, sequence.x[:, :, 0], color=GREY, marker="o", markersize=4, linewidth=1)
+    for i, (name, x) in enumerate(simulated.items()):
+        style = {**curve_style(i), "marker": ""}
+        ax.plot(t, x, **style, linewidth=1.3)
+        handles.append(Line2D([], [], **style, label=name))
+    for agent, time in marked:
+        k = int(np.abs(sequence.time - time).argmin())
+        ax.plot(t[k], sequence.x[k, agent, 0], "s", color="black", fillstyle="none", markersize=10)
+    if marked:
+        handles.append(
+            Line2D(
+                [],
+                [],
+                color="black",
+                marker="s",
+                fillstyle="none",
+                markersize=8,
+                linestyle="",
+                label="fault of the measurement",
+            )
+        )
+    dress(ax, x="time in the sequence (s)", y="position along the lane (m)", title=sequence.name)
+    ax.legend(handles=handles, fontsize=SMALL_FONT)
+    return figure

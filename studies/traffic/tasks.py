@@ -1,0 +1,247 @@
+"""The calculations of the traffic study: one model on one recording each."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.calibrate.bfgs import minimise, optimality_residual
+from nnode.calibrate.cost import sequence_costs
+from nnode.calibrate.evaluate import best_common_speed, constant_velocity, no_interaction
+from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
+from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.resampling import group_weights
+from nnode.data.sequence import Batch
+from nnode.simulation.fused import FusedSolver
+from studies.traffic.problem import COARSE, Problem, groups, named, recording, speeds
+
+Result = dict[str, Any]
+
+
+def fit(
+    folder: str,
+    recording_name: str,
+    model: str,
+    box: float | None,
+    restarts: int,
+    dt: float,
+    iterations: int,
+    bootstrap: int,
+    steps: list[float],
+    seed: int,
+) -> Result:
+    """Calibrate from many starts; costs by sequence, intervals, sensitivity to the step.
+
+    Args:
+        box: bound on the weights, or None.
+        restarts: number of starts.
+        dt: step, s.
+        bootstrap: resamples of groups of sequences.
+        steps: other steps (s) at which the solution is evaluated.
+    """
+    begin = time.perf_counter()
+    sequences = recording(folder, recording_name)
+    problem = Problem(sequences, model, box)
+    found, judged = problem.search(problem.starts(restarts, seed), dt, iterations)
+    cost = problem.cost(dt, torch.float64)
+    best = found.rows[found.best]
+    residual = optimality_residual(found.rows, found.costs, found.gradients, cost.low, cost.high)[
+        found.best
+    ]
+    result: Result = {
+        "cost": float(found.costs[found.best]),
+        "costs": cost.costs(best[None])[0].tolist(),
+        "groups": groups(folder, recording_name).tolist(),
+        "parameters": named(cost, best),
+        "residual": float(residual),
+        "speeds": speeds(ParameterVector(problem.system()).fill_(best)),
+        "steps_costs": {
+            f"{step:g}": float(problem.cost(step, torch.float64).costs(best[None]).mean())
+            for step in steps
+        },
+        "starts": np.quantile(judged.numpy(), [0.0, 0.1, 0.25, 0.5, 0.75]).tolist(),
+    }
+    if bootstrap:
+        rng = np.random.default_rng(seed)
+        weights = torch.from_numpy(group_weights(groups(folder, recording_name), bootstrap, rng))
+        result["bootstrap"] = _bootstrap(
+            problem, best, found.inverses[found.best], weights, dt, iterations // 3
+        )
+    result["seconds"] = time.perf_counter() - begin
+    return result
+
+
+def _bootstrap(
+    problem: Problem, row: Tensor, inverse: Tensor, weights: Tensor, dt: float, iterations: int
+) -> Result:
+    """Local refits to resampled sequences: what their spread says about the parameters."""
+    # the coarse step is ten times cheaper, and does where it hardly changes the solution's cost
+    costs = [float(problem.cost(h, torch.float32).costs(row[None]).mean()) for h in (COARSE, dt)]
+    step = COARSE if abs(costs[0] / costs[1] - 1) < 0.02 else dt
+    cost = problem.cost(step, torch.float32)
+    refits = minimise(
+        lambda rows: cost(rows, weights),
+        row.expand(len(weights), -1),
+        cost.low,
+        cost.high,
+        iterations=iterations,
+        inverse=inverse,
+    )
+    rows = refits.rows[torch.isfinite(refits.costs)]
+    vector = ParameterVector(problem.system())
+    curves = [speeds(vector.fill_(one)) for one in rows]
+    values = {
+        name.removeprefix("terms.0."): value.double().tolist()
+        for name, value in cost.vector.runs(rows).items()
+        if value.ndim == 1
+    }
+    return {
+        "step": step,
+        "values": values,
+        "speeds": np.quantile(np.array(curves), [0.025, 0.975], axis=0).tolist(),
+    }
+
+
+def cross_validate(
+    folder: str,
+    recording_name: str,
+    model: str,
+    box: float | None,
+    folds: int,
+    restarts: int,
+    dt: float,
+    iterations: int,
+    seed: int,
+) -> Result:
+    """Cost of every sequence under a model that was calibrated without its group.
+
+    Fewer groups than ``folds`` make as many folds as groups; a single group has none.
+    """
+    sequences = recording(folder, recording_name)
+    group = groups(folder, recording_name)
+    number = int(group.max()) + 1
+    if number < 2:
+        return {"costs": None}
+    place = np.random.default_rng(seed).permutation(number) % min(folds, number)
+    fold = place[group]
+    problem = Problem(sequences, model, box)
+    rows = problem.search_folds(fold, problem.starts(restarts, seed + 1), dt, iterations)
+    each = problem.cost(dt, torch.float64).costs(rows).numpy()
+    costs = each[fold, np.arange(len(sequences))]
+    common, kept = np.empty(len(sequences)), np.empty(len(sequences))
+    for k in range(int(fold.max()) + 1):
+        out = np.flatnonzero(fold == k)
+        train = problem.batch.select(np.flatnonzero(fold != k).tolist())
+        common[out], kept[out] = _simple(train, problem.batch.select(out.tolist()), problem, dt)
+    return {
+        "costs": costs.tolist(),
+        "no_interaction": common.tolist(),
+        "constant_velocity": kept.tolist(),
+        "groups": group.tolist(),
+        "names": [s.name for s in sequences],
+    }
+
+
+def _simple(
+    train: Batch, test: Batch, problem: Problem, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Costs of the baselines, the common speed taken from the training sequences."""
+    system, solver = problem.system(), FusedSolver(dt)
+    speed = best_common_speed([train])
+    with torch.no_grad():
+        found = [
+            sequence_costs(simulate(test), test).numpy()
+            for simulate in (no_interaction(system, solver, speed), constant_velocity(system))
+        ]
+    return found[0], found[1]
+
+
+def descend(
+    folder: str,
+    recording_name: str,
+    model: str,
+    restarts: int,
+    steps: int,
+    dt: float,
+    updates_dt: float,
+    lr: float,
+    batch_size: int,
+    seed: int,
+) -> Result:
+    """The paper's optimiser, noisy ADADELTA with projection, several runs side by side.
+
+    Args:
+        steps: updates.
+        dt, updates_dt: Euler steps (s) of the final evaluation, and of updates and history.
+        lr: factor on the update, 1 in the paper.
+        batch_size: sequences in a mini-batch, the same for all runs; 0 takes all.
+    """
+    sequences = recording(folder, recording_name)
+    problem = Problem(sequences, model)
+    cost = problem.cost(updates_dt, torch.float32)
+    rows = problem.starts(restarts, seed, wide=False).requires_grad_()
+    optimizer = NoisyAdadelta([rows], lr=lr, seed=seed)
+    rng = np.random.default_rng(seed)
+    number = len(sequences)
+    size = min(batch_size or number, number)
+    order: list[int] = []
+    history = []
+    best, best_rows = torch.full((restarts,), np.inf, dtype=torch.float64), rows.detach().clone()
+    every = max(1, steps // 40)
+    for step in range(steps + 1):
+        if step % every == 0 or step == steps:
+            now = cost.costs(rows.detach()).mean(1)
+            better = now < best
+            best = torch.where(better, now, best)
+            best_rows = torch.where(better[:, None], rows.detach(), best_rows)
+            history.append([step, float(best.min()), float(best.median())])
+        if step == steps:
+            break
+        if len(order) < size:
+            order = rng.permutation(number).tolist()
+        chosen, order = order[:size], order[size:]
+        weights = torch.zeros(number, dtype=torch.float64)
+        weights[chosen] = 1 / size
+        rows.grad = torch.nan_to_num(cost(rows.detach(), weights)[1])
+        optimizer.step()
+        with torch.no_grad():
+            rows.clamp_(cost.low, cost.high)
+    return _ended(problem, dt, best_rows[int(best.argmin())], history)
+
+
+def _ended(problem: Problem, dt: float, row: Tensor, history: list[Any]) -> Result:
+    """The end of a run, evaluated in float64."""
+    cost = problem.cost(dt, torch.float64)
+    value, gradient = cost(row[None])
+    residual = optimality_residual(row[None], value, gradient, cost.low, cost.high)
+    return {
+        "cost": float(value[0]),
+        "parameters": named(cost, row),
+        "residual": float(residual[0]),
+        "history": history,
+    }
+
+
+def scan(folder: str, recording_name: str, model: str, points: int, dt: float) -> Result:
+    """A law's cost on a grid over v0 (10 to 40 m/s) and L (2 to 12 m): no minimum escapes it
+    by more than its spacing."""
+    problem = Problem(recording(folder, recording_name), model)
+    cost = problem.cost(dt, torch.float32)
+    names = [name.rsplit(".")[-1] for name in cost.vector.names]
+    axes = {
+        "v0": torch.linspace(10, 40, points, dtype=torch.float64),
+        "L": torch.linspace(2, 12, points, dtype=torch.float64),
+    }
+    grid = torch.cartesian_prod(*(axes[name] for name in names))
+    costs = torch.cat([cost.costs(part).mean(1) for part in grid.split(256)])
+    least = int(costs.argmin())
+    return {
+        "cost": float(costs[least]),
+        **dict(zip(names, grid[least].tolist(), strict=True)),
+        "lengths": axes["L"].tolist(),
+        "by_length": costs.reshape(points, points).amin(names.index("v0")).tolist(),
+    }

@@ -1,0 +1,44 @@
+"""A few people in a corridor, simulated with known forces by another solver than the studies'."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from nnode.data.sequence import Batch, Sequence, collate
+from nnode.model.system import System
+from nnode.simulation.ode import TorchdiffeqSolver
+from tests.builders import straight
+
+DT = 0.04
+
+
+def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -> Sequence:
+    """People at random places who walk either way; their positions are those of free walkers."""
+    x = np.stack([rng.uniform(-2, 2, people), rng.uniform(0.4, 3.6, people)], -1)
+    v = np.stack([rng.choice([-1.0, 1.0], people), rng.normal(0, 0.1, people)], -1)
+    more = {
+        "start": number,
+        "name": f"made/{number:03d}",
+        "walls": np.array([[-5.0, 0.0, 5.0, 0.0], [5.0, 4.0, -5.0, 4.0]]),
+        "agents": tuple(f"{number}-{i}" for i in range(people)),
+        "destination": x + (DT * (samples - 1) + 2) * v,
+    }
+    return replace(straight(x, v, samples, DT, **more), v=None)
+
+
+def corridor(
+    seed: int, *, system: System | None = None, samples: int = 16, people: int = 12, number: int = 3
+) -> Batch:
+    """Sequences of different numbers of people; with ``system`` they move as it says."""
+    rng = np.random.default_rng(seed)
+    made = collate(sequence(rng, i, samples, people - i) for i in range(number))
+    if system is not None:
+        with torch.no_grad():
+            moved = TorchdiffeqSolver("euler", "discrete")(system, made)
+        assert moved.v is not None
+        made.x = torch.where(made.agent[..., None], moved.x, made.x)
+        made.v = torch.where(made.agent[..., None], moved.v, made.v)
+    return made

@@ -1,0 +1,203 @@
+"""The crowd study's pieces on small made-up corridors, and the whole of it on the real one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nnode.data.sequence import Sequence, collate
+from nnode.data.store import write_store
+from nnode.errors import ConfigError
+from nnode.plots.interaction import evaluate_force, interaction
+from studies.crowd import forces as crowd_forces
+from studies.crowd import printed as printed_crowd
+from studies.crowd.data import ALL, Place, cut, fold_of, parts, time_groups, turned
+from studies.crowd.fit import calibrate, costs, new_system, row_of, system_of
+from studies.crowd.tasks import even_pace
+from tests.studies.crowd.corridor import corridor, sequence
+
+TRUE = np.array([0.05, 40.0, 12.0])
+
+
+def chain(folder: Path, number: int = 20) -> str:
+    """Sequences of one second after another; neighbours share half of their people."""
+    rng = np.random.default_rng(0)
+    made = []
+    for i in range(number):
+        people = tuple(str(p) for p in range(2 * i, 2 * i + 4))
+        made.append(replace(sequence(rng, i, 26, 4), agents=people))
+    write_store(folder, made, {"dt": 0.04})
+    return str(folder)
+
+
+def test_nobody_is_on_both_sides_and_each_sequence_is_held_out_at_most_once(tmp_path):
+    folder = chain(tmp_path / "store")
+    held: list[int] = []
+    for fold in range(4):
+        train, out = parts(Place(folder, f"fold-{fold}", 4), (0.0, 20.0))
+        on_both = {f"{2 * i + k}" for i in train for k in range(4)} & {
+            f"{2 * i + k}" for i in out for k in range(4)
+        }
+        assert train
+        assert out
+        assert not on_both
+        assert not set(train) & set(out)
+        held += out
+    assert sorted(held) == list(range(20))
+    assert parts(Place(folder, ALL), (0.0, 20.0)) == (list(range(20)), [])
+
+
+def test_a_sequence_across_the_border_is_in_no_block():
+    starts = np.array([0.0, 4.0, 5.0, 9.5])
+    found = fold_of(starts, starts + 1.5, 2, (0.0, 11.0))
+    assert found.tolist() == [0, 0, -1, 1]
+    with pytest.raises(ConfigError, match="folds=1"):
+        fold_of(starts, starts + 1, 1, (0.0, 11.0))
+
+
+def test_stretches_of_time_are_numbered_by_recording():
+    rng = np.random.default_rng(0)
+    items = [sequence(rng, i, 26, 2) for i in (0, 3, 10, 11)]
+    items.append(replace(items[0], recording="another"))
+    assert time_groups(items).tolist() == [0, 0, 1, 1, 2]
+
+
+def test_turning_a_corridor_changes_nothing_for_a_force_without_directions():
+    rng = np.random.default_rng(1)
+    along_x = [sequence(rng, i, 20, 15) for i in range(2)]
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # to the left: the corridor then runs along y
+
+    def left(s: Sequence) -> Sequence:
+        assert s.walls is not None
+        assert s.destination is not None
+        walls = (s.walls.reshape(-1, 2, 2) @ turn).reshape(-1, 4)
+        return replace(s, x=s.x @ turn, destination=s.destination @ turn, walls=walls)
+
+    along_y = [left(s) for s in along_x]
+    expected = costs("sf", TRUE, collate(along_x))
+    torch.testing.assert_close(costs("sf", TRUE, collate(along_y)), expected)
+    back = [turned(s) for s in along_y]
+    for before, after in zip(along_x, back, strict=True):
+        np.testing.assert_allclose(after.x, before.x, atol=1e-12)
+        assert before.walls is not None
+        assert after.walls is not None
+        np.testing.assert_allclose(after.walls, before.walls, atol=1e-12)
+    network = row_of(new_system("nn", 4))
+    expected = costs("nn", network, collate(along_x))
+    assert not np.allclose(costs("nn", network, collate(along_y)), expected)
+    torch.testing.assert_close(costs("nn", network, collate(back)), expected)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_known_parameters_are_found_from_the_papers_starts(seed):
+    batch = corridor(3, system=system_of("sf", TRUE), samples=26, people=40, number=4)
+    start = row_of(new_system("sf", seed))
+    assert start.max() > 10
+    found = calibrate("sf", batch, start)
+    assert found.row == pytest.approx(TRUE, rel=1e-3)
+
+
+def test_growing_horizons_end_in_the_same_minimum_as_a_start_next_to_it():
+    batch = corridor(3, system=system_of("sf", TRUE), samples=26, people=40)
+    near = calibrate("sf", batch, 1.1 * TRUE, grow=False)
+    far = calibrate("sf", batch, np.array([30.0, 10.0, 40.0]))
+    assert far.row == pytest.approx(near.row, rel=1e-3)
+
+
+def test_weights_choose_the_sequences():
+    made = [
+        corridor(s, system=system_of("sf", row), samples=26, people=60, number=1)
+        for s, row in ((1, TRUE), (2, 2 * TRUE))
+    ]
+    both = collate(
+        Sequence(
+            name=str(n),
+            recording="made",
+            time=0.04 * np.arange(26),
+            x=one.x[:, 0].numpy(),
+            v=one.v[:, 0].numpy(),
+            destination=one.destination[0].numpy(),
+            walls=one.walls[0].numpy(),
+        )
+        for n, one in enumerate(made)
+    )
+    found = calibrate("sf", both, TRUE, weights=np.array([0.0, 1.0]))
+    assert found.row == pytest.approx(2 * TRUE, rel=1e-3)
+
+
+def test_walls_alone_leave_people_without_force_and_still_learn():
+    batch = corridor(3, system=system_of("sf", 50 * TRUE), people=20)
+    start = row_of(new_system("nn", 5))
+    found = calibrate("nn", batch, start, people=False, steps=2)
+    system = system_of("nn", found.row)
+    dx, dv = np.random.default_rng(0).normal(size=(2, 50, 2))
+    assert np.abs(evaluate_force(system, dx, dv, "pair")).max() == 0.0
+    assert np.abs(evaluate_force(system, dx, dv, "wall")).max() > 0.0
+    first = calibrate("nn", batch, start, people=False, steps=1, grow=False)
+    assert found.cost < first.cost
+
+
+def test_cutting_keeps_destinations():
+    batch = corridor(0)
+    part = cut(batch, 5)
+    assert part.n_samples == 5
+    assert torch.equal(part.destination, batch.destination)
+    assert cut(batch, 99).n_samples == batch.n_samples
+
+
+def test_even_pace_arrives_in_time_and_never_hurries():
+    batch = corridor(1)
+    x = even_pace(batch).x
+    torch.testing.assert_close(x[-1], batch.destination)
+    step = (x[1:] - x[:-1])[:, batch.agent]
+    torch.testing.assert_close(step, step[:1].expand_as(step))
+
+
+def test_force_by_distance_is_that_of_the_formula():
+    measured = crowd_forces.Measured.of(corridor(5, people=120, number=2))
+    system = system_of("sf", [0.5, 30.0, 0.0])
+    found = crowd_forces.away_by_distance(system, measured)
+    distance = np.linalg.norm(measured.dx, axis=1)
+    inside = (distance >= 0.25) & (distance < 0.5) & measured.facing
+    assert inside.sum() >= crowd_forces.LEAST
+    d = distance[inside]
+    expected = (0.5 * np.exp((0.5 - d) / 0.05) + 30.0 * (0.5 - d)).mean()
+    assert found.loc[0.375, "facing"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_parts_add_up_to_what_the_model_adds_to_the_relaxation():
+    measured = crowd_forces.Measured.of(corridor(6))
+    system = new_system("nn", 8)
+    found = crowd_forces.accelerations(system, measured)
+    np.testing.assert_allclose(found["sum"], found["pair"] + found["wall"])
+    assert found["sum"].shape == (int(measured.scenes.agent.sum()), 2)
+    assert interaction(system) is system.terms[1]
+
+
+def test_a_pull_to_a_speed_is_found():
+    v = np.array([[0.5, 0.0], [-1.0, 0.2], [1.5, 0.1], [-0.8, 0.0]])
+    pull = 0.4 * (np.sign(v[:, :1]) * 1.2 - v[:, :1])
+    parts = {"v": v, "sum": np.concatenate([pull, np.zeros((4, 1))], 1)}
+    assert crowd_forces.slope(parts) == pytest.approx((0.4, 1.2))
+
+
+def test_likeness_is_the_sign_and_share_of_agreement():
+    field = np.random.default_rng(0).normal(size=(100, 2))
+    assert crowd_forces.likeness(field, 3 * field + 7) == pytest.approx(1.0)
+    assert crowd_forces.likeness(field, -field) == pytest.approx(-1.0)
+    assert np.isnan(crowd_forces.likeness(field, 0 * field))
+
+
+def test_settings_stand_beside_the_printed_forces():
+    from nnode.plots.settings import six_settings
+
+    system = system_of("sf", list(printed_crowd.PARAMETERS.values()))
+    table = printed_crowd.settings("sf", six_settings(system)[1])
+    assert len(table) == 12
+    for part in ("F_x", "F_y"):
+        away = (table[part] - table[f"{part} printed"]).abs().max()
+        assert away < 1e-4

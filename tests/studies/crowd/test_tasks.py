@@ -1,0 +1,81 @@
+"""The crowd study's calculations on people who move as the social force says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nnode.data.sequence import Sequence
+from nnode.data.store import write_store
+from studies.crowd import tasks
+from studies.crowd.data import chosen
+from studies.crowd.fit import costs, system_of
+from tests.studies.crowd.corridor import DT, corridor
+
+TRUE = np.array([0.05, 40.0, 12.0])
+#: Starts of the sequences, s: two in each half of the recording, in four stretches of 10 s.
+STARTS = (0.0, 10.0, 20.0, 30.0)
+PEOPLE = 30
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
+    made = []
+    for number, start in enumerate(STARTS):
+        one = corridor(number, system=system_of("sf", TRUE), samples=26, people=PEOPLE, number=1)
+        assert one.v is not None
+        assert one.destination is not None
+        assert one.walls is not None
+        made.append(
+            Sequence(
+                name=f"made/{number}",
+                recording="made",
+                time=start + DT * np.arange(26),
+                x=one.x[:, 0].numpy(),
+                v=one.v[:, 0].numpy(),
+                walls=one.walls[0].numpy(),
+                destination=one.destination[0].numpy(),
+                agents=tuple(f"{number}-{i}" for i in range(PEOPLE)),
+            )
+        )
+    place = tmp_path_factory.mktemp("crowd")
+    write_store(place, made, {"dt": DT})
+    return str(place)
+
+
+def test_a_fit_finds_the_truth_without_the_block_that_is_held_out(folder: str) -> None:
+    found = tasks.fit("sf", folder, "fold-1", 2, [0.0, 31.0], 0, (1.2 * TRUE).tolist(), 4)
+    assert found["row"] == pytest.approx(TRUE, rel=1e-3)
+    assert list(found["train"]) == ["made/0", "made/1"]
+    assert list(found["heldout"]) == ["made/2", "made/3"]
+    assert found["J"] == pytest.approx(np.mean(list(found["train"].values())))
+    # those who were held out move by the same law
+    lost = tasks.baselines(folder)["costs"]["relaxation"]
+    assert max(found["heldout"].values()) < 1e-4 * min(lost.values())
+
+
+def test_refits_to_resampled_data_without_noise_stay_where_they_are(folder: str) -> None:
+    found = tasks.resample(folder, TRUE.tolist(), 5, 1, 4, 0)
+    assert np.array(found["rows"]).shape == (3, 3)
+    for row in found["rows"]:
+        assert row == pytest.approx(TRUE, rel=1e-3)
+
+
+def test_baselines_calibrate_nothing(folder: str) -> None:
+    found = tasks.baselines(folder)
+    assert found["people"] == [PEOPLE] * 4
+    names = [f"made/{number}" for number in range(4)]
+    assert all(list(by_name) == names for by_name in found["costs"].values())
+    # no interaction is the social force without strength
+    none = costs("sf", [0.0, 0.0, 0.0], chosen(folder, range(4)))
+    assert list(found["costs"]["relaxation"].values()) == pytest.approx(none.tolist(), rel=1e-9)
+
+
+def test_a_force_without_directions_holds_in_a_corridor_that_lies_another_way(folder: str) -> None:
+    found = tasks.transfer(folder, {"sf": TRUE.tolist()})["runs"]["made"]
+    assert found["people"] == [PEOPLE] * 4
+    there = tasks.baselines(folder)["costs"]
+    for name in ("relaxation", "constant_velocity", "even_pace", "printed"):
+        turned = list(found["costs"][name].values())
+        assert turned == pytest.approx(list(there[name].values()), rel=1e-6)
+    assert max(found["costs"]["sf"].values()) < 1e-4 * min(there["relaxation"].values())

@@ -1,0 +1,155 @@
+"""Folds, pairs of platoons, and calibrations of pairs whose law is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.problem import ResidualProblem
+from nnode.data.clusters import folds
+from nnode.data.sequence import Sequence, collate
+from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
+from nnode.simulation.fused import FusedSolver
+from studies.following import data, fit, inference, leaders, printed
+from studies.following.candidates import EVERY, decay, key, starts
+
+HELLY = {"c_s": 0.15, "c_v": 0.7, "T": 1.4, "s0": 3.0}
+
+
+def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequence]:
+    """Followers by Helly's law, stepped here by a plain loop, behind leaders that swing."""
+    found = []
+    time = 0.1 * np.arange(301)
+    for i in range(number):
+        lead_v = 10 + 2 * np.sin(0.3 * time + i) + np.cos(0.11 * time * (1 + i / 5))
+        lead = np.concatenate([[0.0], np.cumsum((lead_v[1:] + lead_v[:-1]) / 2 * 0.1)])
+        gap_time = HELLY["T"] if time_gaps is None else time_gaps[i]
+        x, v = np.empty(301), np.empty(301)
+        x[0], v[0] = -25.0 - i, 9.0
+        for k in range(300):
+            gap = lead[k] - x[k] - 4.0
+            a = HELLY["c_s"] * (gap - HELLY["s0"] - gap_time * v[k])
+            a -= HELLY["c_v"] * (v[k] - lead_v[k])
+            v[k + 1] = v[k] + 0.1 * a
+            x[k + 1] = x[k] + 0.1 * (v[k] + v[k + 1]) / 2
+        found.append(
+            Sequence(
+                name=f"r/{i}",
+                recording="r",
+                time=time,
+                x=np.stack([x, lead], -1)[..., None],
+                v=np.stack([v, lead_v], -1)[..., None],
+                agents=(f"f{i}", f"l{i // 2}"),
+                length=np.array([np.nan, 4.0]),
+                split="train",
+            )
+        )
+    return found
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
+    pairs = driven()
+    monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
+    monkeypatch.setattr(data, "batch", lambda folder, test=False: collate(pairs))
+    return pairs
+
+
+def test_candidates_are_stepped_as_in_the_published_comparisons() -> None:
+    steps = {name: one.system().step for name, one in EVERY.items()}
+    maps = {name for name in steps if name.split(" ")[0] in ("krauss", "newell")}
+    assert {steps[name] for name in maps} == {"semi_implicit"}
+    assert {steps[name] for name in steps.keys() - maps} == {"ballistic"}
+    for law, limits in printed.CLIPPED.items():
+        values = dict.fromkeys(CAR_FOLLOWING_LAWS[law]["parameters"], 1.0)
+        assert (
+            law_from(law, printed.clipped(CAR_FOLLOWING_LAWS[law], limits, values)).step
+            == "ballistic"
+        )
+
+
+def test_clusters_stay_in_one_fold() -> None:
+    label = data.labels(driven())
+    assert label.tolist() == [0, 0, 1, 1, 2, 2]
+    fold = folds(label, 2, seed=3)
+    assert fold[::2].tolist() == fold[1::2].tolist()
+    assert set(fold) == {0, 1}
+
+
+def test_followers_of_a_platoon_keep_their_leaders() -> None:
+    x = np.array([0.0, 20, 50, 90])[None, :] + 10 * 0.1 * np.arange(50)[:, None]
+    platoon = Sequence(
+        name="p", recording="p", time=0.1 * np.arange(50), x=x[..., None], agents=tuple("dcba")
+    )
+    pairs = data.behind(platoon)
+    assert [pair.agents for pair in pairs] == [("b", "a"), ("c", "b"), ("d", "c")]
+    last = pairs[0].part(0.7, 1.0)
+    assert (last.n_samples, last.time[0]) == (15, pytest.approx(3.5))
+    assert np.diff(last.x[0, :, 0]) == pytest.approx(40)
+
+
+def test_cross_validation_finds_the_hidden_law(known: list[Sequence]) -> None:
+    found = fit.cross_validate("", "helly", restarts=2, folds=2, seed=0)
+    assert found["parameters"] == pytest.approx(HELLY, rel=1e-3)
+    assert max(found["heldout"]["spacing"]) < 1e-3
+    assert found["limits"] == []
+    assert len(found["starts"]) == 2
+
+
+@pytest.mark.thorough  # calibrations of every pair, some thirty times
+def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
+    pairs = driven(time_gaps=own)
+    monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
+    row = [HELLY[n] for n in ("c_s", "c_v", "T", "s0")]
+    found = inference.halves("", "helly", row, folds=2, restarts=1, seed=0)
+    assert found["names"] == ["c_s", "c_v", "T", "s0"]
+    # the spread of the middle of the six time gaps, whose 5 % quantiles the ends are moved to
+    tame = np.clip(own, *np.quantile(own, [0.05, 0.95]))
+    assert found["spread"][2] == pytest.approx(np.std(tame, ddof=1), rel=0.05)
+    assert max(found["alone"]) < 0.01
+    assert np.mean(found["pooled"]) > 0.5
+    assert np.mean(found["shrunk"]) < 0.1 * np.mean(found["pooled"])
+
+
+def test_a_profile_is_least_at_the_best_value(known: list[Sequence]) -> None:
+    cost = ResidualProblem(
+        EVERY["helly"].system(), collate(known), FusedSolver(), Convention.spacing
+    )
+    best = np.array([HELLY[n] for n in fit.named(cost, cost.start)])
+    before = cost.low.copy()
+    found = inference.profile(cost, best, 2, np.arange(6))
+    rise = np.array(found["rise"])
+    assert found["values"] == sorted(found["values"])
+    assert found["values"][int(rise.argmin())] == pytest.approx(HELLY["T"], rel=1e-9)
+    assert (rise >= -1e-9).all()
+    assert cost.low.tolist() == before.tolist()
+
+
+def test_networks_are_penalised_and_laws_are_not() -> None:
+    batch = collate(driven(2))
+    law = ResidualProblem(EVERY["helly"].system(), batch, FusedSolver())
+    assert decay(law) is None
+    beside = ResidualProblem(EVERY["idm + network 4"].system(), batch, FusedSolver())
+    penalty = decay(beside)
+    assert penalty is not None
+    assert (penalty[1] == 0).sum() == 5
+    rows = starts(EVERY["idm + network 4"], beside, 3, seed=1)
+    assert rows[0, :5] == pytest.approx([30, 1.2, 2, 1.3, 1.7])
+    assert len(np.unique(rows[:, 0])) == 3
+
+
+def test_names_of_candidates_are_file_names() -> None:
+    assert key("idm + reaction delay") == "idm-reaction_delay"
+    assert len({key(name).casefold() for name in EVERY}) == len(EVERY)
+
+
+def test_the_jackknife_of_a_mean_is_its_usual_interval() -> None:
+    values = np.random.default_rng(0).normal(size=(10, 2))
+    without = (values.sum(0) - values) / 9
+    error, half = leaders.jackknifed(values.mean(0), without)
+    usual = values.std(0, ddof=1) / np.sqrt(10)
+    assert error == pytest.approx(usual)
+    assert half == pytest.approx(usual * stats.t.ppf(0.975, 9))

@@ -1,0 +1,165 @@
+"""The page from invented results, whose figures are known by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from nnode.pages.page import TableBlock, write_page
+from studies.following import printed, stability
+from studies.following.candidates import EVERY, key
+from studies.following.data import LEADERS, PAIRS, PLATOONS
+from studies.following.fit import OBJECTIVES, named
+from studies.following.results import Study
+from studies.following.study import after, training
+from studies.options import FollowingStudyOptions
+from studies.page import page
+from tests.studies.following.test_fit import driven
+
+#: By candidate: held-out and test error of every pair, m.
+ERRORS = {"idm": (5.0, 3.0), "helly": (4.5, 3.2), "idm + memory": (4.0, 2.8)}
+MAKES = list(printed.PLATOON_ERRORS)
+
+
+def invented() -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {
+        "floor": {"costs": [1.0] * 6, "limits": [[]] * 5 + [["v0"]]},
+        "reproduced-platoon": {"law": printed.PLATOON_ERRORS, "stopped": printed.PLATOON_ERRORS},
+        "reproduced-pairs": {
+            f"{law} {o}": [value] * 20
+            for law, row in printed.ERRORS.items()
+            for o, value in zip(printed.OBJECTIVES, row, strict=True)
+        },
+    }
+    for name, (held, test) in ERRORS.items():
+        system = EVERY[name].system()
+        row = [float(p.detach()) for p in system.parameters()]
+        cost = cast(
+            Any,
+            SimpleNamespace(names=[f"x.{n.split('.')[-1]}" for n, _ in system.named_parameters()]),
+        )
+        values = named(cost, np.array(row))
+        noise = 0.1 * np.arange(6)
+        found[f"cv-{key(name)}"] = {
+            "row": row,
+            "parameters": values,
+            "limits": [],
+            "clusters": [0, 0, 1, 1, 2, 2],
+            "train": {o: (noise + held - 0.5).tolist() for o in OBJECTIVES},
+            "heldout": {o: (noise + held).tolist() for o in OBJECTIVES},
+        }
+        found[f"test-{key(name)}"] = {o: (noise + test).tolist() for o in OBJECTIVES}
+        found[f"objectives-{key(name)}"] = {
+            o: {
+                "reached": {x: 1.0 + (x != o) for x in OBJECTIVES},
+                "parameters": values,
+                "limits": [],
+            }
+            for o in OBJECTIVES
+        }
+        factors = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
+        rise = np.log(factors) ** 2
+        found[f"precision-{key(name)}"] = {
+            "names": list(values),
+            "row": row,
+            "half": [0.2] * len(row),
+            "correlation": np.eye(len(row)).tolist(),
+            "profiles": {
+                n: {
+                    "values": (factors * v).tolist(),
+                    "rise": rise.tolist(),
+                    "low": (rise - 0.1).tolist(),
+                    "high": (rise + 0.1).tolist(),
+                }
+                for n, v in values.items()
+            },
+        }
+    idm = found["cv-idm"]["parameters"]
+    found["halves"] = {
+        "names": list(idm),
+        "centre": list(idm.values()),
+        "spread": [0.1] * 5,
+        "between": [1.0] * 5,
+        "pooled": [4.0] * 6,
+        "alone": [6.0] * 6,
+        "shrunk": [3.0] * 6,
+        "strengths": [0.1, 1.0],
+        "by_strength": [4.0],
+        "clusters": [0, 0, 1, 1, 2, 2],
+    }
+    for name, fold, heldout in (("idm", 2.0, 3.0), ("helly", 3.0, 1.0)):
+        found[f"platoon-{name}"] = {
+            "makes": MAKES,
+            "chosen": [fold] * 4,
+            "train": [fold] * 4,
+            "heldout": [heldout] * 4,
+            "parameters": [idm] * 4,
+            "limits": [[]] * 4,
+        }
+    found["runs"] = {
+        "runs": ["a", "a", "b", "b"],
+        "makes": MAKES,
+        "settings": ["min", "max", "none", "min"],
+        "costs": [1.0] * 4,
+        "limits": [[]] * 4,
+        "parameters": [{**idm, "T": T} for T in (0.8, 2.5, 1.5, 1.0)],
+    }
+    rows = {"both": [30, 1.2, 2, 1.3, 1.7], "HV": [30, 1.0, 2, 1.3, 1.7], "CAV": [30, 1.5, 2, 1, 2]}
+    found["leaders"] = {
+        "names": list(idm),
+        "kinds": ["HV", "CAV"] * 3,
+        "clusters": [0, 0, 1, 1, 2, 2],
+        "rows": rows,
+        "speed": [10.0] * 6,
+        "gap": [20.0] * 6,
+        "without": {k: [[x + d for x in row] for d in (-0.01, 0, 0.01)] for k, row in rows.items()},
+        "heldout": {k: [1.0] * 6 for k in rows},
+        "costs": {k: [1.0] * 6 for k in rows},
+    }
+    return found
+
+
+@pytest.fixture
+def study(monkeypatch: pytest.MonkeyPatch) -> Study:
+    store = SimpleNamespace(folder="", manifest={"files": {}})
+    found = Study(
+        FollowingStudyOptions(),
+        cast(Any, dict.fromkeys((PAIRS, PLATOONS, LEADERS), store)),
+        invented(),
+    )
+    monkeypatch.setattr(Study, "pairs", lambda self, test=False: tuple(driven()))
+    monkeypatch.setattr(stability, "platoon", lambda *args, **more: np.full(11, 0.05))
+    return found
+
+
+def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
+    blocks = page("following", study.tables(), study.figures(), **study.values())
+    tables = {b.name: b.frame for b in blocks if isinstance(b, TableBlock)}
+    assert study.order == ["idm + memory", "helly", "idm"] == list(tables["candidates"].index)
+    away = tables["candidates"].loc["idm + memory", ["minus idm", "from", "to"]]
+    assert list(away) == pytest.approx([-1.0, -1.0, -1.0])
+    assert tables["test"].loc["idm + memory", "test"] == pytest.approx(3.05)
+    assert tables["test"].loc["helly", "minus idm"] == pytest.approx(0.2)
+    assert tables["published"]["difference"].abs().max() == pytest.approx(0)
+    # chosen inside the first 70 %, whatever the rest says
+    assert list(tables["platoon"].index[:2]) == ["idm", "helly"]
+    assert tables["platoon"].loc["idm", "last 30 %"] == pytest.approx(3.0)
+    assert tables["platoon"].loc["chosen by follower", "last 30 %"] == pytest.approx(3.0)
+    assert tables["drivers"].loc["shrunk", "minus pooled"] == pytest.approx(-1)
+    assert tables["time_gaps"].loc["ACC, min", "median"] == pytest.approx(0.9)
+    ends = tables["leaders"][["from", "to"]].astype(float).prod(axis=1)
+    assert list(ends.index[ends > 0]) == ["T", "a", "b"]
+    paths = write_page(blocks, tmp_path, title="Car following")
+    assert all(path.stat().st_size for path in paths)
+
+
+def test_every_task_has_a_key_of_its_own(study: Study) -> None:
+    first, rest = training(study.options, study.stores), after(study)
+    assert {task.key for task in first} == {f"cv-{key(name)}" for name in EVERY}
+    keys = [task.key for task in (*first, *rest)]
+    assert len(set(keys)) == len(keys)
+    assert {"precision-idm", "precision-idm-memory"} < set(keys)

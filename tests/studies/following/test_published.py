@@ -1,0 +1,38 @@
+"""Published errors of published parameters, computed again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from studies.following import fit, platoons, printed
+from studies.following.data import PAIRS, PLATOONS, stores
+from studies.options import FollowingStudyOptions
+
+pytestmark = pytest.mark.real
+
+
+@pytest.fixture(scope="module")
+def folders(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    if not (real_data / "ngsim_pairs").is_dir():
+        pytest.skip(f"{real_data} has no ngsim_pairs")
+    found = stores(
+        FollowingStudyOptions(source=str(real_data)), tmp_path_factory.mktemp("following")
+    )
+    return {name: str(store.folder) for name, store in found.items()}
+
+
+def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
+    found = fit.reproduced(folders[PAIRS])
+    for law, theirs in printed.ERRORS.items():
+        for objective, value in zip(printed.OBJECTIVES, theirs, strict=True):
+            errors = found[f"{law} {objective}"]
+            assert len(errors) == 20
+            assert np.mean(errors) == pytest.approx(value, abs=0.01), (law, objective)
+
+
+def test_four_errors_on_the_track(folders: dict[str, str]) -> None:
+    found = platoons.reproduced(folders[PLATOONS])
+    assert found["stopped"] == pytest.approx(printed.PLATOON_ERRORS, abs=0.03)

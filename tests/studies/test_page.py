@@ -1,0 +1,139 @@
+"""Templates of pages and tidy frames, on small tables; the quick studies on the recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+import pytest
+
+from nnode.errors import ConfigError
+from nnode.pages.page import FigureBlock, Heading, TableBlock, Text
+from nnode.plots.style import new_figure
+from studies import command, frame, page
+from studies.options import CrowdStudyOptions, StudyOptions, TrafficStudyOptions, checked
+from studies.runner import Task
+from tests.studies.work import square
+
+TEMPLATE = """
+## First
+
+Of {{ number | digits }} numbers.
+{% call table("t", digits={"": 1, "b": 3}, least=["a"], head=2) %}
+Two
+rows.
+{% endcall %}
+### Second
+{% call figure("f", "A line.") %}A figure.{% endcall %}
+End.
+"""
+
+
+@pytest.fixture
+def loader(monkeypatch: pytest.MonkeyPatch) -> None:
+    templates = jinja2.DictLoader({"page.md.j2": TEMPLATE})
+    monkeypatch.setattr(page, "PackageLoader", lambda *_: templates)
+
+
+def test_blocks_stand_in_the_template_s_order(loader: None) -> None:
+    table = pd.DataFrame({"a": [3.0, 2.0, 1.0], "b": [1.0, 2.0, 3.0]})
+    blocks = page.page("x", {"t": table}, {"f": new_figure(1, 1)}, number=2.0)
+    first, text, one, second, figure, end, _ = blocks
+    assert (first, second) == (Heading("First", 2), Heading("Second", 3))
+    assert (text, end) == (Text("Of 2.00 numbers."), Text("End."))
+    assert isinstance(one, TableBlock)
+    assert (one.caption, one.digits) == ("Two rows.", {"a": 1, "b": 3})
+    assert len(one.frame) == 2
+    assert one.full is table
+    assert one.bold is not None
+    assert one.bold["a"].tolist() == [False, True]
+    assert isinstance(figure, FigureBlock)
+    assert (figure.caption, figure.alt) == ("A figure.", "A line.")
+
+
+def test_what_the_template_misses_is_an_error(loader: None) -> None:
+    with pytest.raises(jinja2.UndefinedError, match="number"):
+        page.page("x", {}, {})
+    with pytest.raises(KeyError, match="t"):
+        page.page("x", {}, {}, number=1.0)
+
+
+def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
+    table = pd.DataFrame({"a": [3.0, 2.0, 1.0], "b": [1.0, 2.0, 3.0]}, index=["x", "y", "z"])
+    assert page.least_cells(table, ["a"], ["x", "y"])["a"].tolist() == [False, True, False]
+    assert page.least_cells(table, row=["a", "b"]).to_numpy().tolist() == [
+        [False, True],
+        [True, True],
+        [True, False],
+    ]
+
+
+def test_one_row_per_task_and_one_per_number() -> None:
+    tasks = [Task(f"k{x}", square, {"x": x}) for x in (1, 2)]
+    found = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
+    assert found.to_dict("list") == {
+        "key": ["k1", "k2"],
+        "task": ["square"] * 2,
+        "x": [1, 2],
+        "y": [1, 4],
+    }
+    assert frame.numbers({"v": 3.0, "w": [[1.0, 2.0]]}) == [
+        ("v", "", 3.0),
+        ("w", "0 0", 1.0),
+        ("w", "0 1", 2.0),
+    ]
+
+
+def test_means_and_differences_resample_clusters() -> None:
+    cluster = np.repeat(np.arange(40), 3)
+    noise = np.random.default_rng(0).normal(size=40)[cluster]
+    costs = frame.by_unit({"a": 2 + noise, "b": 1 + noise, "c": np.inf + 0 * noise}, cluster)
+    mean = frame.means(costs, 0)
+    # of 40 independent clusters, not of 120 units
+    half = 1.96 * noise[::3].std() / np.sqrt(40)
+    assert mean.loc["a", "high"] - mean.loc["a", "mean"] == pytest.approx(half, rel=0.1)
+    assert np.isnan(mean.loc["c", "low"])
+    away = frame.differences(costs, [("a", "b"), ("c", "b")], 0)
+    first = away.loc[("a", "b")]
+    assert list(first[["difference", "low", "high", "better"]]) == pytest.approx([1, 1, 1, 0])
+    assert first["p"] < 1e-3
+    assert away.loc[("c", "b"), "difference"] == np.inf
+    assert np.isnan(away.loc[("c", "b"), "low"])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (TrafficStudyOptions(restarts=0), "study.restarts=0 must be at least 1"),
+        (TrafficStudyOptions(folds=1), "study.folds=1 must be at least 2"),
+        (TrafficStudyOptions(box=0.0), "study.box=0.0 must be positive"),
+        (TrafficStudyOptions(workers=0), "study.workers=0 must be at least 1"),
+        (CrowdStudyOptions(horizons=[]), r"study.horizons=\[\] must be positive"),
+        (CrowdStudyOptions(horizons=[1.0, 0.0]), "study.horizons=.* must be positive"),
+    ],
+)
+def test_options_out_of_range_are_named(options: StudyOptions, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        checked(options)
+
+
+def test_quick_options() -> None:
+    quick = checked(CrowdStudyOptions(quick=True, horizons=[3.0, 1.0, 2.0], restarts=5))
+    assert (quick.horizons, quick.restarts, quick.folds) == ([1.0, 3.0], 1, 2)
+    assert checked(CrowdStudyOptions(horizons=[3.0, 1.0, 3.0])).horizons == [1.0, 3.0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", command.STUDIES)
+def test_a_quick_study_makes_its_page(name: str, real_data: Path, tmp_path: Path) -> None:
+    from omegaconf import OmegaConf
+
+    from nnode.config import SCHEMAS
+
+    schema: Any = SCHEMAS["study", f"{name}_study_schema"]
+    options = OmegaConf.structured(schema(source=str(real_data), quick=True, workers=2))
+    command.study(OmegaConf.create({"study": options}), tmp_path)
+    assert "## Replay" in (tmp_path / "quick" / "study.md").read_text() or name == "prediction"

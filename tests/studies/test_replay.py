@@ -1,0 +1,63 @@
+"""Scenes of a study's player: calibrated models beside what was measured."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from nnode.data.sequence import Sequence
+from nnode.errors import SimulationError
+from studies import replay
+from studies.traffic.problem import system_of
+from tests.studies.traffic.invented import platoons
+
+V0, L = 25.0, 5.0
+
+
+def test_sequences_are_chosen_evenly() -> None:
+    items = platoons("a") + platoons("b") + platoons("c")
+    assert replay.spread(items, 3) == items[::3]
+    assert replay.spread(items, 9) == items
+    assert replay.spread(items, 100) == items
+    assert len(replay.spread(items, 4)) == 3
+    assert replay.spread([], 4) == []
+
+
+def test_models_drive_as_their_formula_says() -> None:
+    sequences = platoons("a")[:2]
+    system = system_of("lin", {"v0": V0, "L": L})
+    for scene in replay.scenes(sequences, {"lin": system}, dt=0.001):
+        s = scene.sequence
+        time = s.time - s.time[0]
+        x = scene.simulated["lin"][:, :, 0]
+        np.testing.assert_allclose(x[:, -1], s.x[0, -1, 0] + V0 * time, atol=1e-9)
+        # behind a leader of constant speed the follower's law v0 (1 - L/gap) starts like this
+        gap = s.x[0, -1, 0] - s.x[0, -2, 0]
+        first = (x[1, -2] - x[0, -2]) / time[1]
+        assert first == pytest.approx(V0 * (1 - L / gap), rel=0.03)
+
+
+def test_after_a_blow_up_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise SimulationError("it blew up")
+
+    monkeypatch.setattr(replay.FusedSolver, "__call__", fail)
+    (s,) = platoons("a")[:1]
+    (scene,) = replay.scenes([s], {"lin": system_of("lin", {"v0": V0, "L": L})})
+    x = scene.simulated["lin"]
+    np.testing.assert_array_equal(x[0], s.x[0])
+    assert np.isnan(x[1:]).all()
+    block = replay.player("p", [scene], "One.", 7)
+    text, said = block.data()
+    assert said.startswith("1 of 7 sequences")
+    rows = json.loads(text)["scenes"][0]["simulated"][0]["x"]
+    assert all(row[1:] == [None] * (s.n_samples - 1) for row in rows)
+
+
+def test_a_sequence_of_one_car_is_no_reason_to_fail() -> None:
+    time = 0.2 * np.arange(4)
+    s = Sequence(name="a", recording="a", time=time, x=(20 * time)[:, None, None])
+    (scene,) = replay.scenes([s], {"lin": system_of("lin", {"v0": V0, "L": L})})
+    np.testing.assert_allclose(scene.simulated["lin"][:, 0, 0], V0 * time, atol=1e-9)

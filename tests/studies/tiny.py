@@ -1,0 +1,26 @@
+"""A study of squares, to test what runs studies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+
+from nnode.pages.page import Block, TableBlock
+from studies.options import StudyOptions
+from studies.runner import run_tasks
+from tests.studies import work
+
+TITLE = "Squares"
+SUBTITLE = "Of *two* numbers."
+
+
+def run(options: StudyOptions, folder: Path) -> list[Block]:
+    """Compute two squares, and wait where the folder does not say to stay awake."""
+    assert options.workers is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    found = run_tasks(
+        work.tasks(folder), folder, workers=options.workers, fingerprint="f", title="tiny"
+    )
+    squares = {key: result["y"] for key, result in found.items() if "y" in result}
+    return [TableBlock("squares", pd.Series(squares, name="y").to_frame(), "Squares.")]

@@ -1,0 +1,125 @@
+"""The published page's numbers, computed again from its own parameters."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nnode.calibrate.cost import sequence_costs
+from nnode.data.options import EsimasOptions, Faults
+from nnode.data.prepare import prepare
+from nnode.model.build import build_model
+from nnode.model.system import System
+from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
+from studies.crowd.data import chosen, prepare_horizon, sequences
+from studies.crowd.fit import system_of
+from studies.traffic.printed import RECORDINGS
+from studies.traffic.problem import Problem, model_options, recording
+
+PUBLISHED = Path(__file__).parents[3] / "docs" / "studies" / "traffic"
+DT = 0.002
+
+
+@pytest.fixture(scope="module")
+def parameters() -> pd.DataFrame:
+    return pd.read_csv(PUBLISHED / "parameters.csv", dtype={"index": str}, keep_default_na=False)
+
+
+@pytest.fixture(scope="module")
+def table() -> pd.DataFrame:
+    return pd.read_csv(PUBLISHED / "table_2.csv", index_col=0)
+
+
+@pytest.fixture(scope="module")
+def esimas(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("esimas")
+    prepare(EsimasOptions(name="esimas", source=str(real_data), faults=Faults.keep), folder)
+    return str(folder)
+
+
+def calibrated(parameters: pd.DataFrame, model: str, name: str) -> System:
+    """The model with the published parameters of one recording."""
+    p = parameters
+    chosen = p[
+        (p.optimizer == "bfgs")
+        & (p.faults == "keep")
+        & (p.box == "")
+        & (p.model == model)
+        & (p.recording == name)
+    ]
+    system = build_model(model_options(model))
+    own = dict(system.named_parameters())
+    assert len(chosen) == sum(value.numel() for value in own.values())
+    with torch.no_grad():
+        for row in chosen.itertuples():
+            place = tuple(int(i) for i in str(row.index_).split()) if row.index_ else ()
+            own[f"terms.0.{row.parameter}"][place] = float(row.value)
+    return system
+
+
+def mean_cost(system: System, folder: str, name: str, model: str, solver: Solver) -> float:
+    batch = Problem(recording(folder, name), model).batch
+    with torch.no_grad():
+        return float(sequence_costs(solver(system, batch), batch).mean())
+
+
+@pytest.mark.parametrize("model", ["lin", "log", "n2", "n4", "n10"])
+def test_costs_follow_from_the_parameters(
+    model: str, parameters: pd.DataFrame, table: pd.DataFrame, esimas: str
+) -> None:
+    renamed = parameters.rename(columns={"index": "index_"})
+    for name in RECORDINGS:
+        system = calibrated(renamed, model, name)
+        cost = mean_cost(system, esimas, name, model, FusedSolver(DT))
+        assert cost == pytest.approx(table.loc[model, name], rel=1e-6), name
+    # the smallest recording by another solver as well
+    system = calibrated(renamed, model, "3-1_2")
+    cost = mean_cost(system, esimas, "3-1_2", model, TorchdiffeqSolver("euler", "discrete", DT))
+    assert cost == pytest.approx(table.loc[model, "3-1_2"], rel=1e-6)
+
+
+def test_the_average_is_one(table: pd.DataFrame) -> None:
+    pd.testing.assert_series_equal(
+        table[list(RECORDINGS)].mean(axis=1), table["average"], check_names=False
+    )
+
+
+@pytest.mark.parametrize(("model", "label"), [("sf", "SF"), ("nn", "NN")])
+def test_crowd_costs_follow_from_the_parameters(
+    model: str, label: str, real_data: Path, tmp_path: Path
+) -> None:
+    folder = PUBLISHED.parent / "crowd"
+    told = pd.read_csv(folder / "crowd_costs.csv", index_col=0)
+    rows = pd.read_csv(folder / "parameters.csv")
+    rows = rows[(rows.model == model) & (rows["trained on"] == "all") & (rows["horizon (s)"] == 1)]
+    prepare_horizon(str(real_data), None, 1.0, tmp_path)
+    batch = chosen(str(tmp_path), range(len(sequences(str(tmp_path)))))
+
+    def cost(system: System, solver: Solver) -> float:
+        with torch.no_grad():
+            return float(sequence_costs(solver(system, batch), batch).mean())
+
+    systems = [system_of(model, one["value"].to_list()) for _, one in rows.groupby("start")]
+    found = [cost(system, FusedSolver()) for system in systems]
+    # the best one by another solver as well
+    best = systems[int(np.argmin(found))]
+    again = cost(best, TorchdiffeqSolver("euler", "discrete"))
+    assert again == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
+    assert min(found) == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
+    assert 25 * min(found) == pytest.approx(told.loc[label, "here (m²)"], rel=1e-6)
+
+
+@pytest.mark.parametrize("study", ["traffic", "crowd"])
+def test_pages_stand_alone(study: str) -> None:
+    folder = PUBLISHED.parent / study
+    html = (folder / "study.html").read_text()
+    assert not re.search(r'(src|href)="(?!data:|#)', html)
+    named = re.findall(r"\]\(([^)#][^)]*)\)", (folder / "study.md").read_text())
+    assert named
+    for path in named:
+        assert (folder / path.split("#")[0]).is_file() or path.startswith("https://"), path
