@@ -198,7 +198,7 @@ class Calibration:
             ("Status", self.status, "Clusters", f"{fit.clusters}"),
             ("Epochs", f"{self.n_iter}", "RMSE (m)", f"{fit.rmse:.4g}"),
             ("Parameters", f"{fit.parameters}", "Log-likelihood", f"{fit.log_likelihood:.6g}"),
-            ("Time (s)", f"{self.seconds:.1f}", "AIC", f"{fit.aic:.6g}"),
+            ("", "", "AIC", f"{fit.aic:.6g}"),
             ("", "", "BIC", f"{fit.bic:.6g}"),
         ]
         lines = [f"{a:<12}{b:<26}{c:<16}{d:>12}" for a, b, c, d in facts]
@@ -256,9 +256,9 @@ class Calibration:
             lines += self.drivers.summary()
         elif fit.autocorrelation > _CORRELATED:
             lines.append(
-                "the log-likelihood, AIC and BIC assume independent errors, but the autocorrelation "
-                f"of the residuals is {fit.autocorrelation:.2f} at one sample: compare laws on "
-                "held-out sequences"
+                "the log-likelihood, AIC and BIC assume independent errors, but the "
+                f"autocorrelation of the residuals is {fit.autocorrelation:.2f} at one sample: "
+                "compare laws on held-out sequences"
             )
         if self.clusters == 1:
             lines.append(

@@ -142,7 +142,7 @@ class Drivers:
         every = ", ".join(differ) if differ else "none that the data tell"
         return [
             f"{len(self.table)} drivers; parameters that differ between them (standard deviation): "
-            f"{every}; the parameters below are the medians",
+            f"{every}; the parameters of the table are the medians",
             f"pushes of {said['push']} that last {said['push_time']}; errors of measurement of "
             f"{said['measurement']}",
         ]

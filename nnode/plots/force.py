@@ -24,6 +24,6 @@ def force_figure(system: System, sequences: Iterable[Sequence] = ()) -> Figure:
     """
     items = list(sequences)
     if system.domain == "traffic":
-        points = measured_speeds(items) if items else None
+        points = measured_speeds(items, system) if items else None
         return speed_curves({follow_law(system).name: system}, points=points)
     return head_on_figure(system, points=relative_positions(items) if items else None)

@@ -74,16 +74,25 @@ def measured_gaps(sequences: Iterable[Sequence]) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
-def measured_speeds(sequences: Iterable[Sequence], number: int = POINTS) -> np.ndarray:
-    """``(P, 2)`` gaps x_{i+1} - x_i (m) and speeds (m/s) of followers, evenly thinned out to at
-    most ``number`` samples. Speeds that were not measured are central differences.
+def measured_speeds(
+    sequences: Iterable[Sequence], system: System, number: int = POINTS
+) -> np.ndarray:
+    """``(P, 2)`` gaps (m) and speeds (m/s) of followers, evenly thinned out to at most ``number``
+    samples. Speeds that were not measured are central differences.
+
+    A gap is x_{i+1} - x_i, less the length of the vehicle ahead if the model's law takes gaps from
+    bumper to bumper.
 
     Raises:
         DataError: a sequence is not one-dimensional.
     """
     parts = [np.empty((0, 2))]
+    net = "length_1" in getattr(system.formula, "symbols", ())
     for s in sequences:
         gap = measured_gaps([s])
+        if net and s.length is not None and np.isfinite(s.length).any():
+            ahead = np.where(np.isfinite(s.length), s.length, np.nanmean(s.length))[1:]
+            gap = gap - np.tile(ahead, len(s.x))
         speed = s.v if s.v is not None else np.gradient(s.x, s.dt, axis=0)
         parts.append(np.column_stack([gap, speed[:, :-1, 0].ravel()]))
     found = np.concatenate(parts)

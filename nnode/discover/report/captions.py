@@ -97,8 +97,8 @@ def figure(which: str, inputs: Inputs, found: Found, options: DiscoverOptions) -
     """One figure of a diagnosis by its name on the page.
 
     Args:
-        which: ``map`` of the deviations before and after, ``sealed`` for the errors of the held-back
-            sequences, ``coefficients`` of the effects, or ``where`` for deviations by variable.
+        which: ``map`` of the deviations before and after, ``sealed`` for errors of the held-back
+            sequences, ``coefficients`` of the effects, or others that it names.
 
     Raises:
         ConfigError: the diagnosis has no such figure; names those that it has.

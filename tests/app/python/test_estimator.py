@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.stats import norm
 
 import nnode
 from nnode.app.python.inputs import named
@@ -22,6 +23,7 @@ from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError, NotFittedError
 from nnode.model import Traffic, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
+from nnode.plots.traffic import measured_speeds
 from tests.app.conftest import Script
 from tests.app.following import TRUE, pairs, table
 
@@ -314,3 +316,77 @@ def test_models_bear_the_names_of_the_configuration() -> None:
     assert all(named(name)["name"] == name for name in known)
     with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of lin, log"):
         named("lwr")
+
+
+def test_the_summary_agrees_with_the_residuals(fitted: nnode.Calibrator) -> None:
+    run = fitted.result_
+    error = run.residuals().residual
+    fit = run.fit
+    assert fit.observations == len(error)
+    assert fit.rmse == pytest.approx(np.sqrt((error**2).mean()))
+    likely = norm.logpdf(error, scale=np.sqrt((error**2).mean())).sum()
+    assert fit.log_likelihood == pytest.approx(likely)
+    number = len(run.parameters) + 1
+    assert fit.aic == pytest.approx(2 * number - 2 * likely)
+    assert fit.bic == pytest.approx(number * np.log(len(error)) - 2 * likely)
+    first = error.groupby([run.residuals().sequence, run.residuals().agent])
+    pairs = pd.DataFrame({"now": error, "before": first.shift()}).dropna()
+    assert fit.autocorrelation == pytest.approx(
+        (pairs.now @ pairs.before)
+        / np.sqrt((pairs.now @ pairs.now) * (pairs.before @ pairs.before))
+    )
+    assert "RMSE (m)" in run.summary()
+
+
+def test_residuals_leave_out_starts_and_given_leaders(
+    tidy: pd.DataFrame, fitted: nnode.Calibrator
+) -> None:
+    rows = fitted.result_.residuals()
+    starts = tidy.groupby("sequence").time.min()
+    assert (rows.time > rows.sequence.astype(int).map(starts)).all()
+    leaders = tidy.loc[tidy.groupby(["sequence", "time"]).x.idxmax()]
+    given = {*zip(leaders.sequence, leaders.agent, strict=True)}
+    shown = {*zip(rows.sequence.astype(int), rows.agent.astype(int), strict=True)}
+    assert not shown & given
+    assert len(shown) == tidy.groupby("sequence").agent.nunique().sum() - len(given)
+
+
+def test_intervals_of_other_levels(tidy: pd.DataFrame) -> None:
+    run = nnode.fit(tidy, model="idm")
+    both = ["lower", "upper"]
+    pd.testing.assert_frame_equal(
+        run.conf_int(), run.parameters[both].astype(float), check_exact=False, rtol=1e-9
+    )
+    narrow = run.conf_int(0.5)
+    shown = run.parameters.lower.notna()
+    assert shown.any()
+    assert (narrow.lower > run.parameters.lower)[shown].all()
+    assert (narrow.upper < run.parameters.upper)[shown].all()
+    with pytest.raises(ConfigError, match="alpha=5: expected a number between 0 and 1"):
+        run.conf_int(5)
+
+
+def test_the_curve_lies_over_the_data(tidy: pd.DataFrame, fitted: nnode.Calibrator) -> None:
+    figure = fitted.result_.plot()
+    (points,) = (
+        dots for ax in figure.axes for dots in ax.collections if dots.get_gid() == "measured"
+    )
+    gaps = np.asarray(points.get_offsets())[:, 0]
+    x = tidy.pivot_table(index=["sequence", "time"], columns="agent", values="x").to_numpy()
+    between = np.abs(np.diff(np.sort(x, axis=1), axis=1))
+    between = between[np.isfinite(between)]
+    assert (
+        np.abs(np.sort(between)[np.searchsorted(np.sort(between), gaps - 1e-9)] - gaps).max() < 1e-6
+    )
+    assert figure.axes[0].get_ylabel() == "speed W (m/s)"
+
+
+@pytest.mark.parametrize(("law", "shift"), [("lin", 0.0), ("idm", 4.5)])
+def test_points_of_laws_of_net_gaps_leave_out_lengths(
+    tidy: pd.DataFrame, law: str, shift: float
+) -> None:
+    plain = nnode.sequences(tidy.drop(columns="length"))
+    long = nnode.sequences(tidy.assign(length=4.5))
+    model = Traffic([make_law(law)])
+    gaps = measured_speeds(list(plain), model)[:, 0]
+    assert measured_speeds(list(long), model)[:, 0] == pytest.approx(gaps - shift)

@@ -11,6 +11,7 @@ import pytest
 import nnode
 from nnode.app import discover as app
 from nnode.app import nearest_law
+from nnode.errors import ConfigError
 from nnode.model.extend import effects_of
 from tests.app.following import table
 from tests.discover import stand_in
@@ -105,3 +106,16 @@ def test_sequences_and_data_frames_are_diagnosed_alike(tmp_path: Path) -> None:
     assert written.plain()["split"] == of_frame["split"]
     # a data frame is kept as a table, for the commands that the report tells
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "run" / "table.parquet"), tidy)
+
+
+def test_a_report_is_summarised(found: nnode.Report) -> None:
+    text = found.summary()
+    assert text.splitlines()[0] == found.sentence
+    for effect in found.effects:
+        assert all(f"{effect.name}.{name}" in text for name in effect.coefficients)
+
+
+def test_a_report_draws_its_figures(found: nnode.Report) -> None:
+    assert found.plot("coefficients").axes
+    with pytest.raises(ConfigError, match="there is no figure 'heat'; this diagnosis has "):
+        found.plot("heat")
