@@ -1,9 +1,9 @@
 """The diagnosis of lanes where drivers differ: ``python -m benchmarks.drivers --seed N --cases K``.
 
-Every case is 40 platoons of six vehicles for 30 s at 5 Hz, by ``lin`` or ``idm``, in which one
+Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 Hz, by ``lin`` or ``idm``, in which one
 effect is hidden or none. Drivers' parameters are log-normal (``lin``: v0; ``idm``: T and v0) with a
 standard deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of
-0.06 m. Paths are integrated here, in steps of 0.02 s by Euler's method; everything else is the
+``--error`` m. Paths are integrated here, in steps of 0.02 s by Euler's method; everything else is the
 package's public interface. The cases of a run are fixed by its seed. The table has a row per case;
 what is printed last counts them.
 """
@@ -22,8 +22,8 @@ import pandas as pd
 import nnode
 from nnode.discover.options import DiscoverOptions
 
-#: Platoons, vehicles, s, step and sampling interval, s, errors of measurement, m.
-PLATOONS, VEHICLES, SECONDS, STEP, DT, ERROR = 40, 6, 30.0, 0.02, 0.2, 0.06
+#: s, step and sampling interval, s.
+SECONDS, STEP, DT = 30.0, 0.02, 0.2
 #: s that pushes last; their standard deviation by law, m/s and m/s².
 LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06}
 #: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s.
@@ -46,31 +46,40 @@ ZONE = (250.0, 420.0)
 V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
 
 
-def platoons(law: str, effect: str, spread: float, seed: int) -> pd.DataFrame:
+def platoons(
+    law: str,
+    effect: str,
+    spread: float,
+    seed: int,
+    number: int = 40,
+    vehicles: int = 6,
+    error: float = 0.06,
+) -> pd.DataFrame:
     """A tidy table of measured positions, m.
 
     Args:
         effect: a name of :data:`HIDDEN`, or ``none``.
         spread: standard deviation of the logarithms of drivers' parameters.
+        number: of platoons. vehicles: in each. error: of measured positions, m.
     """
     rng = np.random.default_rng(seed)
-    shape, size = (PLATOONS, VEHICLES - 1), HIDDEN[law].get(effect, 0.0)
+    shape, size = (number, vehicles - 1), HIDDEN[law].get(effect, 0.0)
     own_v0, own_t = (np.exp(spread * rng.normal(size=shape)) for _ in range(2))
-    mean, phase = rng.uniform(11, 17, (PLATOONS, 1)), rng.random((PLATOONS, 4))
-    height, period = rng.normal(0, 1.3, (PLATOONS, 4)), np.array([7.0, 13.0, 21.0, 34.0])
+    mean, phase = rng.uniform(11, 17, (number, 1)), rng.random((number, 4))
+    height, period = rng.normal(0, 1.3, (number, 4)), np.array([7.0, 13.0, 21.0, 34.0])
     v0, gap_time = V0 * own_v0, T * own_t
     gap = LENGTH / np.maximum(1 - mean / v0, 0.15)
     if law == "idm":
         gap = CAR + (S0 + mean * gap_time) / np.sqrt(np.maximum(1 - (mean / v0) ** 4, 0.2))
     gap = gap * rng.uniform(0.9, 1.2, shape)
-    x = rng.uniform(0, 300, (PLATOONS, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
-    v, push = np.repeat(mean, VEHICLES, 1), PUSH[law] * rng.normal(size=shape)
+    x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
+    v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
     keep, late = np.exp(-STEP / LASTS), round(size / STEP) if effect == "reaction_delay" else 0
     past: list[tuple[np.ndarray, np.ndarray]] = []
-    slow, rows = np.repeat(mean, VEHICLES - 1, 1), []
+    slow, rows = np.repeat(mean, vehicles - 1, 1), []
     for k in range(round(SECONDS / STEP) + 1):
         if k % round(DT / STEP) == 0:
-            rows.append(x + ERROR * rng.normal(size=x.shape))
+            rows.append(x + error * rng.normal(size=x.shape))
         angle = 2 * np.pi * (k * STEP / period + phase)
         lead = np.maximum(mean[:, 0] + (height * np.sin(angle)).sum(1), 2.0)
         v[:, 0] = lead
@@ -85,7 +94,7 @@ def platoons(law: str, effect: str, spread: float, seed: int) -> pd.DataFrame:
             after = np.maximum(slow + push, 0.0)
             if effect == "relative_speed":
                 ahead = lead
-                for i in range(VEHICLES - 1):
+                for i in range(vehicles - 1):
                     ahead = after[:, i] = after[:, i] + size * (ahead - slow[:, i])
             v = np.column_stack([lead, after])
             x = x + STEP * v
@@ -137,14 +146,20 @@ def _table(law: str, x: np.ndarray) -> pd.DataFrame:
     return pd.DataFrame({k: np.broadcast_to(v, x.shape).ravel() for k, v in columns.items()})
 
 
-def cases(seed: int, number: int, spread: float) -> list[dict[str, Any]]:
-    """Half of them with nothing hidden; laws and effects take turns."""
+def cases(
+    seed: int, number: int, spread: float, laws: list[str], **given: Any
+) -> list[dict[str, Any]]:
+    """Half of them with nothing hidden; laws and effects take turns.
+
+    Args:
+        given: ``number``, ``vehicles`` and ``error`` of :func:`platoons`.
+    """
     found = []
     for k in range(number):
-        law = ("lin", "idm")[k // 2 % 2]
+        law = laws[k // 2 % len(laws)]
         names = list(HIDDEN[law])
-        effect = "none" if k % 2 == 0 else names[k // 4 % len(names)]
-        found.append({"law": law, "effect": effect, "spread": spread, "seed": seed + k})
+        effect = "none" if k % 2 == 0 else names[k // (2 * len(laws)) % len(names)]
+        found.append({"law": law, "effect": effect, "spread": spread, "seed": seed + k} | given)
     return found
 
 
@@ -187,13 +202,26 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True, help="of the first case")
     parser.add_argument("--cases", type=int, default=24)
     parser.add_argument("--spread", type=float, default=15.0, help="between drivers, percent")
+    parser.add_argument("--platoons", type=int, default=40)
+    parser.add_argument("--vehicles", type=int, default=6, help="in a platoon, its leader included")
+    parser.add_argument("--error", type=float, default=0.06, help="of measured positions, m")
+    parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
     given = parser.parse_args()
     given.table.parent.mkdir(parents=True, exist_ok=True)
+    chosen = cases(
+        given.seed,
+        given.cases,
+        given.spread / 100,
+        given.laws,
+        number=given.platoons,
+        vehicles=given.vehicles,
+        error=given.error,
+    )
     rows: list[dict[str, Any]] = []
     with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
-        for row in pool.imap(diagnosed, cases(given.seed, given.cases, given.spread / 100)):
+        for row in pool.imap(diagnosed, chosen):
             rows.append(row)
             pd.DataFrame(rows).to_csv(given.table, index=False)
             print(" ".join(f"{k}={v}" for k, v in row.items()), flush=True)

@@ -21,9 +21,8 @@ from nnode.population.followers import behind_leaders
 #: Errors of positions that are new at every sample, m, between which followers are simulated behind
 #: their own leaders. Below, positions were smoothed or simulated: SUMO's paths at 5 Hz, which have
 #: none, look like errors of 0.011 m, and errors of smoothed positions last, which the likelihood
-#: does not know of. Above, smoothed leaders keep too much: at 5 Hz the share that drivers seem to
-#: look two vehicles ahead, where they do not, is 0.01, 0.03 and 0.08 at errors of 0.06, 0.15 and
-#: 0.3 m before the correction by simulation, and 0.2 is the least that matters.
+#: does not know of. Above, smoothed leaders keep too much: ESIMAS's errors of 0.57 m are taken for
+#: pushes. What the upper limit does is a table in docs/discovery.md.
 NOISE = (0.015, 0.45)
 
 

@@ -94,8 +94,11 @@ def test_sumo_s_drivers_mind_the_speed_ahead(
         f"data.path={drive}",
         "data.window=null",
     )
-    (effect,) = report["effects"]
+    effect, *bounds = report["effects"]
     assert effect["name"] == "asymmetric_response"
+    # SUMO bounds accelerations, which a law of first order does not: a short inertia
+    assert [bound["name"] for bound in bounds] in ([], ["inertia"])
+    assert all(bound["coefficients"]["tau_v"]["value"] < 0.5 for bound in bounds)
     # one kappa for both, its special case, is told apart: they brake harder than they accelerate
     assert effect["alternatives"] == []
     assert report["verdict"] == "named"
@@ -153,8 +156,10 @@ def test_the_stretch_of_longer_times_is_found(
         "data.window=null",
     )
     assert report["verdict"] == "named"
-    (effect,) = report["effects"]
+    effect, *others = report["effects"]
     assert effect["name"] == "speed_zone"
+    # where the stretch begins and ends, SUMO bounds accelerations, which the model does not
+    assert {other["name"] for other in others} <= {"inertia", "time_gap"}
     found = {name: c["value"] for name, c in effect["coefficients"].items()}
     assert found["alpha"] == pytest.approx(by_sumo.TAU / LONGER, abs=0.05)
     assert found["a"] == pytest.approx(STRETCH[0], abs=10)
