@@ -1,11 +1,11 @@
 """The diagnosis of lanes where drivers differ: ``python -m benchmarks.drivers --seed N --cases K``.
 
-Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 Hz, by ``lin`` or ``idm``, in which one
-effect is hidden or none. Drivers' parameters are log-normal (``lin``: v0; ``idm``: T and v0) with a
-standard deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of
-``--error`` m. Paths are integrated here, in steps of 0.02 s by Euler's method; everything else is the
-package's public interface. The cases of a run are fixed by its seed. The table has a row per case;
-what is printed last counts them.
+Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 Hz, by ``lin`` or
+``idm``, in which one effect is hidden or none. Drivers' parameters are log-normal (``lin``: v0;
+``idm``: T and v0) with a standard deviation of ``--spread`` %, pushes last 4 s, and positions are
+measured with errors of ``--error`` m. Paths are integrated here, in steps of 0.02 s by Euler's
+method; everything else is the package's public interface. The cases of a run are fixed by its
+seed. The table has a row per case; what is printed last counts them.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _table(law: str, x: np.ndarray) -> pd.DataFrame:
 
 
 def cases(
-    seed: int, number: int, spread: float, laws: list[str], **given: Any
+    seed: int, total: int, spread: float, laws: list[str], **given: Any
 ) -> list[dict[str, Any]]:
     """Half of them with nothing hidden; laws and effects take turns.
 
@@ -155,7 +155,7 @@ def cases(
         given: ``number``, ``vehicles`` and ``error`` of :func:`platoons`.
     """
     found = []
-    for k in range(number):
+    for k in range(total):
         law = laws[k // 2 % len(laws)]
         names = list(HIDDEN[law])
         effect = "none" if k % 2 == 0 else names[k // (2 * len(laws)) % len(names)]
