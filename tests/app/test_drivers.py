@@ -63,6 +63,13 @@ def test_the_typical_driver_and_every_driver_are_found(
     assert (away.abs() < 2).mean() > 0.8
     assert (drivers["T_shrinkage"] < 0.2).all()
     assert "18 drivers; parameters that differ" in found.summary()
+    usual = found.conf_int()
+    for end in ("lower", "upper"):
+        own = found.parameters[end].to_numpy(dtype=float)
+        assert usual[end].to_numpy() == pytest.approx(own, rel=1e-6, nan_ok=True)
+    assert found.fit.likelihood == "mixed-effects model"
+    assert np.isfinite(found.fit.bic)
+    assert found.drivers.plot().axes[0].get_xlabel() == "T (s)"
 
 
 def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(

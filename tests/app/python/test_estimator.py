@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from scipy.stats import norm
+from scipy.stats import t as students_t
 
 import nnode
 from nnode.app.python.inputs import named
@@ -202,6 +203,14 @@ def test_results_are_shown_and_kept(
     again = nnode.load(run.save(tmp_path / "idm.pt"))
     for name, (value, _) in again.physical().items():
         assert float(value) == run.parameters.estimate[name]
+
+
+def test_intervals_of_a_law_are_symmetric_by_students_quantiles(tidy: pd.DataFrame) -> None:
+    run = nnode.Calibrator("idm").fit(tidy).result_
+    narrow, table = run.conf_int(alpha=0.5), run.parameters
+    half = students_t.ppf(0.75, table["df"]) * table["std_error"]
+    assert (narrow.upper - table.estimate).to_numpy() == pytest.approx(half.to_numpy(), rel=1e-9)
+    assert run.plot().axes[0].get_ylabel() == "equilibrium speed (m/s)"
 
 
 def test_results_are_labelled_arrays(tidy: pd.DataFrame) -> None:

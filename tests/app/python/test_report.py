@@ -76,6 +76,8 @@ def test_nothing_missing_is_an_empty_table() -> None:
     assert found.effects == []
     assert found.to_dataframe().empty
     assert "<table" not in found._repr_html_()
+    (panel, *_) = found.plot().axes
+    assert panel.get_ylabel() == "position along the lane (m)"
 
 
 def test_the_order_of_rows_and_sequences_changes_no_diagnosis() -> None:
