@@ -71,7 +71,7 @@ def test_the_lines_with_scikit_learn(tmp_path: Path) -> None:
     table(platoons=8, seconds=10.0).to_csv(tmp_path / "platoons.csv", index=False)
     script = f"{text}\nassert len(simulated) == 8 * 101 * 3\nprint(list(idm.parameters_))"
     said = in_a_folder(script, tmp_path)
-    assert re.search(r"^idm.T +1\.\d+ +1\.\d+ +1\.\d+ +s ", said, re.M)
+    assert re.search(r"^idm.T +1\.\d+ +1\.\d+ +1\.\d+ +s *$", said, re.M)
     assert "['estimate', 'lower', 'upper', 'unit'" in said
     scores = re.findall(r"-\d+\.\d+", said.partition("\n[")[2].partition("]")[0])
     assert len(scores) == 4
