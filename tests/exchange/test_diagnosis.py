@@ -99,14 +99,16 @@ def test_sumo_s_drivers_mind_the_speed_ahead(
     # SUMO bounds accelerations, which a law of first order does not: a short inertia
     assert [bound["name"] for bound in bounds] in ([], ["inertia"])
     assert all(bound["coefficients"]["tau_v"]["value"] < 0.5 for bound in bounds)
-    # one kappa for both, its special case, is told apart: they brake harder than they accelerate
+    # one kappa for both, its special case, is told apart
     assert effect["alternatives"] == []
     assert report["verdict"] == "named"
     kappa = {name: c["value"] for name, c in effect["coefficients"].items()}
+    # Krauss' drivers have one kappa; a bound on accelerations makes that of opening gaps seem less
     assert kappa["kappa_close"] == pytest.approx(KAPPA, abs=0.06)
-    assert 0.3 < kappa["kappa_open"] < kappa["kappa_close"]
-    assert report["gap"]["closed"] > 0.9
-    assert report["gap"]["after"] < 0.1 * report["gap"]["before"]
+    assert kappa["kappa_open"] == pytest.approx(KAPPA, abs=0.06)
+    # of followers behind measured leaders, each with his most likely start
+    assert report["gap"]["closed"] > 0.8
+    assert report["gap"]["after"] < 0.3 * report["gap"]["before"]
     own = load_checkpoint(tmp_path / "checkpoints" / "best.pt").build()
     assert equilibrium_gap(law(own), MEAN) == pytest.approx(GAP, rel=0.05)
 
