@@ -20,6 +20,8 @@ demo: setup
 	$(BIN)/python scripts/train.py experiment=demo_traffic data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/traffic
 	@echo "== crowd: people in a corridor, forces as networks"
 	$(BIN)/python scripts/train.py experiment=demo_crowd data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/crowd
+	@echo "== what the table of platoons holds"
+	$(BIN)/python scripts/check.py $(DEMO)/raw/platoons.csv
 	@echo "== diagnosis: the linear law on platoons; hidden: a slow zone (speeds x 0.65 from 350 to 450 m),"
 	@echo "   drivers whose speeds differ by 5 %, noise of 0.1 m; 30 % of the platoons are held back"
 	$(BIN)/python scripts/discover.py model=lin model.leader=measured data=table data.domain=traffic \
@@ -33,6 +35,7 @@ demo: setup
 	@echo "runs:        $(DEMO)/traffic/tensorboard $(DEMO)/crowd/tensorboard $(DEMO)/diagnosis/tensorboard"
 	@echo "checkpoints: $(DEMO)/traffic/checkpoints/best.pt $(DEMO)/crowd/checkpoints/best.pt"
 	@echo "force plots: $(DEMO)/traffic/forces/forces.png $(DEMO)/crowd/forces/nn_force_x.png"
+	@echo "a table of your own: $(BIN)/python scripts/check.py mine.csv"
 	@echo "diagnosis:   $(DEMO)/diagnosis/report.html"
 
 # Files of tests side by side, on at most four cores.
