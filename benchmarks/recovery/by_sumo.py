@@ -112,12 +112,14 @@ def write_scene(
         f'<vType id="own" carFollowModel="{follow}" length="{LENGTH}" speedFactor="1" speedDev="0" '
         f'{attributes}/><route id="r" edges="e"/>{"".join(cars)}</routes>'
     )
-    (folder / "a.nod.xml").write_text(
-        f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{ROAD:g}" y="0"/></nodes>'
-    )
-    (folder / "a.edg.xml").write_text(
-        '<edges><edge id="e" from="a" to="b" numLanes="1" speed="60"/></edges>'
-    )
+    nodes = f'<node id="a" x="0" y="0"/><node id="b" x="{ROAD:g}" y="0"/>'
+    network(home, folder, nodes, '<edge id="e" from="a" to="b" numLanes="1" speed="60"/>')
+
+
+def network(home: Path, folder: Path, nodes: str, edges: str) -> Path:
+    """SUMO's network of nodes and edges, XML elements both."""
+    (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "a.edg.xml").write_text(f"<edges>{edges}</edges>")
     call(
         home / "bin" / "netconvert",
         "-n",
@@ -127,6 +129,7 @@ def write_scene(
         "-o",
         folder / "a.net.xml",
     )
+    return folder / "a.net.xml"
 
 
 def _led(command: list[str], home: Path, profile: np.ndarray, steps: int) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import gzip
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+
+from benchmarks.recovery.by_sumo import call, network
 
 #: Of SUMO's passenger car: its own length and gap at rest, m, the time that drivers keep, s, and
 #: their comfortable braking, m/s².
@@ -109,12 +110,6 @@ def measured(path: Path, error: float, seed: int = 0) -> Path:
     return found
 
 
-def call(*arguments: object) -> None:
-    """Run a program that must not fail."""
-    done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 def _roads(home: Path, folder: Path, number: int) -> Path:
     """Parallel straight roads of one lane."""
     nodes = "".join(
@@ -124,18 +119,7 @@ def _roads(home: Path, folder: Path, number: int) -> Path:
     edges = "".join(
         f'<edge id="e{k}" from="a{k}" to="b{k}" numLanes="1" speed="50"/>' for k in range(number)
     )
-    (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (folder / "a.edg.xml").write_text(f"<edges>{edges}</edges>")
-    call(
-        home / "bin" / "netconvert",
-        "-n",
-        folder / "a.nod.xml",
-        "-e",
-        folder / "a.edg.xml",
-        "-o",
-        folder / "a.net.xml",
-    )
-    return folder / "a.net.xml"
+    return network(home, folder, nodes, edges)
 
 
 def _steered(

@@ -221,23 +221,15 @@ def test_a_network_of_speeds(sumo: Path, program: str, tmp_path: Path) -> None:
 
 def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) -> None:
     """A road of two edges of a length, m: two lanes, then so many."""
-    (folder / "a.nod.xml").write_text(
-        f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/>'
-        f'<node id="c" x="{2 * length}" y="0"/></nodes>'
+    nodes = (
+        f'<node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/>'
+        f'<node id="c" x="{2 * length}" y="0"/>'
     )
-    (folder / "a.edg.xml").write_text(
-        f'<edges><edge id="e" from="a" to="b" numLanes="2" speed="{speed}"/>'
-        f'<edge id="f" from="b" to="c" numLanes="{lanes}" speed="{speed}"/></edges>'
+    edges = (
+        f'<edge id="e" from="a" to="b" numLanes="2" speed="{speed}"/>'
+        f'<edge id="f" from="b" to="c" numLanes="{lanes}" speed="{speed}"/>'
     )
-    by_sumo.call(
-        home / "bin" / "netconvert",
-        "-n",
-        folder / "a.nod.xml",
-        "-e",
-        folder / "a.edg.xml",
-        "-o",
-        folder / "a.net.xml",
-    )
+    by_sumo.network(home, folder, nodes, edges)
 
 
 def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.recovery.by_sumo import network
 from nnode.model.effects.lane import EDGE
 from tests.app.following import LONG, STEP, TRUE, idm
 from tests.app.test_replay import held, tracks
-from tests.exchange.by_sumo import call
 from tests.installed import ROOT, Run, built, installed
 
 #: From and to, m, and the desired speed in between, of that elsewhere.
@@ -61,18 +61,8 @@ def platoons(number: int = 30, cars: int = 4, seconds: float = 30.0, seed: int =
 def scenario(sumo: Path, folder: Path) -> None:
     """A road of one lane on which a vehicle drives freely, and three behind it."""
     nodes = '<node id="a" x="0" y="0"/><node id="b" x="1500" y="0"/>'
-    (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     edge = '<edge id="e" from="a" to="b" numLanes="1" speed="60"/>'
-    (folder / "a.edg.xml").write_text(f"<edges>{edge}</edges>")
-    call(
-        sumo / "bin" / "netconvert",
-        "-n",
-        folder / "a.nod.xml",
-        "-e",
-        folder / "a.edg.xml",
-        "-o",
-        folder / "a.net.xml",
-    )
+    network(sumo, folder, nodes, edge)
     cars = "".join(
         f'<vehicle id="c{i}" type="own" route="r" depart="{3 * i}" departPos="{START}" '
         f'departSpeed="{SPEED}" insertionChecks="none"/>'

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.recovery.by_sumo import call, network
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import Faults, SumoOptions, WalkwayOptions
 from nnode.data.prepare import prepare
@@ -24,7 +25,6 @@ from nnode.exchange.trajectories import write_pedpy
 from nnode.model import Crowd, Traffic, make_law
 from nnode.model.term import State
 from tests.app.conftest import Script, forks, script  # noqa: F401
-from tests.exchange.by_sumo import call
 
 ROOM = [(0, 0), (12, 0), (12, 4), (0, 4)]
 PILLAR = [(5.5, 1.8), (6.5, 1.8), (6.5, 2.2), (5.5, 2.2)]
@@ -204,22 +204,9 @@ def test_a_wall_pushes_alike_who_touches_it(jupedsim: ModuleType) -> None:
 def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A straight road of 3 km, as a network for SUMO."""
     folder = tmp_path_factory.mktemp("sumo")
-    (folder / "a.nod.xml").write_text(
-        '<nodes><node id="a" x="0" y="0"/><node id="b" x="3000" y="0"/></nodes>'
-    )
-    (folder / "a.edg.xml").write_text(
-        '<edges><edge id="e" from="a" to="b" numLanes="1" speed="50"/></edges>'
-    )
-    call(
-        sumo / "bin" / "netconvert",
-        "-n",
-        folder / "a.nod.xml",
-        "-e",
-        folder / "a.edg.xml",
-        "-o",
-        folder / "a.net.xml",
-    )
-    return folder / "a.net.xml"
+    nodes = '<node id="a" x="0" y="0"/><node id="b" x="3000" y="0"/>'
+    edge = '<edge id="e" from="a" to="b" numLanes="1" speed="50"/>'
+    return network(sumo, folder, nodes, edge)
 
 
 def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> Path:
