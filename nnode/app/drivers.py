@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import t as students_t
 
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
@@ -239,7 +238,7 @@ def _intervals(
 ) -> tuple[dict[str, Any], dict[str, dict[str, float]], int]:
     """Intervals, correlations and the number of clusters, as
     :func:`nnode.calibrate.intervals.intervals` gives them."""
-    from nnode.calibrate.intervals import LEVEL, VAGUE
+    from nnode.calibrate.intervals import VAGUE
     from nnode.population.intervals import at_bounds, influence
 
     model, theta, paths = found.model, found.estimate.theta, found.model.paths
@@ -249,8 +248,9 @@ def _intervals(
     known, free = influence(found, own)
     low, high = at_bounds(found)
     half = np.full(len(theta), np.inf)
-    degrees = np.ones(len(theta))
-    half[free], degrees[free] = known.half_widths(), known.degrees()
+    error, degrees = half.copy(), half.copy()
+    half[free], error[free] = known.half_widths(), known.standard_errors()
+    degrees[free] = known.degrees()
     if number < 2:
         half[:] = np.inf
     ends = [model.natural(np.clip(theta + s * half, model.low, model.high)) for s in (-1.0, 1.0)]
@@ -260,21 +260,18 @@ def _intervals(
     parameters: dict[str, Any] = {}
     for i, name in enumerate(model.names):
         sure = bool(np.isfinite(half[i]))
-        error = half[i] / students_t.ppf(0.5 + LEVEL / 2, degrees[i])
         parameters[name] = {
             "low": float(ends[0][i]) if sure else None,
             "high": float(ends[1][i]) if sure else None,
-            "std_error": float(error * (value[i] if model.logs[i] else 1.0)) if sure else None,
+            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0)) if sure else None,
             "df": float(degrees[i]) if sure else None,
             "scale": "log" if model.logs[i] else "linear",
             "at_bound": "low" if low[i] else "high" if high[i] else None,
             "identified": sure and bool(ends[1][i] - ends[0][i] < scale[i]) if number > 1 else None,
         }
     table = np.full((len(theta), len(theta)), np.nan)
-    covariance = known.covariance()
-    spread = np.sqrt(np.diag(covariance))
-    spread = np.where((spread > 0) & np.isfinite(half[free]), spread, np.nan)
-    table[np.ix_(free, free)] = covariance / np.outer(spread, spread)
+    if number > 1:
+        table[np.ix_(free, free)] = known.correlation()
     correlation = {
         name: dict(zip(model.names, map(float, line), strict=True))
         for name, line in zip(model.names, table, strict=True)

@@ -94,11 +94,21 @@ class ClusterInfluence:
         total = (own**2 - square**2).sum(0) + (products**2).sum((1, 2))
         return np.maximum(own.sum(0) ** 2 / np.maximum(total, 1e-300), 1.0)
 
+    def standard_errors(self) -> np.ndarray:
+        """``(P,)`` infinite of flat parameters."""
+        return np.where(self.flat, math.inf, np.sqrt(np.diag(self.covariance())))
+
+    def correlation(self) -> np.ndarray:
+        """``(P, P)`` of the estimates; NaN of flat parameters."""
+        error = self.standard_errors()
+        spread = np.where((error > 0) & np.isfinite(error), error, np.nan)
+        found: np.ndarray = self.covariance() / np.outer(spread, spread)
+        return found
+
     def half_widths(self, level: float = LEVEL) -> np.ndarray:
         """``(P,)`` half the width of confidence intervals, by Student's quantiles; infinite of
         flat parameters."""
-        deviation = np.where(self.flat, math.inf, np.sqrt(np.diag(self.covariance())))
-        found: np.ndarray = students_t.ppf(0.5 + level / 2, self.degrees()) * deviation
+        found: np.ndarray = students_t.ppf(0.5 + level / 2, self.degrees()) * self.standard_errors()
         return found
 
     def _weighted(self, power: float, vectors: np.ndarray, least: float) -> np.ndarray:
@@ -151,9 +161,9 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
     free = ~(low | high)
     found, number = influence(problem, row, cluster, free), len(np.unique(cluster))
     half, lost = np.zeros(len(row)), ~free
-    covariance, degrees = found.covariance(), np.ones(len(row))
-    half[free], degrees[free] = found.half_widths(), found.degrees()
-    error = half / students_t.ppf(0.5 + LEVEL / 2, degrees)
+    error, degrees = half.copy(), half.copy()
+    half[free], error[free] = found.half_widths(), found.standard_errors()
+    degrees[free] = found.degrees()
     # with one cluster nothing tells how sure the others are
     lost[free] = found.flat | (len(problem.batch) < 2)
     parameters: dict[str, Any] = {}
@@ -171,9 +181,7 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
             "identified": bool(known and 2 * half[i] < scale) if number > 1 or lost[i] else None,
         }
     table = np.full((len(row), len(row)), np.nan)
-    spread = np.sqrt(np.diag(covariance))
-    spread = np.where((spread > 0) & np.isfinite(half[free]), spread, np.nan)
-    table[np.ix_(free, free)] = covariance / np.outer(spread, spread)
+    table[np.ix_(free, free)] = found.correlation()
     names = dict(zip(problem.names, table, strict=True))
     correlation = {
         name: {
