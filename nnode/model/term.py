@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -217,22 +217,23 @@ def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
     The address is the term's name and the parameter's, ``lin.v0``: whatever other terms there are,
     it stays the same. Of terms of one name the second is numbered, ``speed_zone_2.alpha``.
     """
-    terms = [term for term in module.modules() if isinstance(term, Term) and term.units]
     return {
-        f"{owner}.{name}": (getattr(term, name).detach(), unit)
-        for owner, term in zip(numbered(term.name for term in terms), terms, strict=True)
-        for name, unit in term.units.items()
+        address: (getattr(term, name).detach(), term.units[name])
+        for address, term, name in _declared(module)
     }
 
 
 def physical_bounds(module: nn.Module) -> dict[str, Interval]:
     """Address to the admissible values of every parameter of :func:`physical_parameters`."""
+    return {address: term.bounds.get(name, Interval()) for address, term, name in _declared(module)}
+
+
+def _declared(module: nn.Module) -> Iterator[tuple[str, Term, str]]:
+    """Address, term and name of every declared scalar parameter."""
     terms = [term for term in module.modules() if isinstance(term, Term) and term.units]
-    return {
-        f"{owner}.{name}": term.bounds.get(name, Interval())
-        for owner, term in zip(numbered(term.name for term in terms), terms, strict=True)
-        for name in term.units
-    }
+    for owner, term in zip(numbered(term.name for term in terms), terms, strict=True):
+        for name in term.units:
+            yield f"{owner}.{name}", term, name
 
 
 def numbered(names: Iterable[str]) -> list[str]:
