@@ -6,7 +6,7 @@ import copy
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -151,7 +151,6 @@ class Calibration:
         uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
         seconds: that the training took.
         checkpoint: enough to build the model again, with options, division of the data, versions.
-        fit: how well the model fits the training sequences.
         solver: that simulates the model.
         measured: the sequences of the training and the held-out ones, as the model starts on them.
     """
@@ -178,7 +177,6 @@ class Calibration:
     uncompiled: str
     seconds: float
     checkpoint: Checkpoint
-    fit: Fit
     solver: Solver
     measured: Source
 
@@ -186,6 +184,43 @@ class Calibration:
     def name(self) -> str:
         """Of the model."""
         return str(self.checkpoint.config["model"]["name"])
+
+    @cached_property
+    def fit(self) -> Fit:
+        """How well the model fits the training sequences, which are simulated for it once."""
+        items = self._sequences("train")
+        square, before, after, lagged, agents, samples, dims = 0.0, 0.0, 0.0, 0.0, 0, 0, 1
+        for s, path in zip(items, self._simulated(items), strict=True):
+            error = (s.x - path.x)[1:, _counted(self.model, s)[-1]]
+            dims = error.shape[2]
+            agents, samples = agents + error.shape[1], samples + error.shape[0] * error.shape[1]
+            square += float((error**2).sum())
+            before += float((error[:-1] ** 2).sum())
+            after += float((error[1:] ** 2).sum())
+            lagged += float((error[1:] * error[:-1]).sum())
+        number = max(samples * dims, 1)
+        variance = max(square / number, np.finfo(float).tiny)
+        trained = sum(p.numel() for p in self.model.parameters() if p.requires_grad)
+        label = clusters(self.measured.index)[self._indices("train")]
+        found = Fit(
+            sequences=len(items),
+            agents=agents,
+            observations=number,
+            clusters=len(np.unique(label)),
+            parameters=trained + 1,  # the variance
+            rmse=float(np.sqrt(square / max(samples, 1))),
+            autocorrelation=lagged / np.sqrt(before * after) if before * after > 0 else 0.0,
+            log_likelihood=float(-0.5 * number * (np.log(2 * np.pi * variance) + 1)),
+        )
+        if self.drivers is None:
+            return found
+        return replace(
+            found,
+            observations=self.drivers.observations,
+            parameters=trained + self.drivers.variances,
+            log_likelihood=self.drivers.log_likelihood,
+            likelihood="mixed-effects model",
+        )
 
     def summary(self) -> str:
         """The fit, a table of parameters with intervals of 95 %, and remarks, as text."""
@@ -319,7 +354,7 @@ class Calibration:
         items = self._sequences(part)
         if not items:
             raise DataError("no sequence is held out; fit with heldout=0.2, for example")
-        paths = list(_simulated(self.model, self.solver, items))
+        paths = list(self._simulated(items))
         table, told = (Sequences(them).to_dataframe() for them in (items, paths))
         kept = np.concatenate([_counted(self.model, s).ravel() for s in items])
         found = table[["sequence", "time", "agent"]].copy()
@@ -330,12 +365,19 @@ class Calibration:
             found[name] = table[axis] - told[axis]
         return found[kept].reset_index(drop=True)
 
-    def _sequences(self, part: str) -> list[Sequence]:
-        split = self.checkpoint.split
+    def _indices(self, part: str) -> list[int]:
+        """Where the measured sequences of a part are."""
         if part not in ("train", "heldout"):
             raise ConfigError(f"part={part}: expected train or heldout")
         places = {entry["name"]: i for i, entry in enumerate(self.measured.index)}
-        return [self.measured[places[name]] for name in split.get(part, [])]
+        return [places[name] for name in self.checkpoint.split.get(part, [])]
+
+    def _sequences(self, part: str) -> list[Sequence]:
+        return [self.measured[i] for i in self._indices(part)]
+
+    def _simulated(self, items: list[Sequence]) -> Iterator[Sequence]:
+        dtype = next(self.model.parameters()).dtype
+        return simulated(lambda b: self.solver(self.model, b), items, size=_TOGETHER, dtype=dtype)
 
     def _started(self) -> str:
         """What was done about first speeds that noise makes wrong."""
@@ -498,7 +540,6 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     }
     columns = ["estimate", "lower", "upper", "unit", "at_bound", "identified"]
     columns += ["std_error", "df", "scale"]
-    loaded = cast(SequenceDataset, trainer.train.dataset).store
     correlation = found.get("correlation")
     return Calibration(
         model=model,
@@ -523,53 +564,9 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
         checkpoint=checkpoint,
-        fit=_fit(trainer, model, loaded, drivers),
         solver=trainer.solver,
-        measured=loaded,
+        measured=cast(SequenceDataset, trainer.train.dataset).store,
     )
-
-
-def _fit(trainer: Trainer, model: System, source: Source, drivers: Drivers | None) -> Fit:
-    """How well a model fits the training sequences."""
-    names = set(trainer.provenance.split["train"])
-    places = [i for i, entry in enumerate(source.index) if entry["name"] in names]
-    items = [source[i] for i in places]
-    square, before, after, lagged, agents, samples, dims = 0.0, 0.0, 0.0, 0.0, 0, 0, 1
-    for s, path in zip(items, _simulated(model, trainer.solver, items), strict=True):
-        error = (s.x - path.x)[1:, _counted(model, s)[-1]]
-        dims = error.shape[2]
-        agents, samples = agents + error.shape[1], samples + error.shape[0] * error.shape[1]
-        square += float((error**2).sum())
-        before += float((error[:-1] ** 2).sum())
-        after += float((error[1:] ** 2).sum())
-        lagged += float((error[1:] * error[:-1]).sum())
-    number = max(samples * dims, 1)
-    variance = max(square / number, np.finfo(float).tiny)
-    trained = sum(p.numel() for p in model.parameters() if p.requires_grad)
-    found = Fit(
-        sequences=len(items),
-        agents=agents,
-        observations=number,
-        clusters=len(np.unique(clusters(source.index)[places])),
-        parameters=trained + 1,  # the variance
-        rmse=float(np.sqrt(square / max(samples, 1))),
-        autocorrelation=lagged / np.sqrt(before * after) if before * after > 0 else 0.0,
-        log_likelihood=float(-0.5 * number * (np.log(2 * np.pi * variance) + 1)),
-    )
-    if drivers is None:
-        return found
-    return replace(
-        found,
-        observations=drivers.observations,
-        parameters=trained + drivers.variances,
-        log_likelihood=drivers.log_likelihood,
-        likelihood="mixed-effects model",
-    )
-
-
-def _simulated(model: System, solver: Solver, items: list[Sequence]) -> Iterator[Sequence]:
-    dtype = next(model.parameters()).dtype
-    return simulated(lambda batch: solver(model, batch), items, size=_TOGETHER, dtype=dtype)
 
 
 def _counted(model: System, s: Sequence) -> np.ndarray:
@@ -577,7 +574,7 @@ def _counted(model: System, s: Sequence) -> np.ndarray:
     leader that is given as it was measured."""
     counted = np.ones(s.x.shape[:2], dtype=bool)
     counted[0] = False
-    if getattr(model, "leader", "constant") == "measured":
+    if model.leader_measured:
         counted[:, -1] = False
     return counted
 

@@ -127,7 +127,7 @@ def write_replay(
     shown = indices[:: -(-len(indices) // MOST)]
     real = [store[i] for i in shown]
     found = simulated_by(simulate, real, dtype=dtype, device=device)
-    led = getattr(model, "leader", "constant") == "measured"
+    led = model.leader_measured
     scenes = [Scene(s, {name: x.x}, led=led) for s, x in zip(real, found, strict=True)]
     zones = [zone for one in effects_of(model) if (zone := _zone(one)) is not None]
     block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), zones, len(indices))

@@ -111,6 +111,11 @@ class System(nn.Module):
         """``(B, N)`` True for agents that follow their measured paths; None: there is none."""
         return None
 
+    @property
+    def leader_measured(self) -> bool:
+        """Whether the first vehicle of every sequence follows its measured path."""
+        return False
+
     def _terms(self) -> list[Term]:
         return cast(list[Term], list(self.terms))
 
@@ -224,7 +229,7 @@ class Traffic(System):
         return [torch.stack(list(found.values()), -1)]
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
-        place = scene.measured_at(t) if self.leader == "measured" else None
+        place = scene.measured_at(t) if self.leader_measured else None
         return self.rates_behind(t, y, scene, place)
 
     def rates_behind(self, t: Tensor, y: Tensor, scene: Scene, place: Tensor | None) -> Tensor:
@@ -255,7 +260,7 @@ class Traffic(System):
 
     def _imposed(self, rate: Tensor, state: State) -> Tensor:
         # of no account for laws of the gap, but effects look at the speed of the vehicle ahead
-        if self.leader == "constant" or len(self.terms) == 1:
+        if not self.leader_measured or len(self.terms) == 1:
             return rate
         speed = state.scene.measured_rate_at(state.t)
         return torch.where(state.scene.leader[..., None], speed, rate)
@@ -268,8 +273,12 @@ class Traffic(System):
         lead = given[..., None]
         return torch.where(lead, batch.x, x), None if v is None else torch.where(lead, batch.v, v)
 
+    @property
+    def leader_measured(self) -> bool:
+        return self.leader == "measured"
+
     def given(self, batch: Batch) -> Tensor | None:
-        if self.leader == "constant":
+        if not self.leader_measured:
             return None
         index = torch.arange(batch.agent.shape[1], device=batch.agent.device)
         return index == (batch.agent.sum(1) - 1)[:, None]

@@ -154,7 +154,7 @@ def speed_curves(
     leaders = {
         name: float(follow_law(system).get_parameter("v0").detach())
         for name, system in models.items()
-        if getattr(system, "leader", "constant") == "constant" and system.order == 1
+        if not system.leader_measured and system.order == 1
     }
     if gaps is None:
         figure = new_figure(6.4, 4.0)

@@ -74,7 +74,7 @@ class RightHandSide:
                 wide = {name: value[:, None, None] for name, value in several.items()}
                 self.added = with_parameters(terms[-1], wide)
         self._every: dict[int, Scene] = {}
-        self.measured = getattr(system, "leader", "constant") == "measured"
+        self.measured = system.leader_measured
         self.leads = _rows(scene.leader.T)
         last = (scene.agent.sum(1) - 1)[None, :, None]
         self._path = [

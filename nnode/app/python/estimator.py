@@ -155,7 +155,7 @@ class Calibrator:
         with threads_given_back():
             set_threads(None, model.domain)
             items = simulated(lambda b: solver(model, b), given, size=_TOGETHER, dtype=dtype)
-            led = getattr(model, "leader", "constant") == "measured"
+            led = model.leader_measured
             return Sequences(items, {"simulated": self.result_.name, "led": led})
 
     def score(self, X: Any, y: object = None) -> float:

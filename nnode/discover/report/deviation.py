@@ -104,7 +104,7 @@ def deviation(system: System, sequences: list[Sequence], step: float | None = No
     pieces = [piece for s in sequences for piece in _pieces(s, system)]
     pieces = pieces[:: max(1, -(-len(pieces) // MOST[system.domain]))]
     measure = _traffic if system.domain == "traffic" else _crowd
-    led = getattr(system, "leader", "constant") == "measured"
+    led = system.leader_measured
     parts = [
         measure(s, x, s.n_agents - led)
         for s, x in zip(pieces, simulate(system, pieces, step), strict=True)

@@ -295,7 +295,7 @@ class LeaderSpeed(LaneEffect):
 
     @classmethod
     def applies(cls, batch: Batch, system: System) -> bool:
-        return isinstance(system, Traffic) and system.leader == "constant"
+        return isinstance(system, Traffic) and not system.leader_measured
 
 
 @CATALOGUE.add

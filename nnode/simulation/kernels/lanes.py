@@ -335,7 +335,7 @@ def supports(system: System, batch: Batch) -> LaneDynamics | None:
     """The formula of a model that is simulated in compiled code; None: it is not."""
     if batch.x.device.type != "cpu" or type(system) is not Traffic:
         return None
-    if system.leader == "measured" and batch.x.requires_grad:
+    if system.leader_measured and batch.x.requires_grad:
         return None  # measured positions are constants here
     lane = system.formula
     return lane if lane is not None and lane.is_formula else None
@@ -377,7 +377,7 @@ def simulate(
         y0 = torch.stack([initial_with(system, own, batch, step) for own in every])
     y0 = y0.to(batch.x.dtype).permute(3, 0, 1, 2)
     simulations, agents = y0.shape[2:]
-    if system.leader == "measured":  # which carries no gradient
+    if system.leader_measured:  # which carries no gradient
         last = torch.arange(agents) == (batch.agent.sum(1) - 1)[:, None]
         y0 = torch.where(last, y0.detach(), y0)
     own = runs > 1 and (agents - 1) * simulations < _ENOUGH
@@ -489,7 +489,7 @@ def _planned(
         inputs["start"] = batch.start[:, None].expand(-1, agents)
     fields = [tiled(inputs[name].to(x.dtype)) for name in source.fields]
     path = x.new_empty(2, 0, 0)
-    if system.leader == "measured" or source.measured:
+    if system.leader_measured or source.measured:
         lead = (batch.agent.sum(1) - 1)[None, None, :, None].expand(2, samples, -1, 1)
         path = torch.stack([x[..., 0], batch.v.detach()[..., 0]]).gather(3, lead)
         path = path[..., 0].repeat(1, 1, runs)
@@ -507,7 +507,7 @@ def _planned(
         constants=(
             substeps,
             x.new_tensor(batch.dt / substeps).numpy()[()],
-            x.new_tensor(float(system.leader == "constant")).numpy()[()],
+            x.new_tensor(float(not system.leader_measured)).numpy()[()],
             np.stack(fields) if fields else np.zeros((0, 1, 1), x.numpy().dtype),
             tiled(batch.agent.sum(1)),
             tiled(substeps * (batch.valid.any(-1).sum(0) - 1)),
