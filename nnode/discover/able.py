@@ -22,7 +22,7 @@ from nnode.population.followers import behind_leaders
 #: their own leaders. Below, positions were smoothed or simulated: SUMO's paths at 5 Hz, which have
 #: none, look like errors of 0.011 m, and errors of smoothed positions last, which the likelihood
 #: does not know of. Above, smoothed leaders keep too much: ESIMAS's errors of 0.57 m are taken for
-#: pushes. What the upper limit does is a table in docs/discovery.md.
+#: pushes. A table in docs/discovery.md compares both ways at errors below the upper limit.
 NOISE = (0.015, 0.45)
 
 

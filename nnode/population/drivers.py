@@ -42,8 +42,8 @@ START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 LONGEST, TOLERANCE = 0.3, 1e-2
 #: At most so many parameters are estimated to differ before the best is chosen.
 RANKED = 2
-#: Linearisations of each until then. Most estimates converge in fewer; those that do not are of
-#: parameters that hardly differ, and the chosen one is continued.
+#: Linearisations of each of these before the best is chosen. Most estimates converge in fewer; the
+#: search for the chosen one is continued if it did not.
 RANKING_STEPS = 15
 #: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
 #: estimate's standard error.

@@ -232,8 +232,8 @@ def _predict(
     before: np.ndarray,
     half: np.ndarray,
 ) -> None:
-    """The state one sample later: mean and covariance are replaced; ``before`` and ``half`` are
-    memory of their sizes."""
+    """The state one sample later: mean and covariance are replaced. ``before`` and ``half`` are
+    work arrays of the sizes of ``mean`` and ``spread``."""
     n, width = mean.shape
     for i in range(n):
         for c in range(width):
@@ -265,8 +265,8 @@ def _condition(
     white: np.ndarray,
     gain: np.ndarray,
 ) -> float:
-    """The state after a sample: mean and covariance are replaced, ``white`` is filled; ``gain`` is
-    memory of its size.
+    """The state after a sample: mean and covariance are replaced, ``white`` is filled. ``gain`` is
+    a work array of as many numbers as the state has.
 
     Returns:
         The logarithm of the innovation's variance.
