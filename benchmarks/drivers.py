@@ -1,11 +1,12 @@
 """The diagnosis of lanes where drivers differ: ``python -m benchmarks.drivers --seed N --cases K``.
 
 Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 Hz, by ``lin`` or
-``idm``, in which one effect is hidden or none. Drivers' parameters are log-normal (``lin``: v0;
-``idm``: T and v0) with a standard deviation of ``--spread`` %, pushes last 4 s, and positions are
-measured with errors of ``--error`` m. Paths are integrated here, in steps of 0.02 s by Euler's
-method; everything else is the package's public interface. The cases of a run are fixed by its
-seed. The table has a row per case; what is printed last counts them.
+``idm``, in which one effect is hidden or none, or two with ``--pairs``. Drivers' parameters are
+log-normal (``lin``: v0; ``idm``: T and v0) with a standard deviation of ``--spread`` %, pushes last
+4 s, and positions are measured with errors of ``--error`` m. ``--nature`` departs from this. Paths
+are integrated here, in steps of 0.02 s by Euler's method; everything else is the package's public
+interface. The cases of a run are fixed by its seed. The table has a row per case; what is printed
+last counts them.
 """
 
 from __future__ import annotations
@@ -42,6 +43,15 @@ HIDDEN = {
         "reaction_delay": 0.6,
     },
 }
+#: Two effects that are hidden at once.
+PAIRS = {
+    "lin": ["speed_zone+relative_speed", "multi_anticipation+inertia", "speed_zone+reaction_delay"],
+    "idm": ["speed_zone+relative_speed", "speed_zone+multi_anticipation"],
+}
+#: What departs from the assumptions: desired speeds that vary by 8 % over 30 s, drivers of a skewed
+#: distribution (gamma), pushes with heavy tails (Student's t of four degrees of freedom), errors of
+#: measurement that last for 1 s.
+NATURES = ("plain", "moods", "skewed", "heavy", "lasting")
 ZONE = (250.0, 420.0)
 V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
 
@@ -54,17 +64,19 @@ def platoons(
     number: int = 40,
     vehicles: int = 6,
     error: float = 0.06,
+    nature: str = "plain",
 ) -> pd.DataFrame:
     """A tidy table of measured positions, m.
 
     Args:
-        effect: a name of :data:`HIDDEN`, or ``none``.
+        effect: a name of :data:`HIDDEN`, several with ``+`` between, or ``none``.
         spread: standard deviation of the logarithms of drivers' parameters.
         number: of platoons. vehicles: in each. error: of measured positions, m.
+        nature: one of :data:`NATURES`.
     """
     rng = np.random.default_rng(seed)
-    shape, size = (number, vehicles - 1), HIDDEN[law].get(effect, 0.0)
-    own_v0, own_t = (np.exp(spread * rng.normal(size=shape)) for _ in range(2))
+    shape, sizes = (number, vehicles - 1), _sizes(law, effect)
+    own_v0, own_t = (_factors(rng, spread, shape, nature) for _ in range(2))
     mean, phase = rng.uniform(11, 17, (number, 1)), rng.random((number, 4))
     height, period = rng.normal(0, 1.3, (number, 4)), np.array([7.0, 13.0, 21.0, 34.0])
     v0, gap_time = V0 * own_v0, T * own_t
@@ -74,49 +86,90 @@ def platoons(
     gap = gap * rng.uniform(0.9, 1.2, shape)
     x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
     v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
-    keep, late = np.exp(-STEP / LASTS), round(size / STEP) if effect == "reaction_delay" else 0
+    keep, late = np.exp(-STEP / LASTS), round(sizes.get("reaction_delay", 0.0) / STEP)
+    mood, kick = np.zeros(shape), np.zeros((number, vehicles))
     past: list[tuple[np.ndarray, np.ndarray]] = []
     slow, rows = np.repeat(mean, vehicles - 1, 1), []
     for k in range(round(SECONDS / STEP) + 1):
         if k % round(DT / STEP) == 0:
-            rows.append(x + error * rng.normal(size=x.shape))
+            kick = _error(rng, kick, nature)
+            rows.append(x + error * kick)
         angle = 2 * np.pi * (k * STEP / period + phase)
         lead = np.maximum(mean[:, 0] + (height * np.sin(angle)).sum(1), 2.0)
         v[:, 0] = lead
         past = [*past, (x, v.copy())][-late - 1 :]
         at, speed = past[0] if late else (x, v)
         wish = v0.copy()
-        if effect == "speed_zone":
-            wish[(x[:, 1:] > ZONE[0]) & (x[:, 1:] < ZONE[1])] *= size
+        if nature == "moods":
+            mood = _lasting(rng, mood, 30.0)
+            wish = v0 * np.exp(0.08 * mood)
+        if "speed_zone" in sizes:
+            wish[(x[:, 1:] > ZONE[0]) & (x[:, 1:] < ZONE[1])] *= sizes["speed_zone"]
         if law == "lin":
-            wanted = _wanted(at, wish, effect, size)
-            slow = slow + STEP / size * (wanted - slow) if effect == "inertia" else wanted
+            wanted, late_by = _wanted(at, wish, sizes), sizes.get("inertia", STEP)
+            slow = slow + STEP / late_by * (wanted - slow)
             after = np.maximum(slow + push, 0.0)
-            if effect == "relative_speed":
+            if "relative_speed" in sizes:
                 ahead = lead
                 for i in range(vehicles - 1):
-                    ahead = after[:, i] = after[:, i] + size * (ahead - slow[:, i])
+                    more = sizes["relative_speed"] * (ahead - slow[:, i])
+                    ahead = after[:, i] = after[:, i] + more
             v = np.column_stack([lead, after])
             x = x + STEP * v
         else:
-            rate = _rate(at, speed, wish, gap_time, effect, size) + push
+            rate = _rate(at, speed, wish, gap_time, sizes) + push
             after = np.maximum(v[:, 1:] + STEP * np.clip(rate, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
-        push = keep * push + PUSH[law] * np.sqrt(1 - keep**2) * rng.normal(size=shape)
+        shock = rng.normal(size=shape)
+        if nature == "heavy":
+            shock = rng.standard_t(4, size=shape) / np.sqrt(2.0)
+        push = keep * push + PUSH[law] * np.sqrt(1 - keep**2) * shock
     return _table(law, np.array(rows))
 
 
-def _wanted(x: np.ndarray, v0: np.ndarray, effect: str, size: float) -> np.ndarray:
+def _sizes(law: str, effect: str) -> dict[str, float]:
+    """Of the effects that are hidden."""
+    return {name: HIDDEN[law][name] for name in effect.split("+") if name != "none"}
+
+
+def _factors(
+    rng: np.random.Generator, spread: float, shape: tuple[int, int], nature: str
+) -> np.ndarray:
+    """Drivers' factors on a parameter."""
+    if nature != "skewed":
+        return np.asarray(np.exp(spread * rng.normal(size=shape)))
+    return np.asarray(
+        rng.gamma(2.0, size=shape) / np.sqrt(2.0) * spread + 1 - spread * np.sqrt(2.0)
+    )
+
+
+def _lasting(rng: np.random.Generator, now: np.ndarray, lasts: float) -> np.ndarray:
+    """The next value, one step later, of something of variance 1 that lasts so many s."""
+    keep = np.exp(-STEP / lasts)
+    return np.asarray(keep * now + np.sqrt(1 - keep**2) * rng.normal(size=now.shape))
+
+
+def _error(rng: np.random.Generator, before: np.ndarray, nature: str) -> np.ndarray:
+    """The error of the next sample, of variance 1."""
+    keep = np.exp(-DT) if nature == "lasting" else 0.0
+    return np.asarray(keep * before + np.sqrt(1 - keep**2) * rng.normal(size=before.shape))
+
+
+def _wanted(x: np.ndarray, v0: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
     gap = np.maximum(x[:, :-1] - x[:, 1:], 0.6 * LENGTH)
     found = v0 * (1 - LENGTH / gap)
-    if effect == "multi_anticipation":
+    if size := sizes.get("multi_anticipation"):
         found[:, 1:] += size * (v0[:, 1:] * (1 - LENGTH / gap[:, :-1]) - found[:, 1:])
     return found
 
 
 def _rate(
-    x: np.ndarray, v: np.ndarray, v0: np.ndarray, gap_time: np.ndarray, effect: str, size: float
+    x: np.ndarray,
+    v: np.ndarray,
+    v0: np.ndarray,
+    gap_time: np.ndarray,
+    sizes: dict[str, float],
 ) -> np.ndarray:
     own, ahead, gap = v[:, 1:], v[:, :-1], np.maximum(x[:, :-1] - x[:, 1:] - CAR, 0.3)
 
@@ -127,9 +180,9 @@ def _rate(
         return found
 
     found = law(gap, ahead, slice(None))
-    if effect == "relative_speed":
+    if size := sizes.get("relative_speed"):
         found += size * (ahead - own)
-    if effect == "multi_anticipation":
+    if size := sizes.get("multi_anticipation"):
         second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
         found[:, 1:] += size * (law(second, v[:, :-2], slice(1, None)) - found[:, 1:])
     return found
@@ -147,17 +200,18 @@ def _table(law: str, x: np.ndarray) -> pd.DataFrame:
 
 
 def cases(
-    seed: int, total: int, spread: float, laws: list[str], **given: Any
+    seed: int, total: int, spread: float, laws: list[str], pairs: bool = False, **given: Any
 ) -> list[dict[str, Any]]:
     """Half of them with nothing hidden; laws and effects take turns.
 
     Args:
-        given: ``number``, ``vehicles`` and ``error`` of :func:`platoons`.
+        pairs: two effects are hidden at once.
+        given: ``number``, ``vehicles``, ``error`` and ``nature`` of :func:`platoons`.
     """
     found = []
     for k in range(total):
         law = laws[k // 2 % len(laws)]
-        names = list(HIDDEN[law])
+        names = PAIRS[law] if pairs else list(HIDDEN[law])
         effect = "none" if k % 2 == 0 else names[k // (2 * len(laws)) % len(names)]
         found.append({"law": law, "effect": effect, "spread": spread, "seed": seed + k} | given)
     return found
@@ -174,8 +228,13 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
     ).plain()
     names = [one["name"] for one in found["effects"]]
     others = {other["name"] for one in found["effects"] for other in one["alternatives"]}
-    hidden = {case["effect"]} - {"none"}
-    values = [one["coefficients"] for one in found["effects"] if one["name"] in hidden]
+    sizes = _sizes(case["law"], case["effect"])
+    hidden = set(sizes)
+    values = {
+        one["name"]: next(iter(one["coefficients"].values()))["value"]
+        for one in found["effects"]
+        if one["name"] in hidden
+    }
     drivers = {one["name"]: one for one in found["drivers"]}
     return {
         **case,
@@ -187,8 +246,8 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
         and found["verdict"] == ("named" if hidden else "none"),
         "among": hidden <= set(names) | others,
         "false": bool(set(names) - hidden),
-        "size": HIDDEN[case["law"]].get(case["effect"], np.nan),
-        "estimate": next(iter(values[0].values()))["value"] if values else np.nan,
+        "size": " ".join(f"{size:g}" for size in sizes.values()),
+        "estimate": " ".join(f"{values[name]:.3g}" if name in values else "-" for name in sizes),
         **{
             f"{name} (%)": round(drivers[name]["estimate"], 1) if name in drivers else 0.0
             for name in ("v0", "T")
@@ -205,6 +264,8 @@ def main() -> None:
     parser.add_argument("--platoons", type=int, default=40)
     parser.add_argument("--vehicles", type=int, default=6, help="in a platoon, its leader included")
     parser.add_argument("--error", type=float, default=0.06, help="of measured positions, m")
+    parser.add_argument("--pairs", action="store_true", help="two effects at once")
+    parser.add_argument("--nature", default="plain", choices=NATURES)
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
@@ -218,6 +279,8 @@ def main() -> None:
         number=given.platoons,
         vehicles=given.vehicles,
         error=given.error,
+        pairs=given.pairs,
+        nature=given.nature,
     )
     rows: list[dict[str, Any]] = []
     with multiprocessing.get_context("spawn").Pool(given.processes) as pool:

@@ -315,8 +315,11 @@ def _looked_for(
             "the model cannot be simulated on these data: it blows up from its own parameters and "
             "from those near the measured rates; start from others, or look at the data"
         )
+    hints = [] if hint is None else [hint]
     if isinstance(engine, FollowersEngine):
-        engine.settle_among([*wider(engine, start, effects), start.system])
+        likely = wider(engine, start, effects)
+        engine.settle_among([*likely, start.system])
+        hints += likely
         base = refine(engine, start.system)
     else:
         base = settled(engine, start.system)
@@ -339,7 +342,7 @@ def _looked_for(
         variables=variables,
         levels=_levels(engine, effects),
         within=stages.within,
-        hint=hint,
+        hints=hints,
     )
     # what a missing effect leaves is common to all clusters: only what the search leaves tells
     tested = simultaneous(engine, found.fit, options.seed)

@@ -71,23 +71,22 @@ class Candidate:
 
 
 def calibrated(
-    engine: Engine, before: Fit, score: Score, hopeless: float, hint: System | None = None
+    engine: Engine, before: Fit, score: Score, hopeless: float, hints: list[System] | None = None
 ) -> Fit:
-    """The model with one more effect, from where its score found it and from a hint.
+    """The model with one more effect, from where its score found it and from hints.
 
     Args:
         hopeless: see :func:`~nnode.discover.residuals.fit.refine`.
-        hint: the extended model with other parameters.
+        hints: the extended model with other parameters.
 
     Raises:
         SimulationError: it blows up.
     """
     system, place = extended(before.system, score.effect(**score.options))
     fits = []
-    for start in (system, hint):
+    for start in (system, *(hints or [])):
         try:
-            if start is not None:
-                fits.append(refine(engine, start, tolerance=ROUGH, hopeless=hopeless))
+            fits.append(refine(engine, start, tolerance=ROUGH, hopeless=hopeless))
         except SimulationError:
             continue
     if not fits:

@@ -116,7 +116,7 @@ def search(
     variables: list[Variable] | None = None,
     levels: dict[str, np.ndarray] | None = None,
     within: Callable[[float], None] = lambda part: None,
-    hint: System | None = None,
+    hints: list[System] | None = None,
 ) -> Search:
     """Forwards until no effect passes, then backwards.
 
@@ -135,8 +135,8 @@ def search(
         levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser
             than the engine's.
         within: is told, now and then, about which part of the search is done.
-        hint: the model with effects that another law lacks, calibrated: their calibration begins
-            from there as well.
+        hints: models with effects, calibrated: the calibration of these effects begins from there
+            as well.
     """
     found, levels = Search(fit), levels or {}
     doubtful: Search | None = None  # as it was before an effect that a curve outdoes
@@ -145,7 +145,7 @@ def search(
         found.first = found.first or found.scores
         if len(found.steps) >= most:
             break
-        step = _round(engine, found, alpha, hint)
+        step = _round(engine, found, alpha, hints or [])
         if step is None:
             break
         if _outdone(engine, found.fit, step.chosen, variables or []):
@@ -215,7 +215,7 @@ def _columns(known: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
     return known[id(fit)]
 
 
-def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> Step | None:
+def _round(engine: Engine, found: Search, alpha: float, hints: list[System]) -> Step | None:
     scores, screen = found.scores, found.screen
     assert screen is not None
     if not scores:
@@ -224,10 +224,10 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
     shown = min(score.p_value for score in scores) <= alpha
     if not shown and isinstance(engine, FollowersEngine):
         return None  # strong effects show in the variances of the likeliest model
-    hinted = set() if hint is None else {effect.name for effect in effects_of(hint)}
+    hinted = {effect.name for hint in hints for effect in effects_of(hint)}
     tried = [s for s in scores if s.gain >= rules().rival * scores[0].gain][:RIVALS]
     tried += [score for score in scores if score.effect.name in hinted and score not in tried]
-    candidates = _in_order(engine, found, tried, hint, shown)
+    candidates = _in_order(engine, found, tried, hints, shown)
     good = [
         c
         for c in candidates
@@ -250,7 +250,7 @@ def _round(engine: Engine, found: Search, alpha: float, hint: System | None) -> 
 
 
 def _in_order(
-    engine: Engine, found: Search, tried: list[Score], hint: System | None, shown: bool
+    engine: Engine, found: Search, tried: list[Score], hints: list[System], shown: bool
 ) -> list[Candidate]:
     """Effects calibrated with the model, the best first; none where nothing is left to explain.
 
@@ -265,9 +265,9 @@ def _in_order(
         return []
     for score in tried:
         least = min((c.fit.cost for c in candidates), default=0.0)
-        start = _hinted(hint, found.fit.system, score.effect.name)
+        starts = _hinted(hints, found.fit.system, score.effect.name)
         try:
-            fit = calibrated(engine, found.fit, score, least, start)
+            fit = calibrated(engine, found.fit, score, least, starts)
         except SimulationError:
             continue
         removed = (square - square_of(engine, fit.system)) / found.square
@@ -316,13 +316,14 @@ def apart_at(one: Candidate, other: Candidate) -> float:
     return rules().sure if group and group == other.score.effect.confusable_group else rules().level
 
 
-def _hinted(hint: System | None, system: System, name: str) -> System | None:
-    """The hint with the effects that a model has and one more; None where it lacks any."""
-    wanted = {effect.name for effect in effects_of(system)} | {name}
-    known = set() if hint is None else {effect.name for effect in effects_of(hint)}
-    if hint is None or not wanted <= known:
-        return None
-    return without(hint, *(known - wanted))
+def _hinted(hints: list[System], system: System, name: str) -> list[System]:
+    """Hints that have all effects of a model and one more, each without its other effects."""
+    wanted, starts = {effect.name for effect in effects_of(system)} | {name}, []
+    for hint in hints:
+        known = {effect.name for effect in effects_of(hint)}
+        if wanted <= known:
+            starts.append(without(hint, *(known - wanted)))
+    return starts
 
 
 def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:

@@ -23,18 +23,19 @@ def lin(*effects: dict[str, Any]) -> System:
     return build_model({**model_options("lin", "measured"), "effects": list(effects)}, 0)
 
 
-def names(system: System | None) -> set[str] | None:
-    return None if system is None else {effect.name for effect in effects_of(system)}
+def names(*hints: System) -> list[set[str]]:
+    return [{effect.name for effect in effects_of(hint)} for hint in hints]
 
 
 def test_a_hint_has_the_model_s_effects_and_one_more() -> None:
     hint = lin(ZONE, LATE)
-    assert names(_hinted(hint, lin(), "speed_zone")) == {"speed_zone"}
-    assert names(_hinted(hint, lin(LATE), "speed_zone")) == {"speed_zone", "reaction_delay"}
-    assert _hinted(hint, lin(), "inertia") is None
-    assert _hinted(hint, lin({"name": "inertia", "tau_v": 0.5}), "speed_zone") is None
-    assert _hinted(None, lin(), "speed_zone") is None
-    assert names(hint) == {"speed_zone", "reaction_delay"}
+    assert names(*_hinted([hint, lin(LATE)], lin(), "speed_zone")) == [{"speed_zone"}]
+    assert names(*_hinted([hint], lin(LATE), "speed_zone")) == [{"speed_zone", "reaction_delay"}]
+    assert names(*_hinted([hint, lin(LATE)], lin(), "reaction_delay")) == 2 * [{"reaction_delay"}]
+    assert not _hinted([hint], lin(), "inertia")
+    assert not _hinted([hint], lin({"name": "inertia", "tau_v": 0.5}), "speed_zone")
+    assert not _hinted([], lin(), "speed_zone")
+    assert names(hint) == [{"speed_zone", "reaction_delay"}]
 
 
 def score() -> Any:
@@ -59,7 +60,7 @@ def test_the_better_of_two_starts_counts(
     monkeypatch.setattr(candidate, "refine", refine)
     engine: Any = None
     before: Any = SimpleNamespace(system=lin())
-    assert candidate.calibrated(engine, before, score(), 0.0, hint).cost == best
+    assert candidate.calibrated(engine, before, score(), 0.0, [hint]).cost == best
 
 
 def test_two_starts_that_blow_up_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,14 +52,14 @@ DV = -np.diff(SPEEDS)
 @pytest.mark.parametrize(
     ("effect", "expected"),
     [
-        # places 0, 20 and 51 m; edges of a zone are 12 m wide
+        # places 0, 20 and 51 m; edges of a zone are 6 m wide
         (
             {"name": "speed_zone", "alpha": 0.6, "a": 10.0, "b": 35.0},
             [BARE[0], idm(1, P, v0=0.6 * P.v0), BARE[2]],
         ),
         (
             {"name": "speed_zone", "alpha": 0.6, "a": 20.0, "b": 90.0},  # half inside
-            [BARE[0], idm(1, P, v0=0.8 * P.v0), idm(2, P, v0=0.6 * P.v0)],
+            [BARE[0], idm(1, P, v0=P.v0 / ((1 + 1 / 0.6) / 2)), idm(2, P, v0=0.6 * P.v0)],
         ),
         (
             {"name": "slope", "grade": 0.04, "a": 10.0, "b": 35.0},
