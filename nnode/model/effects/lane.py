@@ -26,10 +26,10 @@ from nnode.model.term import Interval
 from nnode.model.terms import Rule
 
 #: A zone begins and ends over this distance, m, and a period over this time, s, so that errors are
-#: differentiable in their ends. In a zone, the time per metre changes linearly: passing the edge takes
-#: as long as if it were sharp. Beside sharp edges at 350 and 450 m with alpha 0.65, platoons of
-#: :mod:`nnode.data.synthetic.platoons` gave 350.2, 449.8, 0.648 with 12 m; 350.0, 450.0, 0.650 with
-#: 6 m and with 3 m.
+#: differentiable in their ends. In a zone, the time per metre changes linearly: passing the edge
+#: takes as long as if it were sharp. Beside sharp edges at 350 and 450 m with alpha 0.65, platoons
+#: of :mod:`nnode.data.synthetic.platoons` gave 350.2, 449.8 and 0.648 with 12 m; 350.0, 450.0 and
+#: 0.650 with 6 m and with 3 m.
 EDGE = {"m": 6.0, "s": 1.0}
 #: So many cells of a road or a time are looked at one by one.
 CELLS = 32
