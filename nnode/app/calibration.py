@@ -589,7 +589,7 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     if drivers == NONE:
         return None
     names = trainer.provenance.split["train"]
-    if drivers == AUTO:
+    if drivers in (None, AUTO):
         rmse = _metrics(trainer, trainer.model, "train").rmse
         if rmse <= EXACT:
             log.info(
@@ -604,14 +604,26 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     seed, row = int(trainer.provenance.config["seed"]), trainer.history[0]
     known = {name: row.get(f"parameters/{name}") for name in trainer.model.physical()}
     first = {name: value for name, value in known.items() if value is not None}
-    return calibrated_drivers(
-        copy.deepcopy(trainer.model).cpu(),
-        first,
-        [store[i] for i in indices],
-        drivers,
-        clusters(store.index)[indices],
-        seed,
-    )
+    try:
+        found = calibrated_drivers(
+            copy.deepcopy(trainer.model).cpu(),
+            first,
+            [store[i] for i in indices],
+            drivers or AUTO,
+            clusters(store.index)[indices],
+            seed,
+        )
+    except ConfigError:
+        if drivers is not None:
+            raise
+        found = None
+    if drivers is None and (found is None or not found.converged):
+        log.warning(
+            "how drivers differ could not be estimated: all share their parameters, whose "
+            "intervals do not contain that they differ"
+        )
+        return None
+    return found
 
 
 def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:

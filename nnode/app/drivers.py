@@ -38,13 +38,15 @@ INSIDE = 0.01
 
 
 def planned(
-    options: TrainerOptions, model: System, sequences: Callable[[], list[Sequence]]
-) -> str | list[str]:
-    """What is done about drivers who differ: ``auto``, ``none``, or names of parameters.
+    options: TrainerOptions, model: System, sequences: Callable[[], list[Sequence]], exact: bool
+) -> str | list[str] | None:
+    """What is done about drivers who differ: ``auto``, ``none``, or names of parameters; None: as
+    ``auto``, but all share their parameters if that cannot be estimated.
 
     Args:
         options: of the trainer, as they were given.
         sequences: reads those of the training.
+        exact: whether the optimizer takes exact derivatives.
 
     Raises:
         ConfigError: a value that is none of these, an unknown parameter, or drivers who differ
@@ -53,6 +55,14 @@ def planned(
     given = options.drivers
     if given == NONE:
         return NONE
+    from nnode.population.drivers import known_names, obstacle  # compiled code takes a second
+    from nnode.population.followers import drivers_differ
+
+    if given is None:
+        if not exact or model.order == 1 or options.pooling is not Pooling.pooled:
+            return NONE
+        able = obstacle(model, sequences()) is None and drivers_differ(model, sequences())
+        return None if able else NONE
     if given != AUTO and not _names(given):
         raise ConfigError(
             f"trainer.drivers={given} is unknown, expected auto, none, or a list of parameters of "
@@ -64,8 +74,6 @@ def planned(
             f"{asked} and trainer.pooling={options.pooling.value} both give drivers parameters of "
             "their own; choose one of them"
         )
-    from nnode.population.drivers import known_names, obstacle  # compiled code takes a second
-
     reason = obstacle(model, sequences())
     if reason is not None:
         raise ConfigError(f"{asked} has no place here: {reason}; take trainer.drivers=none")

@@ -172,8 +172,8 @@ def trainer_of(
     _check_pooling(options.pooling, model, optimizer_options.name)
     _check_same_data(store, checkpoint)
     parts = _parts(store, data, checkpoint)
-    options.drivers = planned(options, model, lambda: [store[i] for i in parts.train])
     exact = optimizer_options.name == "gauss_newton"
+    options.drivers = planned(options, model, lambda: [store[i] for i in parts.train], exact)
     source: Source = store
     if options.start_speeds is StartSpeeds.auto:
         source = sound_speeds(store, model.domain, model.order)

@@ -112,8 +112,9 @@ class TrainerOptions:
     cost: Convention = Convention.integral
     pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
     # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
-    # those of which the data tell how they differ
-    drivers: Any = "none"
+    # those of which the data tell how they differ; null: auto for laws of second order with
+    # optimizer=gauss_newton where errors of positions are 0.015 to 0.45 m, otherwise none
+    drivers: Any = None
     # auto | given | fitted: first speeds of training sequences, those of the data, or the best;
     # auto: as the noise of the measurement asks for
     start_speeds: StartSpeeds = StartSpeeds.auto

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
 
-from nnode.data.sequence import Sequence
-from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError
 from nnode.model.build import add_effects
 from nnode.model.effects import Effect, IndividualEffect
@@ -16,14 +13,6 @@ from nnode.model.formula import crowd_of
 from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
 from nnode.model.terms import SMALLEST
-from nnode.population.followers import behind_leaders
-
-#: Errors of positions that are new at every sample, m, between which followers are simulated behind
-#: their own leaders. Below, positions were smoothed or simulated: SUMO's paths at 5 Hz, which have
-#: none, look like errors of 0.011 m, and errors of smoothed positions last, which the likelihood
-#: does not know of. Above, smoothed leaders keep too much: ESIMAS's errors of 0.57 m are taken for
-#: pushes. A table in docs/discovery.md compares both ways at errors below the upper limit.
-NOISE = (0.015, 0.45)
 
 
 def check_effect(effect: type[Effect]) -> None:
@@ -45,7 +34,7 @@ def not_offered(effect: type[Effect], system: System, differ: bool = False) -> s
     """Why an effect cannot act on a model; empty: it can.
 
     Args:
-        differ: see :func:`drivers_differ`.
+        differ: see :func:`~nnode.population.followers.drivers_differ`.
     """
     if isinstance(system, Crowd) and effect.sets_desired_speed and system.desired != "last":
         return (
@@ -63,14 +52,6 @@ def not_offered(effect: type[Effect], system: System, differ: bool = False) -> s
     except ConfigError as error:
         return str(error).removeprefix("model.effects: ")
     return ""
-
-
-def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
-    """Whether how drivers differ is estimated with a model: with formulas of the positions and the
-    speeds of a driver and of the vehicles ahead, where these were measured well enough."""
-    if behind_leaders(system) is None:
-        return False
-    return NOISE[0] < measured_noise(sequences).position < NOISE[1]
 
 
 def check_model(system: System) -> None:

@@ -14,7 +14,7 @@ import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model, drivers_differ, not_offered
+from nnode.discover.able import check_model, not_offered
 from nnode.discover.compare.laws import Nearer, imitated
 from nnode.discover.division import Division, divide
 from nnode.discover.found import Found
@@ -51,6 +51,7 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
+from nnode.population.followers import drivers_differ
 from nnode.population.intervals import variations
 from nnode.progress import Stages
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, cast
@@ -36,6 +36,13 @@ from nnode.simulation.rhs import formula_of
 
 #: Least standard deviation of errors of measurement, m: that of a camera.
 FLOOR = 0.01
+#: Errors of positions that are new at every sample, m, between which followers are simulated
+#: behind their own leaders unless something else is asked for. Below, positions were smoothed or
+#: simulated: SUMO's paths at 5 Hz, which have none, look like errors of 0.011 m, and errors of
+#: smoothed positions last, which the likelihood does not know of. Above, smoothed leaders keep too
+#: much: ESIMAS's errors of 0.57 m are taken for pushes. A table in docs/discovery.md compares both
+#: ways at errors below the upper limit.
+NOISE = (0.015, 0.45)
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
 #: What is added to the highest rate ``(R, F)``, of the number among the times of the paths ahead,
@@ -208,6 +215,15 @@ def behind_leaders(system: System) -> LaneDynamics | None:
     if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
         return None
     return lane
+
+
+def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
+    """Whether it is estimated how drivers differ unless something else is asked for: with formulas
+    of the positions and the speeds of a driver and of the vehicles ahead, where these were measured
+    well enough."""
+    if behind_leaders(system) is None:
+        return False
+    return NOISE[0] < measured_noise(sequences).position < NOISE[1]
 
 
 def _followed(lane: LaneDynamics) -> int:

@@ -116,6 +116,27 @@ def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model
 
 
 @pytest.mark.parametrize(
+    ("options", "noise", "differ"),
+    [
+        ({}, True, True),
+        ({}, False, False),
+        ({"model": "lin"}, True, False),
+        ({"optimizer": "lbfgs"}, True, False),
+        ({"pooling": "alone"}, True, False),
+        ({"model": "a2", "epochs": 2}, True, False),
+        ({"effects": ["reaction_delay"]}, True, False),  # simulations of it blow up
+        ({"drivers": "none"}, True, False),
+    ],
+)
+def test_unless_it_is_said_laws_of_second_order_and_measured_positions_have_drivers_who_differ(
+    small: pd.DataFrame, options: dict[str, Any], noise: bool, differ: bool
+) -> None:
+    given = small if noise else pairs(number=6, seconds=20.0)
+    found = nnode.Calibrator(**{"model": "idm", **options}).fit(given).result_
+    assert (found.drivers is not None) == differ
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"drivers": ["foo"]}, r"drivers=foo is no parameter .* v0, T, s0, a, b"),
@@ -189,7 +210,7 @@ def test_drivers_of_noisy_positions_are_told_apart() -> None:
     """Twenty platoons of five cars, whose positions a satellite's receiver measures."""
     differ = {"T": 0.15, "v0": 0.15}
     measured, _ = table(201, platoons=20, cars=5, seconds=60.0, noise=0.3, differ=differ)
-    found = nnode.fit(measured, model="idm", drivers="auto", heldout=0.0)
+    found = nnode.fit(measured, model="idm", heldout=0.0)
     assert found.drivers is not None
     assert sorted(found.drivers.differ) == ["T", "v0"]
     values = found.parameters.estimate

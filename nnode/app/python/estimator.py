@@ -58,7 +58,9 @@ class Calibrator:
         cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
         drivers: ``none``, ``auto`` or names of parameters such as ``["T", "v0"]``, which differ
             between drivers; ``auto``: those of which the data tell how they differ. Laws of lanes
-            are then calibrated by a mixed-effects model, see ``docs/method.md``.
+            are then calibrated by a mixed-effects model, see ``docs/method.md``. None: ``auto``
+            for laws of second order where errors of positions are 0.015 to 0.45 m, otherwise
+            ``none``.
         pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
             pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
         start_speeds: ``auto``, ``given``, or ``fitted`` beside the parameters to each training
@@ -86,7 +88,7 @@ class Calibrator:
     effects: ListLike[str | Mapping[str, Any]] = ()
     leader: str | None = None
     cost: str = "integral"
-    drivers: str | ListLike[str] = "none"
+    drivers: str | ListLike[str] | None = None
     pooling: str = "pooled"
     start_speeds: str = "auto"
     optimizer: str | Mapping[str, Any] | None = None
@@ -226,8 +228,10 @@ class Calibrator:
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
         trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
-        named = isinstance(self.drivers, str)
-        trainer["drivers"] = self.drivers if named else list(self.drivers)
+        drivers = self.drivers
+        trainer["drivers"] = drivers
+        if drivers is not None and not isinstance(drivers, str):
+            trainer["drivers"] = list(drivers)
         trainer |= {"pooling": self.pooling, "start_speeds": self.start_speeds}
         trainer["device"] = Device.cpu.value
         data = OmegaConf.structured(data_of(given))
@@ -285,7 +289,7 @@ def fit(
     model: str | Mapping[str, Any] | System = "lin",
     walls: str | Path | None = None,
     leader: str | None = None,
-    drivers: str | ListLike[str] = "none",
+    drivers: str | ListLike[str] | None = None,
     epochs: int = 100,
     heldout: float = 0.2,
     seed: int = 0,
@@ -300,7 +304,8 @@ def fit(
         walls: CSV with x1, y1, x2, y2, m.
         model: see :class:`Calibrator`, as for the following.
         leader: what the first vehicle does.
-        drivers: which parameters differ between drivers.
+        drivers: which parameters differ between drivers; None: as the data tell, for laws of
+            second order and positions with errors.
         epochs: at most.
         heldout: share of the sequences that the calibration does not see.
         seed: of start values and of the division.

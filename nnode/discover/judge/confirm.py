@@ -19,7 +19,6 @@ import numpy as np
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
-from nnode.discover.able import drivers_differ
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import TrafficEngine
@@ -29,6 +28,7 @@ from nnode.discover.residuals.fit import sums
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import leaning
 from nnode.model.system import System
+from nnode.population.followers import drivers_differ
 
 
 def engine_of(
