@@ -14,7 +14,11 @@ import pandas as pd
 import pytest
 
 import nnode
+from nnode.app.drivers import planned
+from nnode.app.python.inputs import model_options
+from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.errors import ConfigError
+from nnode.model import build_model
 from tests.app.conftest import ROOT, Script, environment
 from tests.app.different import LASTING, PUSH, TRUE, table
 from tests.app.following import TRUE as EXACT
@@ -116,24 +120,34 @@ def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model
 
 
 @pytest.mark.parametrize(
-    ("options", "noise", "differ"),
+    ("model", "noise", "options", "plan"),
     [
-        ({}, True, True),
-        ({}, False, False),
-        ({"model": "lin"}, True, False),
-        ({"optimizer": "lbfgs"}, True, False),
-        ({"pooling": "alone"}, True, False),
-        ({"model": "a2", "epochs": 2}, True, False),
-        ({"effects": ["reaction_delay"]}, True, False),  # simulations of it blow up
-        ({"drivers": "none"}, True, False),
+        ("idm", True, {}, None),
+        ("idm", False, {}, "none"),
+        ("lin", True, {}, "none"),
+        ("a2", True, {}, "none"),
+        ("idm", True, {"pooling": Pooling.alone}, "none"),
+        ("idm", True, {"drivers": "none"}, "none"),
+        ("idm", False, {"drivers": "auto"}, "auto"),
+        ("lin", True, {"drivers": ["v0"]}, ["v0"]),
     ],
 )
-def test_unless_it_is_said_laws_of_second_order_and_measured_positions_have_drivers_who_differ(
-    small: pd.DataFrame, options: dict[str, Any], noise: bool, differ: bool
+def test_drivers_differ_by_default_in_laws_of_second_order_where_positions_have_errors(
+    small: pd.DataFrame, model: str, noise: bool, options: dict[str, Any], plan: Any
 ) -> None:
-    given = small if noise else pairs(number=6, seconds=20.0)
-    found = nnode.Calibrator(**{"model": "idm", **options}).fit(given).result_
-    assert (found.drivers is not None) == differ
+    given = list(nnode.sequences(small if noise else pairs(number=6, seconds=20.0)))
+    system = build_model(model_options(model, "measured"), 0)
+    for exact in (True, False):
+        found = planned(TrainerOptions(**options), system, lambda: given, exact)
+        assert found == (plan if exact or options.get("drivers") else "none")
+
+
+def test_all_share_their_parameters_where_the_default_cannot_be_estimated(
+    small: pd.DataFrame, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = nnode.Calibrator("idm", effects=["reaction_delay"], epochs=3).fit(small).result_
+    assert found.drivers is None
+    assert "how drivers differ could not be estimated" in caplog.text
 
 
 @pytest.mark.parametrize(
