@@ -36,11 +36,10 @@ _FLAGS = {
 }
 
 
-def help_text(name: str, conf: Path, *, _root_: DictConfig) -> str:
+def help_text(name: str, *, _root_: DictConfig) -> str:
     """The help of a command, as a template of Hydra's.
 
     Args:
-        conf: the folder ``conf/``.
         _root_: the composed configuration, Hydra's part with it.
     """
     hydra = _root_.hydra
@@ -55,7 +54,7 @@ def help_text(name: str, conf: Path, *, _root_: DictConfig) -> str:
         choices.insert(0, "Choices, GROUP=NAME; those with * are taken now")
     config = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
     head = "Options, NAME=VALUE, with their values now; null means none"
-    parts = [words(name, conf), *choices, head, "\n".join(_options(_root_, plain(config)))]
+    parts = [words(name), *choices, head, "\n".join(_options(_root_, plain(config)))]
     place = re.sub(r"\d{4}(-\d\d){2}_\d\d(-\d\d){2}", "TIME", hydra.run.dir)
     flags = {"hydra.run.dir=FOLDER": f"folder of the results; without it {place}", **_FLAGS}
     parts.append("\n".join(["Running", *(_row(*flag) for flag in flags.items())]))

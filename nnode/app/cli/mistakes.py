@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, ValidationError
 
 from nnode.errors import ConfigError
-from nnode.program import configuration, typed
+from nnode.program import configuration
 
 #: What an option's value must be, by OmegaConf's name of the type.
 _KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
@@ -81,8 +81,8 @@ def unknown_choice(group: str, chosen: str, there: Iterable[str]) -> ConfigError
     text = f"there is no {group}={chosen}; expected one of {', '.join(known)}"
     text += _near(chosen, {one: one for one in known})
     if group == "data" and (Path(chosen).suffix or Path(chosen).exists()):
-        text += typed(
-            f". For a file of your own, python scripts/check.py {chosen} prints the options that "
+        text += (
+            f". For a file of your own, nnode check {chosen} prints the options that "
             "read it; a tidy table is data=table data.path=FILE data.domain=traffic"
         )
     return ConfigError(text)

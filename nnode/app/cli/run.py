@@ -33,7 +33,7 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
 from nnode.files import disk_words, write_json
-from nnode.program import begin, configuration
+from nnode.program import configuration, running
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
@@ -102,9 +102,8 @@ def run(
     register()
     # on a full disk the log cannot be written either, which shall not bury the run's own words
     logging.raiseExceptions = False
-    begin()
-    folder = configuration()
-    OmegaConf.register_new_resolver("nnode_help", partial(help_text, name, folder), replace=True)
+    running(name)
+    OmegaConf.register_new_resolver("nnode_help", partial(help_text, name), replace=True)
     try:
         if parallel:
             join()
@@ -117,7 +116,7 @@ def run(
     GlobalHydra.instance().clear()  # of a job that has forked this process
     with _out_of_sight() as places, _errors_raised():
         sys.argv[1:] = [*given, *places, *flags]
-        command = hydra.main(version_base="1.3", config_path=str(folder), config_name=name)
+        command = hydra.main(version_base="1.3", config_path=str(configuration()), config_name=name)
         try:
             command(_task(job, name))()
         except (HydraException, OmegaConfBaseException) as error:
