@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import time
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     assert fault["time"] == pytest.approx(3.2)
     assert "lane/0" not in report["split"]["open"] + report["split"]["sealed"]
     assert report["seconds"]["reading"] > 0
-    page = (run / "report.html").read_text()
+    page = unescape((run / "report.html").read_text())
     assert f"nnode evaluate checkpoint={run / 'checkpoints' / 'best.pt'}" in page
     assert (
         f"mkdir -p conf/model && cp {run / 'model.yaml'} conf/model/lin_with_speed_zone.yaml"

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import plain
 from nnode.app.cli.typed import literal
+from nnode.model.laws import LAW_MODELS, entries
 from nnode.program import words
 
 #: A dataclass's field with the comments above it and beside it.
@@ -47,8 +48,10 @@ def help_text(name: str, *, _root_: DictConfig) -> str:
     choices = []
     for group, chosen in hydra.runtime.choices.items():
         if not group.startswith("hydra/"):
-            files = sorted(p for folder in folders for p in (folder / group).glob("*.yaml"))
-            rows = [_row(f"{' *'[p.stem == chosen]} {p.stem}", said_of(p), 18) for p in files]
+            about = {name: entries()[name]["about"] for name in LAW_MODELS if group == "model"}
+            files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
+            about |= {path.stem: said_of(path) for path in files}
+            rows = [_row(f"{' *'[n == chosen]} {n}", said, 18) for n, said in sorted(about.items())]
             choices.append("\n".join([f"{group}=", *rows]))
     if choices:
         choices.insert(0, "Choices, GROUP=NAME; those with * are taken now")

@@ -217,9 +217,10 @@ class Law(Term):
             found = {key: in_si(str(value)) for key, value in entry.items()}
             units = {own for _, own in found.values()}
             if len(units) > 1:
+                said = ", ".join(f"{key} {value}" for key, value in entry.items())
                 raise ConfigError(
-                    f"model.law.parameters.{name} has the units {', '.join(sorted(units))}; value, "
-                    "low and high need the same kind of unit"
+                    f"model.law.parameters.{name} has {said}: expected quantities with one kind of "
+                    f"unit, such as '3 {max(units - {'1'})}'"
                 )
             bounds = {key: value for key, (value, _) in found.items() if key != "value"}
             if "low" in bounds and options.get(f"{name}_min") is not None:
