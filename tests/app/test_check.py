@@ -46,7 +46,7 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
         (["file=$T/junk.csv"], "is no text"),
         (["file=$T/junk.csv", "domain=sea"], "domain=sea: expected traffic, crowd, or null"),
         (["file=$T/junk.csv", "frame_rate=-1"], "frame_rate=-1.0: expected a positive number"),
-        ([], "Missing mandatory value: file; type file=VALUE"),
+        ([], "file is missing; type file=VALUE"),
         (["$T/junk.csv", "other.csv"], "other.csv is no option: expected NAME=VALUE"),
     ],
 )
