@@ -136,10 +136,12 @@ class Stages(OnTerminal):
         super().__exit__(kind, error, trace)
 
     def begin(self, stage: str) -> None:
-        """A stage begins; those before it are done."""
+        """A stage begins; those before it are done. An earlier one starts the estimate anew."""
         names = list(self.shares)
-        self._stage = stage
-        self._before = sum(self.shares[name] for name in names[: names.index(stage)])
+        before = sum(self.shares[name] for name in names[: names.index(stage)])
+        if before < self._before:
+            self._start = time.monotonic()
+        self._stage, self._before = stage, before
         self.within(0.0)
 
     def within(self, part: float) -> None:
