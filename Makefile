@@ -82,7 +82,7 @@ lint: setup
 # Studies on the real recordings (downloaded, or from NNODE_DATA; following: from there), pages into docs/.
 study: setup
 	for name in traffic crowd following; do \
-	  $(BIN)/python scripts/study.py study=$$name || exit $$?; \
+	  $(BIN)/nnode study study=$$name || exit $$?; \
 	  rm -rf docs/studies/$$name && mkdir -p docs/studies/$$name && \
 	  cp -r runs/study/$$name/study.html runs/study/$$name/study.md runs/study/$$name/*.csv \
 	    runs/study/$$name/figures docs/studies/$$name/ || exit $$?; \

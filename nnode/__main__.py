@@ -1,4 +1,4 @@
-"""The program ``nnode``: one command for each script of a checkout."""
+"""The program ``nnode``: one command for each file in ``nnode/app/commands``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import textwrap
 from difflib import get_close_matches
 from importlib import import_module
 
-from nnode.program import COMMANDS, PROGRAM, configuration, running, words
+from nnode.program import COMMANDS, words
 from nnode.version import VERSION
 
 
@@ -19,10 +19,9 @@ def main() -> None:
     if name in ("-h", "--help"):
         print(_help(names))
     elif name == "--version":
-        print(f"{PROGRAM} {VERSION}")
+        print(f"nnode {VERSION}")
     elif name in names:
         del sys.argv[1]
-        running(name)
         import_module(f"nnode.app.commands.{name}").main()
     else:
         near = get_close_matches(name, names, n=1)
@@ -33,20 +32,19 @@ def main() -> None:
 
 
 def _help(names: list[str]) -> str:
-    conf = configuration()
     rows = []
     for name in names:
-        about = textwrap.wrap(words(name, conf).splitlines()[0], 82)
+        about = textwrap.wrap(words(name).splitlines()[0], 82)
         rows += [f"  {name:<14}{about[0]}", *(f"{'':<16}{line}" for line in about[1:])]
     return "\n".join(
         [
             "Calibrate interacting particle systems to measured trajectories, and diagnose them.",
             "",
-            f"{PROGRAM} COMMAND [NAME=VALUE ...]",
+            "nnode COMMAND [NAME=VALUE ...]",
             *rows,
             "",
-            f"{PROGRAM} COMMAND --help shows examples, choices and all options; {PROGRAM} "
-            "--version the version.",
+            "nnode COMMAND --help shows examples, choices and all options of a command.",
+            "nnode --version shows the version.",
         ]
     )
 

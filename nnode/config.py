@@ -58,7 +58,7 @@ from studies.options import (
 
 @dataclass
 class TrainConfig:
-    """``scripts/train.py``: calibrate a model to data."""
+    """``nnode train``: calibrate a model to data."""
 
     model: Any = MISSING
     data: Any = MISSING
@@ -71,14 +71,14 @@ class TrainConfig:
 
 @dataclass
 class PrepareConfig:
-    """``scripts/prepare_data.py``: raw recordings to sequences."""
+    """``nnode prepare_data``: raw recordings to sequences."""
 
     data: Any = MISSING
 
 
 @dataclass
 class CheckConfig:
-    """``scripts/check.py``: what a file holds and what is wrong with it."""
+    """``nnode check``: what a file holds and what is wrong with it."""
 
     file: str = MISSING  # CSV, text of numbers, Parquet, or any other file that docs/data.md lists
     domain: str | None = None  # traffic | crowd; null guesses
@@ -87,7 +87,7 @@ class CheckConfig:
 
 @dataclass
 class EvaluateConfig:
-    """``scripts/evaluate.py``: errors of a checkpoint beside its baselines."""
+    """``nnode evaluate``: errors of a checkpoint beside its baselines."""
 
     checkpoint: str = MISSING  # RUN/checkpoints/best.pt
     data: Any = MISSING
@@ -99,7 +99,7 @@ class EvaluateConfig:
 
 @dataclass
 class ExportConfig:
-    """``scripts/export.py``: a run's results in the formats of other programs."""
+    """``nnode export``: a run's results in the formats of other programs."""
 
     run: str = MISSING  # folder of a training or a diagnosis
     to: Any = "auto"  # jupedsim | sumo | pedpy | fcd | parquet | csv, or a list; auto: all that fit
@@ -112,7 +112,7 @@ class ExportConfig:
 
 @dataclass
 class DriveConfig:
-    """``scripts/drive.py``: a calibrated law drives vehicles in SUMO."""
+    """``nnode drive``: a calibrated law drives vehicles in SUMO."""
 
     run: str = MISSING  # folder of a training or a diagnosis
     sumo: str = MISSING  # SUMO's configuration, *.sumocfg
@@ -128,7 +128,7 @@ class DriveConfig:
 
 @dataclass
 class SimulateConfig:
-    """``scripts/simulate.py``: sampled motion of a calibrated model, with its scores."""
+    """``nnode simulate``: sampled motion of a calibrated model, with its scores."""
 
     run: str = MISSING  # folder of a training or a diagnosis
     samples: int = 99  # of every sequence, at least 39
@@ -143,7 +143,7 @@ class SimulateConfig:
 
 @dataclass
 class PlotForcesConfig:
-    """``scripts/plot_forces.py``: what calibrated models have learned."""
+    """``nnode plot_forces``: what calibrated models have learned."""
 
     checkpoint: Any = MISSING  # one path or a list of paths
     data: Any = MISSING
@@ -152,14 +152,14 @@ class PlotForcesConfig:
 
 @dataclass
 class StudyConfig:
-    """``scripts/study.py``: the paper's studies on the real recordings."""
+    """``nnode study``: the paper's studies on the real recordings."""
 
     study: Any = MISSING
 
 
 @dataclass
 class DiscoverConfig:
-    """``scripts/discover.py``: what a model lacks."""
+    """``nnode discover``: what a model lacks."""
 
     model: Any = MISSING
     data: Any = MISSING

@@ -121,7 +121,7 @@ class Stages(OnTerminal):
         )
         whole = sum(shares.values())
         self.title, self.shares = title, {name: x / whole for name, x in shares.items()}
-        self.done, self._before, self._stage = 0.0, 0.0, ""
+        self.done, self._before, self._stage, self._reported = 0.0, 0.0, "", self._start
         if self._bar:
             self._task = self._bar.add_task(title, total=1.0, text="")
 
@@ -136,15 +136,18 @@ class Stages(OnTerminal):
         super().__exit__(kind, error, trace)
 
     def begin(self, stage: str) -> None:
-        """A stage begins; those before it are done."""
+        """A stage begins; those before it are done. An earlier one starts the estimate anew."""
         names = list(self.shares)
-        self._stage = stage
-        self._before = sum(self.shares[name] for name in names[: names.index(stage)])
+        before = sum(self.shares[name] for name in names[: names.index(stage)])
+        if before < self._before:
+            self._start = time.monotonic()
+        self._stage, self._before = stage, before
         self.within(0.0)
 
     def within(self, part: float) -> None:
         """So much of the stage is done, between 0 and 1; called often."""
         self.done = self._before + self.shares[self._stage] * min(max(part, 0.0), 1.0)
+        self._reported = time.monotonic()
         if self._bar:
             self._bar.update(self._task, completed=self.done, text=self.text())
             if self._forks:
@@ -158,7 +161,10 @@ class Stages(OnTerminal):
 
     def text(self) -> str:
         """Stage and time left."""
-        passed = time.monotonic() - self._start
+        passed, since = self._reported - self._start, time.monotonic() - self._reported
         if not self.done or passed < 1:
             return self._stage
-        return f"{self._stage}, about {passed * (1 - self.done) / self.done:.0f} s left"
+        left = passed * (1 - self.done) / self.done - since
+        if left < 0:
+            return f"{self._stage}, longer than estimated"
+        return f"{self._stage}, about {left:.0f} s left"

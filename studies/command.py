@@ -1,4 +1,4 @@
-"""The paper's studies: ``scripts/study.py``."""
+"""The paper's studies: ``nnode study``."""
 
 from __future__ import annotations
 

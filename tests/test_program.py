@@ -1,8 +1,7 @@
-"""Commands are told as this user types them."""
+"""Commands are typed in one form, whatever started them."""
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 
@@ -10,49 +9,25 @@ import pytest
 
 from nnode import program
 from nnode.__main__ import main
-from nnode.discover.report.files import model_yaml
 
 ROOT = Path(__file__).parents[1]
-TEXT = "python scripts/train.py x=1; torchrun --nproc-per-node=2 scripts/train.py y=2"
 
 
-@pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program, "_running", "train")
-    monkeypatch.setattr(sys, "argv", ["/usr/bin/nnode", "model=lin", "data.path=my file.csv"])
-    monkeypatch.setenv("NNODE_SCRIPTS", "/of/an/earlier/script")
-    program.begin()
+@pytest.mark.parametrize(
+    ("name", "typed"),
+    [
+        ("train", "nnode train model=lin 'data.path=my file.csv'"),
+        ("torture", "python scripts/torture.py model=lin 'data.path=my file.csv'"),
+        ("", "python scripts/torture.py model=lin 'data.path=my file.csv'"),
+    ],
+)
+def test_the_command_that_runs(monkeypatch: pytest.MonkeyPatch, name: str, typed: str) -> None:
+    monkeypatch.setattr(program, "_running", name)
+    monkeypatch.setattr(sys, "argv", ["scripts/torture.py", "model=lin", "data.path=my file.csv"])
+    assert program.command_line() == typed
 
 
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    shutil.copytree(ROOT / "conf", tmp_path / "conf")
-    monkeypatch.setattr(sys, "argv", [str(tmp_path / "scripts" / "train.py"), "model=lin"])
-    monkeypatch.setenv("NNODE_SCRIPTS", "")  # taken back at the end
-    program.begin()
-    return tmp_path
-
-
-@pytest.mark.usefixtures("installed")
-def test_the_installed_program() -> None:
-    told = "nnode train x=1; torchrun --nproc-per-node=2 -m nnode train y=2"
-    assert program.typed(TEXT) == told
-    assert program.command_line() == "nnode train model=lin 'data.path=my file.csv'"
-    assert program.configuration() == ROOT / "conf"
-    assert "then: --config-dir conf model=m\n" in model_yaml({"name": "m", "term": "lin"}, False)
-
-
-def test_a_script_takes_the_configuration_beside_it(script: Path) -> None:
-    assert program.typed(TEXT) == TEXT
-    assert program.command_line() == f"python {script}/scripts/train.py model=lin"
-    assert program.configuration() == script / "conf"
-    assert "then: model=m\n" in model_yaml({"name": "m", "term": "lin"}, False)
-
-
-def test_a_program_of_somebody_else_is_no_script_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("NNODE_SCRIPTS", raising=False)
-    monkeypatch.setattr(sys, "argv", ["/home/me/scripts/train.py"])
-    assert program.typed(TEXT).startswith("nnode train x=1")
+def test_a_checkout_has_its_configuration_beside_the_package() -> None:
     assert program.configuration() == ROOT / "conf"
 
 

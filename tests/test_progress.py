@@ -39,6 +39,14 @@ def test_time_left_follows_the_shares_of_the_stages(clock: list[float]) -> None:
     assert stages.text() == "thinking, about 10 s left"
     stages.within(7.0)  # a guess that was too low
     assert stages.text() == "thinking, about 0 s left"
+    clock[0] = 11.0
+    assert stages.text() == "thinking, longer than estimated"
+    stages.begin("reading")  # the work is done twice
+    clock[0] = 13.0
+    stages.within(0.5)
+    assert stages.text() == "reading, about 14 s left"
+    clock[0] = 17.0
+    assert stages.text() == "reading, about 10 s left"
 
 
 def test_elsewhere_a_line_comes_seldom_and_nothing_before_ten_seconds(

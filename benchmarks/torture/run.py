@@ -7,7 +7,6 @@ promises then is in ``docs/reliability.md``; here it is tried.
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from benchmarks.torture.campaign import check_names
 from benchmarks.torture.report import REPORT, Row, keep, show
 from nnode.errors import ConfigError, StudyError
 from nnode.machine import how_made
+from nnode.program import configuration
 
 
 def torture(config: DictConfig, folder: Path) -> None:
@@ -34,10 +34,11 @@ def torture(config: DictConfig, folder: Path) -> None:
         StudyError: something was lost; the table tells what.
     """
     options = cast(TortureConfig, OmegaConf.to_object(config))
+    root = configuration().parent
     campaigns: dict[str, Callable[[], list[Row]]] = {
-        "kills": lambda: kills.kills(root(), folder, options.kills, options.seed, options.jobs),
-        "disk": lambda: disk.disk(root(), folder, options.jobs),
-        "folder": lambda: one_folder.folder(root(), folder, options.jobs, options.repeats),
+        "kills": lambda: kills.kills(root, folder, options.kills, options.seed, options.jobs),
+        "disk": lambda: disk.disk(root, folder, options.jobs),
+        "folder": lambda: one_folder.folder(root, folder, options.jobs, options.repeats),
         "fuzz": lambda: fuzz.rows(folder, options.inputs, options.seed, options.targets),
     }
     check_names("campaigns", options.campaigns, campaigns)
@@ -60,8 +61,3 @@ def torture(config: DictConfig, folder: Path) -> None:
     print(f"report: {folder / REPORT}")
     if any(row.losses for row in rows):
         raise StudyError(f"something was lost; {folder / REPORT} tells what")
-
-
-def root() -> Path:
-    """The folder in which ``scripts/`` and ``conf/`` are."""
-    return Path(sys.argv[0]).resolve().parent.parent

@@ -1,1 +1,1 @@
-"""The jobs that the scripts start: each composes what the packages below offer."""
+"""The jobs that the commands start: each composes what the packages below offer."""

@@ -1,4 +1,4 @@
-"""What a file of trajectories holds and what is wrong with it: ``scripts/check.py``."""
+"""What a file of trajectories holds and what is wrong with it: ``nnode check``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from nnode.discover.inputs import LEAST
 from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
-from nnode.program import typed
 
 #: Stands before what is printed of each level.
 _SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
@@ -36,7 +35,7 @@ class Check:
 
     Attributes:
         examination: all that was found, in SI units.
-        options: overrides with which scripts, and ``nnode COMMAND``, read the file.
+        options: overrides with which the commands read the file.
     """
 
     examination: Examination
@@ -53,7 +52,7 @@ class Check:
         return _probability(self.examination)
 
     def __repr__(self) -> str:
-        return typed(summary(self.examination, self.options))
+        return summary(self.examination, self.options)
 
     def _repr_html_(self) -> str:
         table = _rows(self.findings).to_html() if self.findings else ""
@@ -104,7 +103,7 @@ def check(config: DictConfig, folder: Path) -> None:
 
 
 def command(found: Examination) -> list[str]:
-    """The overrides, as they can be typed, with which scripts read the file."""
+    """The overrides, as they can be typed, with which the commands read the file."""
     source = found.source
     values = plain_options(source.options)
     defaults = group_defaults("data", source.group, "prepare_data")
@@ -137,7 +136,7 @@ def summary(found: Examination, lines: list[str]) -> str:
         text.append(f"format: {found.raw.native}, whose reader knows its units")
     text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
     words = " ".join(lines)
-    text += ["", "to read it:", f"  python scripts/prepare_data.py {words}"]
+    text += ["", "to read it:", f"  nnode prepare_data {words}"]
     text += ["to calibrate a model, and to diagnose it:"]
     text += [f"  {line}" for line in _next(found, words)]
     text += ["in Python:", *(f"  {line}" for line in python_lines(found))]
@@ -148,9 +147,9 @@ def _next(found: Examination, words: str) -> list[str]:
     """Commands that go on with the data, as far as these suffice for them."""
     kept = _kept(found)
     held = [] if _heldout(found, kept) else ["data.split.heldout=0"]
-    lines = [" ".join([f"python scripts/train.py {_model(found)} {words}", *held])]
+    lines = [" ".join([f"nnode train {_model(found)} {words}", *held])]
     if len(kept) >= LEAST:
-        lines.append(f"python scripts/discover.py {_model(found)} {words}")
+        lines.append(f"nnode discover {_model(found)} {words}")
     else:
         lines.append(f"# a diagnosis needs at least {LEAST} sequences, there are {len(kept)}")
     return lines
@@ -242,10 +241,10 @@ def _findings(findings: list[Finding]) -> list[Block]:
 
 def _usage(found: Examination, lines: list[str]) -> str:
     words = " \\\n    ".join(lines)
-    commands = [f"python scripts/prepare_data.py {words}"]
+    commands = [f"nnode prepare_data {words}"]
     commands += _next(found, words)
     shell, python = "\n".join(commands), "\n".join(python_lines(found))
-    return typed(f"```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```")
+    return f"```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```"
 
 
 def _columns(found: Examination) -> list[Block]:

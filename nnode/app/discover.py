@@ -56,7 +56,6 @@ from nnode.errors import ConfigError
 from nnode.files import write_text
 from nnode.model import build_model
 from nnode.model.effects.own import load_own
-from nnode.program import scripts, typed
 from nnode.progress import Stages
 
 if TYPE_CHECKING:
@@ -284,19 +283,15 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
     name, group = config["model"]["name"], config["groups"]["data"]
     place = shlex.quote(str(folder / MODEL))
-    # an installed package's own folder is no place for a user's files
-    own = [] if scripts() else ["--config-dir conf"]
     copy = shlex.quote(f"conf/model/{name}.yaml")
     model, data = shell_override("model", name), shell_override("data", group)
-    train = ["python scripts/train.py", *own, model, data]
     options = changes("data", config["data"], group_defaults("data", group))
-    lines = [
-        f"python scripts/evaluate.py {checkpoint}",
-        f"python scripts/plot_forces.py {checkpoint}",
-        "mkdir -p conf/model && " * bool(own) + f"cp {place} {copy}",
-        " ".join([*train, *options]),
+    return [
+        f"nnode evaluate {checkpoint}",
+        f"nnode plot_forces {checkpoint}",
+        f"mkdir -p conf/model && cp {place} {copy}",
+        " ".join(["nnode train --config-dir conf", model, data, *options]),
     ]
-    return [typed(line) for line in lines]
 
 
 def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""A run's model drives vehicles in SUMO: ``scripts/drive.py``."""
+"""A run's model drives vehicles in SUMO: ``nnode drive``."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def drive_run(
 
 
 def drive_scenario(config: DictConfig, folder: Path) -> None:
-    """What the script does: :func:`drive_run`, and a few lines on what came of it."""
+    """What the command does: :func:`drive_run`, and a few lines on what came of it."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     asked: dict[str, Any] = {str(key): value for key, value in plain.items()}

@@ -1,4 +1,4 @@
-"""Errors of a checkpoint beside its baselines: ``scripts/evaluate.py``."""
+"""Errors of a checkpoint beside its baselines: ``nnode evaluate``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run's results in the formats of other programs: ``scripts/export.py``."""
+"""A run's results in the formats of other programs: ``nnode export``."""
 
 from __future__ import annotations
 

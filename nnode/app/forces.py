@@ -1,4 +1,4 @@
-"""What calibrated models have learned, as pictures: ``scripts/plot_forces.py``."""
+"""What calibrated models have learned, as pictures: ``nnode plot_forces``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Raw recordings to sequences: ``scripts/prepare_data.py``."""
+"""Raw recordings to sequences: ``nnode prepare_data``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sampled motion of a run's model, and its scores: ``scripts/simulate.py``."""
+"""Sampled motion of a run's model, and its scores: ``nnode simulate``."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def simulate_run(
 
 
 def simulate(config: DictConfig, folder: Path) -> None:
-    """What the script does: :func:`simulate_run` on the data that are asked for, and files of it.
+    """What the command does: :func:`simulate_run` on the data that are asked for, and files of it.
 
     Raises:
         NNodeError: no such run or data, too few samples.

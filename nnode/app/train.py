@@ -24,7 +24,6 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.store import Store
 from nnode.files import csv_text, write_json, write_text
-from nnode.program import typed
 from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
@@ -99,7 +98,7 @@ def train(config: DictConfig, folder: Path) -> None:
     except Interrupted as stop:
         again = [shell_override("resume", trainer.last_path)]
         again.append(shell_override("hydra.run.dir", folder))
-        command = " ".join([typed("python scripts/train.py"), *again])
+        command = " ".join(["nnode train", *again])
         raise Interrupted(f"{stop}\nresume with: {command}", stop.signal) from None
     paths = {
         "tensorboard": folder / "tensorboard",

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from nnode.calibrate.options import Device
 from nnode.errors import ConfigError, NNodeError
-from nnode.program import typed
 
 T = TypeVar("T")
 
@@ -53,7 +52,7 @@ def join() -> None:
     except (RuntimeError, ValueError) as error:
         raise ConfigError(
             f"{os.environ['WORLD_SIZE']} processes cannot find each other: {error}; start them "
-            f"with {typed('torchrun --nproc-per-node=NUMBER scripts/train.py')}"
+            "with torchrun --nproc-per-node=NUMBER -m nnode train"
         ) from error
     # the interpreter must not end with the threads of the group still running
     atexit.register(_leave)

@@ -26,7 +26,7 @@ class Precision(str, Enum):
 
 
 class Device(str, Enum):
-    """Where the calculation runs; ``auto`` is a CUDA device where torch finds one."""
+    """Where the calculation runs; auto is a CUDA device if torch finds one."""
 
     auto = "auto"
     cpu = "cpu"
@@ -110,13 +110,13 @@ class TrainerOptions:
     patience: int | None = None  # evaluations without progress before stopping; null never
     min_delta: float = 0.0  # the least improvement that counts as progress
     cost: Convention = Convention.integral
-    pooling: Pooling = Pooling.pooled  # pooled | alone | shrunk: parameters of each sequence's own
+    pooling: Pooling = Pooling.pooled  # parameters of all sequences, or of each
     # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
     # those of which the data tell how they differ; null: auto for laws of second order with
     # optimizer=gauss_newton where errors of positions are 0.015 to 0.45 m, otherwise none
     drivers: Any = None
-    # auto | given | fitted: first speeds of training sequences, those of the data, or the best;
-    # auto: as the noise of the measurement asks for
+    # first speeds of training sequences, those of the data, or the best; auto: as the noise of the
+    # measurement asks for
     start_speeds: StartSpeeds = StartSpeeds.auto
     dtype: Precision = Precision.float64
     device: Device = Device.auto

@@ -32,16 +32,17 @@ class Reporter(OnTerminal):
             TextColumn("{task.fields[note]}"),
         )
         self.total, self.done, self.what = total, done, what
-        self._first, self._note = done, ""
+        self._begun, self._first, self._note = done, done, ""
         if self._bar:
             self._task = self._bar.add_task(what, total=total, completed=done, rate=0.0, note="")
 
     def advance(self, note: str = "") -> None:
         """One step more is done."""
         self.done += 1
-        rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
+        if self.done == self._begun + 1:  # the first step includes compilation
+            self._first, self._start = self.done, time.monotonic()
         if self._bar:
-            self._bar.update(self._task, completed=self.done, rate=rate, note=note)
+            self._bar.update(self._task, completed=self.done, rate=self._rate(), note=note)
         else:
             self._note = note
             self.log_if_due()
@@ -51,6 +52,9 @@ class Reporter(OnTerminal):
         text = f"{self.what}: step {self.done} of {self.total}"
         if self.done == self._first:
             return text
-        rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
-        left = (self.total - self.done) / max(rate, 1e-9)
-        return f"{text}, {rate:.1f} steps/s, {left:.0f} s left  {self._note}"
+        left = (self.total - self.done) / self._rate()
+        return f"{text}, {self._rate():.1f} steps/s, about {left:.0f} s left, {self._note}"
+
+    def _rate(self) -> float:
+        """Steps per second since the first one."""
+        return (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)

@@ -33,7 +33,7 @@ Agents = Enum(
 
 
 class SplitMode(str, Enum):
-    """How held-out sequences are chosen: see :mod:`nnode.data.split`."""
+    """How held-out sequences are chosen, see docs/data.md."""
 
     auto = "auto"
     random = "random"
@@ -109,8 +109,8 @@ class DataOptions:
     smooth: float | None = None
     # whether one identifier in two sequences of a recording is one agent
     agents: Agents = Agents.auto
-    # measured | smoothed: speeds at the first sample, with which simulations start; smoothed: of
-    # parabolas through the first 2 s of positions
+    # speeds at the first sample, with which simulations start; smoothed: those of parabolas through
+    # the first 2 s of positions
     start_speeds: Starts = Starts.measured
     split: SplitOptions = field(default_factory=SplitOptions)
     loader: LoaderOptions = field(default_factory=LoaderOptions)
@@ -207,7 +207,7 @@ class PairOptions(DataOptions):
     kinds: Any = field(default_factory=dict)  # {class code: name}
     lane: Any = None  # a lane or a list of lanes; null takes every lane
     dt: float | None = None  # s, grid to interpolate to; null: the times as they are
-    gaps: Gaps = Gaps.cut  # cut | error: a gap in the times of a pair
+    gaps: Gaps = Gaps.cut  # what becomes of a gap in the times of a pair
     window: float | None = None  # s, length of a sequence; null: a pair is as long as it is
     min_samples: int = 3  # fewest times of a sequence
 

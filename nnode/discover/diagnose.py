@@ -59,12 +59,12 @@ from nnode.progress import Stages
 LEADS = 3
 
 
-#: Stages of a diagnosis, with the seconds that they take on the motorway recordings.
+#: Stages of a diagnosis, with the seconds that they take on 120 pairs of NGSIM I-80.
 STAGES = {
-    "calibrating": 2.0,
-    "locating": 1.5,
-    "naming": 11.5,
-    "comparing on sealed sequences": 1.0,
+    "calibrating": 6.0,
+    "locating": 22.0,
+    "naming": 62.0,
+    "comparing on sealed sequences": 55.0,
 }
 
 

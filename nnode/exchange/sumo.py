@@ -150,7 +150,7 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
         raise ConfigError(
             f"to=sumo: the run's model is neither {' nor '.join(SAME)} nor a law with a gap at "
             "rest, and SUMO has no counterpart to it; leave it out of to=, or let it drive SUMO's "
-            "vehicles itself: scripts/drive.py"
+            "vehicles itself: nnode drive"
         )
     found = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}

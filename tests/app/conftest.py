@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +21,11 @@ from tests.app.forked import Forks
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = ROOT / "conf"
+#: What stands behind ``nnode`` or ``python``.
+COMMANDS = {
+    *(path.stem for path in (ROOT / "nnode" / "app" / "commands").glob("[a-z]*.py")),
+    *(f"scripts/{name}.py" for name in ("benchmark", "benchmark_discovery", "torture")),
+}
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -32,12 +38,15 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def examples(words: str) -> list[str]:
-    """The command lines in a script's words, continued lines joined."""
-    joined = words.replace("\\\n", " ")
-    lines = [line.strip() for line in joined.splitlines() if "scripts/" in line]
-    commands = [line for line in lines if re.match(r"(python|torchrun) ", line)]
-    return [re.sub(r"\s+", " ", line) for line in commands]
+#: How a command of the program, or a script of the benchmarks, is typed.
+TYPED = re.compile(r"^ *(?:[A-Z_]+=\S+ )?(?:(?:torchrun \S+ -m )?nnode|python) (.*)", re.M)
+
+
+def examples(text: str) -> list[list[str]]:
+    """Name and options of each command in a text, continued lines joined."""
+    lines = TYPED.findall(text.replace("\\\n", " "))
+    commands = [shlex.split(line, comments=True) for line in lines]
+    return [[Path(name).stem, *words] for name, *words in commands if name in COMMANDS]
 
 
 def composed(name: str, *words: str) -> DictConfig:

@@ -1,4 +1,4 @@
-"""``scripts/check.py`` from a file to a page, and to the options that read the file."""
+"""``nnode check`` from a file to a page, and to the options that read the file."""
 
 from __future__ import annotations
 
@@ -28,9 +28,8 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     assert "look  direction: all vehicles drive towards smaller positions" in done.stdout
     page = (tmp_path / "run" / "check.html").read_text(encoding="utf-8")
     assert "Check of my cars.csv" in page
-    (line,) = [line for line in done.stdout.splitlines() if "prepare_data.py" in line]
-    _, command, *words = shlex.split(line)
-    assert command == "scripts/prepare_data.py"
+    (line,) = [line for line in done.stdout.splitlines() if "nnode prepare_data" in line]
+    words = shlex.split(line)[2:]
     read = script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
     assert read.returncode == 0, read.stderr
     options = Store(tmp_path / "data").manifest["options"]
@@ -47,7 +46,7 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
         (["file=$T/junk.csv"], "is no text"),
         (["file=$T/junk.csv", "domain=sea"], "domain=sea: expected traffic, crowd, or null"),
         (["file=$T/junk.csv", "frame_rate=-1"], "frame_rate=-1.0: expected a positive number"),
-        ([], "Missing mandatory value: file; type file=VALUE"),
+        ([], "file is missing; type file=VALUE"),
         (["$T/junk.csv", "other.csv"], "other.csv is no option: expected NAME=VALUE"),
     ],
 )
@@ -70,7 +69,7 @@ def test_the_text_says_all(tmp_path: Path) -> None:
     told = summary(found, ["data=pedpy", "data.path=X"])
     assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in told
     assert "units: crowd, positions in cm, times in frames of 1/16 s (sure)" in told
-    assert "\n  python scripts/prepare_data.py data=pedpy data.path=X\n" in told
+    assert "\n  nnode prepare_data data=pedpy data.path=X\n" in told
     for one in found.findings:
         assert one.text in told
 

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import time
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,6 @@ from nnode.app import discover, nearest_law
 from nnode.app.cli.run import run
 from tests.discover import stand_in
 if __name__ == "__main__":
-    sys.argv[0] = "scripts/discover.py"
     nearest_law.diagnose = stand_in.diagnose
     run("discover", discover.discover)
 """
@@ -66,13 +66,13 @@ from nnode.app import discover, nearest_law
 from nnode.app.cli.run import run
 from tests.discover import stand_in
 
-def script(name, *arguments, root="."):
-    sys.argv = [f"{root}/scripts/{name}.py", *arguments]
+def script(name, *arguments):
+    sys.argv = [f"scripts/{name}.py", *arguments]
     runpy.run_path(sys.argv[0], run_name="__main__")
 
 if __name__ == "__main__":
     folder, *overrides = sys.argv[1:]
-    sys.argv = ["scripts/discover.py", *overrides]
+    sys.argv[1:] = overrides
     nearest_law.diagnose = stand_in.diagnose
     run("discover", discover.discover)
     checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
@@ -81,13 +81,13 @@ if __name__ == "__main__":
     print("== plot_forces")
     script("plot_forces", checkpoint, f"hydra.run.dir={folder}/forces")
     print("== train")
-    for name in ("conf", "scripts"):
-        shutil.copytree(name, f"{folder}/{name}")
-    shutil.copy(f"{folder}/run/model.yaml", f"{folder}/conf/model/lin_with_speed_zone.yaml")
+    models = Path(folder, "conf", "model")
+    models.mkdir(parents=True)
+    shutil.copy(f"{folder}/run/model.yaml", models / "lin_with_speed_zone.yaml")
     script(
-        "train", "model=lin_with_speed_zone", "solver.dt=0.02", "data=table",
-        f"data.path={folder}/lane.csv", "data.domain=traffic", "trainer.max_epochs=1",
-        f"hydra.run.dir={folder}/train", root=folder,
+        "train", "--config-dir", f"{folder}/conf", "model=lin_with_speed_zone",
+        "solver.dt=0.02", "data=table", f"data.path={folder}/lane.csv", "data.domain=traffic",
+        "trainer.max_epochs=1", f"hydra.run.dir={folder}/train",
     )
 """
 
@@ -134,10 +134,13 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     assert fault["time"] == pytest.approx(3.2)
     assert "lane/0" not in report["split"]["open"] + report["split"]["sealed"]
     assert report["seconds"]["reading"] > 0
-    page = (run / "report.html").read_text()
-    assert f"python scripts/evaluate.py checkpoint={run / 'checkpoints' / 'best.pt'}" in page
-    assert f"cp {run / 'model.yaml'} conf/model/lin_with_speed_zone.yaml" in page
-    (train,) = re.findall(r"python scripts/train.py model=lin_with_speed_zone data=table .*", page)
+    page = unescape((run / "report.html").read_text())
+    assert f"nnode evaluate checkpoint={run / 'checkpoints' / 'best.pt'}" in page
+    assert (
+        f"mkdir -p conf/model && cp {run / 'model.yaml'} conf/model/lin_with_speed_zone.yaml"
+        in page
+    )
+    (train,) = re.findall(r"nnode train --config-dir conf model=lin_with_speed_zone data=t.*", page)
     assert "data.domain=traffic" in train
     assert f"data.path={run.parent / 'lane.csv'}" in train
 

@@ -1,4 +1,4 @@
-"""``scripts/simulate.py`` and ``nnode.simulate`` from a table to scores."""
+"""``nnode simulate`` and ``nnode.simulate`` from a table to scores."""
 
 from __future__ import annotations
 

@@ -23,7 +23,6 @@ import sys
 from studies import command as study
 from nnode.app.cli.run import run
 if __name__ == "__main__":
-    sys.argv[0] = "scripts/study.py"
     study.STUDIES["traffic"] = "tests.studies.tiny"
     run("study", study.study)
 """
@@ -71,7 +70,7 @@ def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
     assert list(pd.read_csv(tmp_path / "squares.csv")["y"]) == [1.0, 4.0]
     page = (tmp_path / "study.md").read_text()
     assert page.startswith("# Squares\n\nOf *two* numbers.\n")
-    assert f"- Command: python scripts/study.py {' '.join(command)}" in page
+    assert f"- Command: nnode study {' '.join(command)}" in page
     assert "torch" in page
 
 

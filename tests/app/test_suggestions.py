@@ -117,8 +117,7 @@ CASES = [
 def commands(printed: str) -> list[list[str]]:
     """The commands that a check printed."""
     lines = [line.strip() for line in printed.splitlines()]
-    found = [shlex.split(line) for line in lines if line.startswith("python scripts/")]
-    return [[Path(words[1]).stem, *words[2:]] for words in found]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("nnode ")]
 
 
 def python(printed: str) -> str:
@@ -204,4 +203,4 @@ def test_a_command_recognises_columns_and_units(script: Script, tmp_path: Path) 
         f"hydra.run.dir={tmp_path / 'no'}",
     )
     assert done.returncode == 2
-    assert "has no columns of data=vehicles; python scripts/check.py" in done.stderr
+    assert "has no columns of data=vehicles; nnode check" in done.stderr

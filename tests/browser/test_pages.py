@@ -38,7 +38,7 @@ def pages(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     folder = tmp_path_factory.mktemp("report")
     inputs, found = with_faults(traffic), deepcopy(traffic.found)
     found.diagnosis.data_faults = inputs.data_faults
-    draw(inputs, found, traffic.options, CONFIG, ["python scripts/evaluate.py X"], folder)()
+    draw(inputs, found, traffic.options, CONFIG, ["nnode evaluate X"], folder)()
     examined = examine(saved(cars(), folder))
     write_page(blocks(examined, ["data=vehicles"]), folder, title="Check", stem="check")
     studies = {name: STUDIES / name / "study.html" for name in ("traffic", "crowd")}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -31,11 +30,8 @@ MADE = {"model=lin_with_speed_zone", "data=i80"}
 def test_every_command_has_options_that_exist(page: Path) -> None:
     for language, text in blocks(page):
         for command in examples(text) if language == "sh" else []:
-            words = shlex.split(command, comments=True)
-            place = next(i for i, word in enumerate(words) if word.startswith("scripts/"))
-            if "…" in words or MADE & set(words):
-                continue
-            composed(Path(words[place]).stem, *words[place + 1 :])
+            if "…" not in command and not MADE & set(command):
+                composed(*command)
 
 
 def test_every_link_leads_somewhere() -> None:
@@ -47,7 +43,7 @@ def test_every_link_leads_somewhere() -> None:
 
 @pytest.mark.thorough
 def test_your_own_data_in_python(tmp_path: Path) -> None:
-    (text,) = (t for lang, t in blocks(README) if lang == "python" and "mine.csv" in t)
+    text = "".join(t for lang, t in blocks(README) if lang == "python" and "mine.csv" in t)
     rows = [
         (number, time, f"{number}/{i}", x)
         for number, one in enumerate(platoons(number=6, seconds=8.0))

@@ -1,1 +1,1 @@
-"""Command lines: options, help, checks, folders, launchers; what every script shares."""
+"""Command lines: options, help, checks, folders, launchers; what every command shares."""

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import plain
 from nnode.app.cli.typed import literal
+from nnode.model.laws import LAW_MODELS, entries
 from nnode.program import words
 
 #: A dataclass's field with the comments above it and beside it.
@@ -36,11 +37,10 @@ _FLAGS = {
 }
 
 
-def help_text(name: str, conf: Path, *, _root_: DictConfig) -> str:
+def help_text(name: str, *, _root_: DictConfig) -> str:
     """The help of a command, as a template of Hydra's.
 
     Args:
-        conf: the folder ``conf/``.
         _root_: the composed configuration, Hydra's part with it.
     """
     hydra = _root_.hydra
@@ -48,14 +48,16 @@ def help_text(name: str, conf: Path, *, _root_: DictConfig) -> str:
     choices = []
     for group, chosen in hydra.runtime.choices.items():
         if not group.startswith("hydra/"):
-            files = sorted(p for folder in folders for p in (folder / group).glob("*.yaml"))
-            rows = [_row(f"{' *'[p.stem == chosen]} {p.stem}", said_of(p), 18) for p in files]
+            about = {name: entries()[name]["about"] for name in LAW_MODELS if group == "model"}
+            files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
+            about |= {path.stem: said_of(path) for path in files}
+            rows = [_row(f"{' *'[n == chosen]} {n}", said, 18) for n, said in sorted(about.items())]
             choices.append("\n".join([f"{group}=", *rows]))
     if choices:
         choices.insert(0, "Choices, GROUP=NAME; those with * are taken now")
     config = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
     head = "Options, NAME=VALUE, with their values now; null means none"
-    parts = [words(name, conf), *choices, head, "\n".join(_options(_root_, plain(config)))]
+    parts = [words(name), *choices, head, "\n".join(_options(_root_, plain(config)))]
     place = re.sub(r"\d{4}(-\d\d){2}_\d\d(-\d\d){2}", "TIME", hydra.run.dir)
     flags = {"hydra.run.dir=FOLDER": f"folder of the results; without it {place}", **_FLAGS}
     parts.append("\n".join(["Running", *(_row(*flag) for flag in flags.items())]))

@@ -25,10 +25,15 @@ from hydra.errors import (
     SearchPathException,
 )
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException, ValidationError
+from omegaconf.errors import (
+    InterpolationToMissingValueError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+    ValidationError,
+)
 
 from nnode.errors import ConfigError
-from nnode.program import configuration, typed
+from nnode.program import configuration
 
 #: What an option's value must be, by OmegaConf's name of the type.
 _KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
@@ -42,7 +47,7 @@ def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]
         overrides, flags: as they were typed.
     """
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
-    said = str(cause).splitlines()[0] if str(cause) else type(cause).__name__
+    said = _first_line(cause)
     if isinstance(error, OverrideParseException):
         return ConfigError(
             f"{error.override} cannot be read: expected NAME=VALUE, a list [A, B] or a mapping "
@@ -67,22 +72,37 @@ def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]
         return ConfigError(f"{twice[1]} is chosen twice; type {twice[1]}=NAME once, without a +")
     key = gone[1] if gone else str(getattr(cause, "full_key", None) or "")
     if isinstance(cause, ValidationError):
-        return wrong_value(_typed_for(key, overrides), said, _composed(name, overrides, flags))
+        whole = _typed_for(key, overrides)
+        return wrong_value(key, whole, said, _composed(name, overrides, flags))
     lost = re.match(r"(?:Could not override|Key) '([^']*)'", str(error))
     if (gone or lost) and (key or lost):
         whole = _typed_for(key or str(lost and lost[1]), overrides)
         return unknown_option(whole, _composed(name, overrides, flags), name)
+    return without_value(cause)
+
+
+def without_value(error: Exception) -> ConfigError:
+    """The error of an option that must be given, or refers to what there is not."""
+    said = _first_line(error)
+    if isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
+        key = said.rpartition(" ")[2]
+        return ConfigError(f"{key} is missing; type {key}=VALUE, --help shows examples")
+    said = re.sub(r"^\w+ raised while resolving interpolation: |, possible .* keys: .*", "", said)
     return ConfigError(f"{said}; --help shows examples and all options")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def unknown_choice(group: str, chosen: str, there: Iterable[str]) -> ConfigError:
     """The error of a choice that its group does not have."""
     known = sorted(there)
-    text = f"there is no {group}={chosen}; expected one of {', '.join(known)}"
-    text += _near(chosen, {one: one for one in known})
+    near = _near(chosen, {one: f"{group}={one}" for one in known})
+    text = f"there is no {group}={chosen}{near or ';'} {group} is one of {', '.join(known)}"
     if group == "data" and (Path(chosen).suffix or Path(chosen).exists()):
-        text += typed(
-            f". For a file of your own, python scripts/check.py {chosen} prints the options that "
+        text += (
+            f". For a file of your own, nnode check {chosen} prints the options that "
             "read it; a tidy table is data=table data.path=FILE data.domain=traffic"
         )
     return ConfigError(text)
@@ -121,16 +141,17 @@ def unknown_option(
         every = {one.rpartition(".")[2]: one for one in reversed([*_keys(config)])}
         near = _near(rest.rpartition(".")[2], every, cutoff=0.75)
     whose = at.rstrip(".") or name
-    return ConfigError(f"{text}; {whose} has {', '.join(own)}{more}{near}")
+    return ConfigError(f"{text}{near or ';'} {whose} has {', '.join(own)}{more}")
 
 
-def wrong_value(override: str, said: str, config: DictConfig | None) -> ConfigError:
-    """The error of a value that an option cannot have; ``said``: OmegaConf's words."""
-    key = override.lstrip("+").partition("=")[0]
+def wrong_value(key: str, override: str, said: str, config: DictConfig | None) -> ConfigError:
+    """The error of a value that the option ``key`` cannot have; ``said``: OmegaConf's words."""
+    typed, _, value = override.lstrip("+").partition("=")
+    if typed != key:
+        return ConfigError(f"{override}: {key} is a value, without options of its own")
     if match := re.search(r"could not be converted to (\w+)", said):
         return ConfigError(f"{override}: expected {_KINDS.get(match[1], match[1].lower())}")
     if match := re.search(r"expected one of \[(.*)\]", said):
-        value = override.partition("=")[2]
         known = [one.strip() for one in match[1].split(",")]
         near = _near(value, {one: one for one in known})
         return ConfigError(f"{override}: expected one of {', '.join(known)}{near}")
@@ -146,6 +167,8 @@ def wrong_value(override: str, said: str, config: DictConfig | None) -> ConfigEr
         )
     if "None" in said or "not Optional" in said:
         return ConfigError(f"{override}: null is no value of this option; leave it out")
+    if "is not a ListConfig" in said:
+        return ConfigError(f"{override}: expected a list, such as [{value}]")
     if "convert 'dict'" in said:
         return ConfigError(f"{override}: {key} is a value, without options of its own")
     return ConfigError(f"{override}: {said}")

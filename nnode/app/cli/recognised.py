@@ -11,7 +11,6 @@ from nnode.app.cli.typed import plain_options
 from nnode.data.check.recognise import NEEDED, UNIT, has_columns, recognised
 from nnode.data.sequences import say_recognised
 from nnode.errors import ConfigError, DataError
-from nnode.program import typed
 
 
 def with_recognised(config: DictConfig) -> DictConfig:
@@ -42,8 +41,7 @@ def with_recognised(config: DictConfig) -> DictConfig:
         return config  # the reader's own words are nearer to what was asked for
     if found.group != group or found.table is not None:
         raise ConfigError(
-            f"{place} has no columns of data={group}; "
-            + typed(f"python scripts/check.py {place} prints what reads it")
+            f"{place} has no columns of data={group}; nnode check {place} prints what reads it"
         )
     say_recognised(found)
     merged = config.copy()

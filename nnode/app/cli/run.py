@@ -21,10 +21,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from nnode.app.cli.help import help_text
-from nnode.app.cli.mistakes import in_words, refuse_added
+from nnode.app.cli.mistakes import in_words, refuse_added, without_value
 from nnode.app.cli.prepared import prepared_group
 from nnode.app.cli.runs import RESULT, end, failures, say
 from nnode.app.cli.typed import literal
@@ -33,7 +33,7 @@ from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
 from nnode.errors import ConfigError, NNodeError
 from nnode.files import disk_words, write_json
-from nnode.program import begin, configuration
+from nnode.program import configuration, running
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
@@ -41,20 +41,8 @@ Job = Callable[[DictConfig, Path], None]
 #: Variable of the environment with which Hydra raises errors.
 _RAISE = "HYDRA_FULL_ERROR"
 
-#: Flags of Hydra's, and those that take a value, with the values that there are.
-_FLAGS = (
-    "-h",
-    "--help",
-    "-m",
-    "--multirun",
-    "--version",
-    "--resolve",
-    "-r",
-    "--run",
-    "--hydra-help",
-    "-sc",
-    "--shell-completion",
-)
+#: Flags of Hydra's that are offered, and those that take a value, with the values that there are.
+_FLAGS = ("-h", "--help", "-m", "--multirun", "--version", "--resolve")
 _CFG = ("job", "hydra", "all")
 _VALUED: dict[str, tuple[str, ...]] = {
     "-c": _CFG,
@@ -63,13 +51,6 @@ _VALUED: dict[str, tuple[str, ...]] = {
     "--package": (),
     "-cd": (),
     "--config-dir": (),
-    "-cp": (),
-    "--config-path": (),
-    "-cn": (),
-    "--config-name": (),
-    "-i": (),
-    "--info": (),
-    "--experimental-rerun": (),
 }
 
 
@@ -102,9 +83,8 @@ def run(
     register()
     # on a full disk the log cannot be written either, which shall not bury the run's own words
     logging.raiseExceptions = False
-    begin()
-    folder = configuration()
-    OmegaConf.register_new_resolver("nnode_help", partial(help_text, name, folder), replace=True)
+    running(name)
+    OmegaConf.register_new_resolver("nnode_help", partial(help_text, name), replace=True)
     try:
         if parallel:
             join()
@@ -117,7 +97,7 @@ def run(
     GlobalHydra.instance().clear()  # of a job that has forked this process
     with _out_of_sight() as places, _errors_raised():
         sys.argv[1:] = [*given, *places, *flags]
-        command = hydra.main(version_base="1.3", config_path=str(folder), config_name=name)
+        command = hydra.main(version_base="1.3", config_path=str(configuration()), config_name=name)
         try:
             command(_task(job, name))()
         except (HydraException, OmegaConfBaseException) as error:
@@ -138,9 +118,7 @@ def _task(job: Job, name: str) -> Callable[[DictConfig], None]:
                 refuse_added(config, name)
                 job(config, folder)
         except OmegaConfBaseException as error:
-            lacking = isinstance(error, MissingMandatoryValue)
-            hint = f"; type {error.full_key}=VALUE, --help shows examples" if lacking else ""
-            failed: NNodeError = ConfigError(str(error).splitlines()[0] + hint)
+            failed: NNodeError = without_value(error)
         except NNodeError as error:
             failed = error
         else:
@@ -185,7 +163,7 @@ def _parted(bare: str | None) -> tuple[list[str], list[str]]:
         else:
             overrides.append(f"{bare}={literal(word)}")
             bare = None
-    if len(sys.argv) > 1 and sys.argv[-1] in _VALUED.keys() - {"-i", "--info"}:
+    if len(sys.argv) > 1 and sys.argv[-1] in _VALUED:
         raise ConfigError(f"{sys.argv[-1]} lacks its value; --help shows examples")
     return overrides, flags
 
@@ -201,11 +179,10 @@ def _flag(word: str) -> str:
         return word
     if value and name not in _FLAGS:
         raise ConfigError(f"{word}: options have no dashes; type {word.lstrip('-')}")
-    near = get_close_matches(
-        name, ["--help", "--multirun", "--cfg", "--config-dir", "--version"], n=1
-    )
-    hint = f"; did you mean {near[0]}?" if near else ""
-    raise ConfigError(f"there is no flag {word}{hint}; --help shows all options")
+    flags = [flag for flag in (*_FLAGS, *_VALUED) if flag.startswith("--")]
+    near = get_close_matches(name, flags, n=1, cutoff=0.7)
+    hint = f"; did you mean {near[0]}?" if near else ";"
+    raise ConfigError(f"there is no flag {word}{hint} --help shows all options and flags")
 
 
 @contextmanager

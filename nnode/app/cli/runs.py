@@ -9,12 +9,14 @@ import json
 import logging
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
 import pandas as pd
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from nnode.calibrate.distributed import World
 from nnode.calibrate.interrupt import Interrupted
@@ -36,7 +38,9 @@ class Runs(Callback):
     """Refuses a second run, or a second sweep, where one is at work; gathers a sweep's results."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        _take(Path(config.hydra.run.dir))
+        # a folder named after an option that is missing: Hydra raises the error itself
+        with suppress(OmegaConfBaseException):
+            _take(Path(config.hydra.run.dir))
 
     def on_run_end(self, config: DictConfig, **kwargs: Any) -> None:
         give(Path(config.hydra.run.dir))

@@ -101,7 +101,7 @@ def field_groups(overrides: list[str]) -> list[str]:
 
 
 def train_groups(overrides: list[str]) -> list[str]:
-    """What ``scripts/train.py`` chooses for the user, from a checkpoint or for a law."""
+    """What ``nnode train`` chooses for the user, from a checkpoint or for a law."""
     return saved_groups(overrides, option="resume") or field_groups(overrides)
 
 

@@ -52,14 +52,14 @@ def plain_options(options: object) -> dict[str, Any]:
     return plain(OmegaConf.structured(options))
 
 
-def group_defaults(section: str, group: str, script: str | None = None) -> dict[str, Any]:
+def group_defaults(section: str, group: str, command: str | None = None) -> dict[str, Any]:
     """What a configuration group has where nothing is said, ``???`` where something must be.
 
     Args:
-        script: that has such groups, where the one that runs has not.
+        command: one that has such groups, if the one that runs has none.
     """
     if in_hydra():
-        name = script or HydraConfig.get().job.config_name
+        name = command or HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:
         config = cast(DictConfig, OmegaConf.merge(*written(section, group)))

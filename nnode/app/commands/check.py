@@ -1,12 +1,12 @@
 """What a file of trajectories holds and what is wrong with it, before anything else.
 
 Columns, units, rate and time scale, identifiers, swaps, overlaps, holes, direction, order, who
-comes and goes, how sure all that is, and the options with which the other scripts read the file.
+comes and goes, how sure all that is, and the options with which the other commands read the file.
 
 Examples:
-  python scripts/check.py mine.csv
+  nnode check mine.csv
   # what is known need not be guessed
-  python scripts/check.py people.txt domain=crowd frame_rate=25
+  nnode check people.txt domain=crowd frame_rate=25
 
 Results: a text, and check.html, a page that needs no other file. Nothing is changed.
 """

@@ -1,13 +1,13 @@
 """Find what a model lacks: where it is wrong, which effect is missing, what adding it changes.
 
 Examples:
-  python scripts/discover.py model=lin data=esimas
+  nnode discover model=lin data=esimas
   # your own tables: columns sequence, time, agent, x and, in crowds, y; in SI units
-  python scripts/discover.py model=lin model.leader=measured data=table data.path=F.csv \\
+  nnode discover model=lin model.leader=measured data=table data.path=F.csv \\
       data.domain=traffic
-  python scripts/discover.py model=sf data=table data.path=F.csv data.domain=crowd data.walls=W.csv
+  nnode discover model=sf data=table data.path=F.csv data.domain=crowd data.walls=W.csv
   # not looking for one effect, in a folder of your choice
-  python scripts/discover.py model=lin data=ngsim 'discover.exclude=[inertia]' hydra.run.dir=DIR
+  nnode discover model=lin data=ngsim 'discover.exclude=[inertia]' hydra.run.dir=DIR
 
 Networks (model=n2, n4, n10, nn) hide effects of their own inputs: diagnose a law to see those. The
 effects that are looked for, with formulas, units and sources: python -m nnode.discover.catalogue

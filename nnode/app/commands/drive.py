@@ -2,11 +2,11 @@
 
 Examples:
   # the vehicles of type car; SUMO's steps must be those of the run
-  python scripts/drive.py run=RUN sumo=SCENARIO.sumocfg vehicles=car
+  nnode drive run=RUN sumo=SCENARIO.sumocfg vehicles=car
   # SUMO makes the run's steps, in a process of its own
-  python scripts/drive.py run=RUN sumo=SCENARIO.sumocfg vehicles=car steps=run program=traci
+  nnode drive run=RUN sumo=SCENARIO.sumocfg vehicles=car steps=run program=traci
   # a law without a speed on an empty road: who is 100 m away counts as nobody
-  python scripts/drive.py run=RUN sumo=SCENARIO.sumocfg vehicles=[car,truck] far=100
+  nnode drive run=RUN sumo=SCENARIO.sumocfg vehicles=[car,truck] far=100
 
 Results: fcd.xml.gz, all vehicles' trajectories, which data=sumo reads; drive.json, how many were
 driven, how fast, collisions and teleports. docs/exchange.md says what SUMO is told and asked.

@@ -2,10 +2,10 @@
 
 Examples:
   # on the sequences that its training held out
-  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt
+  nnode evaluate checkpoint=RUN/checkpoints/best.pt
   # on other data
-  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
-  python scripts/evaluate.py checkpoint=RUN/checkpoints/best.pt part=all
+  nnode evaluate checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
+  nnode evaluate checkpoint=RUN/checkpoints/best.pt part=all
 
 Results: a table, metrics.json, and replay.html, in which agents move. Data and solver are those of
 the training where none are chosen.

@@ -2,10 +2,10 @@
 
 Examples:
   # all that fit the run's model
-  python scripts/export.py run=RUN
+  nnode export run=RUN
   # the social force's parameters for JuPedSim, a law's for SUMO
-  python scripts/export.py run=RUN to=jupedsim
-  python scripts/export.py run=RUN 'to=[pedpy,parquet]' trajectories=simulated part=heldout
+  nnode export run=RUN to=jupedsim
+  nnode export run=RUN 'to=[pedpy,parquet]' trajectories=simulated part=heldout
 
 Results: the files, and what of the model has no counterpart there; docs/exchange.md. Data are those
 of the run where none are chosen.

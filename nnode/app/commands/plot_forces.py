@@ -1,11 +1,11 @@
 """Force plots of one or many calibrated models.
 
 Examples:
-  python scripts/plot_forces.py checkpoint=RUN/checkpoints/best.pt
+  nnode plot_forces checkpoint=RUN/checkpoints/best.pt
   # several models of traffic in one picture
-  python scripts/plot_forces.py 'checkpoint=[A/checkpoints/best.pt,B/checkpoints/best.pt]'
+  nnode plot_forces 'checkpoint=[A/checkpoints/best.pt,B/checkpoints/best.pt]'
   # a crowd's force within 2 m
-  python scripts/plot_forces.py checkpoint=RUN/checkpoints/best.pt extent=2
+  nnode plot_forces checkpoint=RUN/checkpoints/best.pt extent=2
 
 Results: traffic, forces.png and forces.csv; crowds, contours of both components of the force and
 the six settings of the paper. The histogram of gaps is that of the first checkpoint's data.

@@ -1,17 +1,17 @@
 """Turn raw recordings into sequences, with a manifest of everything kept and dropped.
 
-Other scripts do so on the fly; this one does it once, to look at what became of the files.
+Other commands do so on the fly; this one does it once, to look at what became of the files.
 
 Examples:
   # the paper's traffic data, downloaded or from the folder in NNODE_DATA
-  python scripts/prepare_data.py data=esimas
-  python scripts/prepare_data.py data=juelich data.source=FOLDER_OR_URL
+  nnode prepare_data data=esimas
+  nnode prepare_data data=juelich data.source=FOLDER_OR_URL
   # your own files
-  python scripts/prepare_data.py data=table data.path=mine.csv data.domain=traffic
-  python scripts/prepare_data.py data=vehicles data.path=FILE 'data.columns={vehicle: id, x: pos}'
-  python scripts/prepare_data.py data=ngsim data.path=FILE
-  python scripts/prepare_data.py data=pairs data.path=FOLDER 'data.columns={time: t, spacing: gap}'
-  python scripts/prepare_data.py data=sumo data.path=fcd.xml
+  nnode prepare_data data=table data.path=mine.csv data.domain=traffic
+  nnode prepare_data data=vehicles data.path=FILE 'data.columns={vehicle: id, x: pos}'
+  nnode prepare_data data=ngsim data.path=FILE
+  nnode prepare_data data=pairs data.path=FOLDER 'data.columns={time: t, spacing: gap}'
+  nnode prepare_data data=sumo data.path=fcd.xml
 
 Results: the sequences, manifest.json, and pictures of those with faults. Train with
 data.prepared=FOLDER, and no other option of the data.

@@ -2,12 +2,12 @@
 
 Examples:
   # what the run held out, 99 times, scored beside the model without noise and constant speeds
-  python scripts/simulate.py run=RUN
-  python scripts/simulate.py run=RUN samples=399 seed=1
+  nnode simulate run=RUN
+  nnode simulate run=RUN samples=399 seed=1
   # the samples as SUMO or PedPy have trajectories; scores alone
-  python scripts/simulate.py run=RUN format=fcd
-  python scripts/simulate.py run=RUN format=pedpy
-  python scripts/simulate.py run=RUN format=null
+  nnode simulate run=RUN format=fcd
+  nnode simulate run=RUN format=pedpy
+  nnode simulate run=RUN format=null
 
 Results: scores.json, the noise, CRPS and what bands cover; bands.png; samples.parquet, which
 data=table reads, of people with walls.csv. docs/sampling.md has the other formats and how noise is

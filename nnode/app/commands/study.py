@@ -1,12 +1,12 @@
 """Redo the paper's studies on the real recordings; ends with one page beside its printed numbers.
 
 Examples:
-  python scripts/study.py study=traffic
+  nnode study study=traffic
   # shows within a minute that all works; no figures to cite
-  python scripts/study.py study=crowd study.quick=true
+  nnode study study=crowd study.quick=true
   # pairs and platoons that the study cannot download: a folder with ngsim_pairs, openacc, tgsim
-  NNODE_DATA=FOLDER python scripts/study.py study=following
-  python scripts/study.py study=traffic study.workers=8 hydra.run.dir=runs/study/mine
+  NNODE_DATA=FOLDER nnode study study=following
+  nnode study study=traffic study.workers=8 hydra.run.dir=runs/study/mine
 
 Results: study.html, the same in Markdown, and a CSV of every table and of all parameters. The same
 command goes on where it was stopped.

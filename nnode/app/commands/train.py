@@ -2,22 +2,22 @@
 
 Examples:
   # one recording of the paper's, its four-neuron network
-  python scripts/train.py model=n4 data=esimas data.recording=1-1_1
+  nnode train model=n4 data=esimas data.recording=1-1_1
   # compiled kernels and L-BFGS: a hundred times faster
-  python scripts/train.py model=lin data=esimas solver=fused optimizer=lbfgs
+  nnode train model=lin data=esimas solver=fused optimizer=lbfgs
   # the field's laws, by Gauss and Newton's method on exact tangents
-  python scripts/train.py model=idm data=ngsim_pairs trainer.cost=spacing
+  nnode train model=idm data=ngsim_pairs trainer.cost=spacing
   # drivers who differ: which parameters, by how much, and those of each driver
-  python scripts/train.py model=idm data=openacc trainer.drivers=auto
+  nnode train model=idm data=openacc trainer.drivers=auto
   # your own table: columns sequence, time, agent, x; in SI units
-  python scripts/train.py model=lin data=table data.path=mine.csv data.domain=traffic
+  nnode train model=lin data=table data.path=mine.csv data.domain=traffic
   # sweeps: every model with every seed, one after the other, or on all cores
-  python scripts/train.py -m model=lin,log,n2 seed=1,2,3
-  python scripts/train.py -m hydra/launcher=cores model=lin,log,n2
+  nnode train -m model=lin,log,n2 seed=1,2,3
+  nnode train -m hydra/launcher=cores model=lin,log,n2
   # mini-batches shared by two processes
-  torchrun --nproc-per-node=2 scripts/train.py model=n4 data=esimas data.recording=1-1_1
+  torchrun --nproc-per-node=2 -m nnode train model=n4 data=esimas data.recording=1-1_1
   # go on with a run that was stopped
-  python scripts/train.py resume=RUN/checkpoints/last.pt hydra.run.dir=RUN
+  nnode train resume=RUN/checkpoints/last.pt hydra.run.dir=RUN
 
 Results: result.json, checkpoints/best.pt and last.pt, and curves for TensorBoard; with
 trainer.drivers also drivers.csv. A sweep ends with sweep.csv. Ctrl-C saves, and says how to go on.

@@ -93,7 +93,8 @@ def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
             raise unknown_option(f"{section}.{key}", known, "nnode", "") from error
         every = OmegaConf.merge(*given)
         value = OmegaConf.select(every, key)
-        raise wrong_value(f"{section}.{key}={value}", said, known) from error
+        full = f"{section}.{key}"
+        raise wrong_value(full, f"{full}={value}", said, known) from error
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{section}: {str(error).splitlines()[0]}") from error
 

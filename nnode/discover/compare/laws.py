@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import cast
 
@@ -39,7 +39,10 @@ ROUNDS = 3
 
 
 def compare_laws(
-    candidates: Mapping[str, System], sequences: list[Sequence], options: DiscoverOptions
+    candidates: Mapping[str, System],
+    sequences: list[Sequence],
+    options: DiscoverOptions,
+    within: Callable[[float], None] = lambda part: None,
 ) -> tuple[Laws, dict[str, System]]:
     """Rank laws on the open clusters of a diagnosis with the same options.
 
@@ -47,6 +50,7 @@ def compare_laws(
         candidates: models by name; they are not changed. Those that the diagnosis cannot simulate
             are told as refused, with the reason.
         sequences: without faults, at least three of them.
+        within: is told which part of the work is done, between 0 and 1.
 
     Returns:
         The ranking, and the laws, calibrated.
@@ -58,7 +62,7 @@ def compare_laws(
     chosen, label = [sequences[i] for i in division.open], division.label[division.open]
     one = next(iter(candidates.values()))
     whole = engine_of(one, chosen, label, whole=True)
-    found, refused = _calibrated(whole, candidates)
+    found, refused = _calibrated(whole, candidates, within)
     if not found:
         return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
@@ -70,7 +74,9 @@ def compare_laws(
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
         engine.settle(found[first].system, ParameterVector(found[first].system).row)
-        found = {n: refine(engine, copy.deepcopy(fit.system)) for n, fit in found.items()}
+        for place, (name, fit) in enumerate(found.items()):
+            within((1 + place / len(found)) / 2)
+            found[name] = refine(engine, copy.deepcopy(fit.system))
         costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
         best = min(costs, key=lambda name: _level(costs[name]))
         if best == first:
@@ -159,12 +165,13 @@ def _level(costs: np.ndarray) -> float:
 
 
 def _calibrated(
-    engine: Engine, candidates: Mapping[str, System]
+    engine: Engine, candidates: Mapping[str, System], within: Callable[[float], None]
 ) -> tuple[dict[str, Fit], dict[str, str]]:
     """Every law from the better of two starts, by the engine's residuals as they are."""
     found: dict[str, Fit] = {}
     refused: dict[str, str] = {}
-    for name, system in candidates.items():
+    for place, (name, system) in enumerate(candidates.items()):
+        within(place / len(candidates) / 2)
         try:
             check_model(system)
         except ConfigError as error:

@@ -21,7 +21,6 @@ from nnode.files import write_text
 from nnode.model import FeedForward, System, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import effects_of
-from nnode.program import scripts, typed
 
 REPORT = "report.json"
 MODEL = "model.yaml"
@@ -241,10 +240,10 @@ def has_network(system: System) -> bool:
 def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
     """A model's options as a file for ``conf/model``."""
     # in a comment: a line break would end it
-    name, own = " ".join(str(options["name"]).split()), "" if scripts() else "--config-dir conf "
+    name = " ".join(str(options["name"]).split())
     lines = [
-        f"# Made by {typed('python scripts/discover.py')}. "
-        f"Copy it to conf/model/{name}.yaml, then: {own}model={name}",
+        f"# Made by nnode discover. Copy it to conf/model/{name}.yaml, "
+        f"then: nnode train --config-dir conf model={name}",
     ]
     if networks:
         lines.append(f"# The weights of the network are in {CHECKPOINT} only: these would be new.")

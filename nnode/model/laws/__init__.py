@@ -57,6 +57,7 @@ _MAPPINGS = (*_COMMON, "delayed", "states", *REDUCED)
 #: A network that is added to a law, by its order: inputs are brought to the size of one, SI units.
 _ADDED = {1: "NN(gap/20)", 2: "NN(gap/20, v/10, dv/2)"}
 _PARAMETER = {"value", "low", "high", "unit"}
+_ENDS = {"low": "at least", "high": "at most"}
 
 
 @cache
@@ -217,11 +218,19 @@ class Law(Term):
             found = {key: in_si(str(value)) for key, value in entry.items()}
             units = {own for _, own in found.values()}
             if len(units) > 1:
+                said = ", ".join(f"{key} {value}" for key, value in entry.items())
                 raise ConfigError(
-                    f"model.law.parameters.{name} has the units {', '.join(sorted(units))}; value, "
-                    "low and high need the same kind of unit"
+                    f"model.law.parameters.{name} has {said}: expected quantities with one kind of "
+                    f"unit, such as '3 {max(units - {'1'})}'"
                 )
             bounds = {key: value for key, (value, _) in found.items() if key != "value"}
+            within = Interval(**bounds)
+            if not within.low <= found["value"][0] <= within.high:
+                ends = [f"{word} {entry[key]}" for key, word in _ENDS.items() if key in entry]
+                raise ConfigError(
+                    f"model.law.parameters.{name}.value={entry['value']}: a start value of {name} "
+                    f"must be {' and '.join(ends)}"
+                )
             if "low" in bounds and options.get(f"{name}_min") is not None:
                 bounds["low"] = float(options.pop(f"{name}_min"))
             start = found["value"][0] if drawn is None else drawn

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -22,7 +22,7 @@ SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help_names_purpose_choices_options_and_results(name: str) -> None:
     config = composed(name)
-    text = help_text(name, CONF, _root_=config)
+    text = help_text(name, _root_=config)
     assert text.splitlines()[0].endswith(".")
     assert "\nExamples:\n" in text
     assert "\nResults: " in text
@@ -31,22 +31,22 @@ def test_help_names_purpose_choices_options_and_results(name: str) -> None:
         assert group.startswith("hydra/") or f"\n{group}=\n" in text
         assert group.startswith("hydra/") or chosen is None or f"\n  * {chosen} " in text
     assert max(len(line) for line in text.splitlines()) <= 100
+    assert not re.search(r":\w+:`|``", text)  # markup of docstrings
+    assert not re.search(r"((?:\w+ \| )+\w+): \1", text)  # choices that are said twice
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_every_example_has_options_that_exist(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setenv("NNODE_SCRIPTS", str(ROOT))
-    commands = examples(words(name, CONF))
+def test_every_example_has_options_that_exist(name: str) -> None:
+    commands = examples(words(name))
     assert commands
     for command in commands:
-        parts = shlex.split(command)
-        assert f"scripts/{name}.py" in parts
-        composed(name, *parts[parts.index(f"scripts/{name}.py") + 1 :])
+        assert command[0] == name
+        composed(*command)
 
 
 def test_a_wrong_example_would_be_found() -> None:
-    (command,) = examples("Examples:\n  python scripts/train.py modle=lin \\\n    seed=1\n")
-    assert command == "python scripts/train.py modle=lin seed=1"
+    (command,) = examples("Examples:\n  nnode train modle=lin \\\n    seed=1\n")
+    assert command == ["train", "modle=lin", "seed=1"]
 
 
 def test_every_option_and_every_choice_says_what_it_means() -> None:
@@ -57,7 +57,7 @@ def test_every_option_and_every_choice_says_what_it_means() -> None:
         silent = {field.name for field in fields(kind)} - set(remarks(kind)) - groups
         assert not silent, f"{key}: a comment beside {silent} becomes their line of the help"
     for path in CONF.glob("*/*.yaml"):
-        assert len(said_of(path)) > 3, path
+        assert re.fullmatch(r".+\.", said_of(path)), path
 
 
 def test_a_script_prints_its_help_with_choices_of_one_s_own(script: Script, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def start(*overrides: str, temporary: Path) -> subprocess.Popen[str]:
     """Two processes; their temporary files go to a folder of their own."""
     temporary.mkdir(exist_ok=True)
     return subprocess.Popen(
-        [*TORCHRUN, "scripts/train.py", *overrides],
+        [*TORCHRUN, "-m", "nnode", "train", *overrides],
         cwd=ROOT,
         env={**environment(), "TMPDIR": str(temporary)},
         stdout=subprocess.PIPE,

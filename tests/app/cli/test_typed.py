@@ -138,9 +138,8 @@ def test_only_what_differs_is_told() -> None:
     ],
 )
 def test_the_printed_training_reads_the_data_of_the_diagnosis(
-    monkeypatch: pytest.MonkeyPatch, model: str, given: list[str], tmp_path: Path
+    model: str, given: list[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("NNODE_SCRIPTS", str(CONF.parent))
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("discover", [f"model={model}", *given], return_hydra_config=True)
         HydraConfig.instance().set_config(config)
@@ -151,16 +150,13 @@ def test_the_printed_training_reads_the_data_of_the_diagnosis(
             command = _commands({**told, "model": {"name": model}}, tmp_path)[-1]
         finally:
             HydraConfig.instance().cfg = None
-    python, script, *overrides = shlex.split(command)
-    assert [python, script] == ["python", "scripts/train.py"]
+    program, name, *overrides = shlex.split(command)
+    assert [program, name] == ["nnode", "train"]
     read = composed("train", *overrides)
     assert OmegaConf.to_container(read.data, resolve=True, enum_to_str=True) == told["data"]
 
 
-def test_the_installed_program_finds_a_model_in_a_folder_of_the_user_s(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.delenv("NNODE_SCRIPTS", raising=False)
+def test_the_printed_training_finds_the_model_in_a_folder_of_the_user_s(tmp_path: Path) -> None:
     data = {**group_defaults("data", "table"), "path": "drive.csv", "domain": "traffic"}
     config = {"model": {"name": "mine"}, "data": data, "groups": {"data": "table"}}
     *_, copy, train = _commands(config, tmp_path)

@@ -50,7 +50,7 @@ def written(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     inputs = with_faults(traffic)
     found = deepcopy(traffic.found)
     found.diagnosis.data_faults = inputs.data_faults
-    write = draw(inputs, found, traffic.options, CONFIG, ["python scripts/evaluate.py X"], folder)
+    write = draw(inputs, found, traffic.options, CONFIG, ["nnode evaluate X"], folder)
     assert list(folder.iterdir()) == []  # drawn is not written
     paths = write()
     assert paths == {"page": folder / "report.html", "tensorboard": folder / "tensorboard"}
@@ -80,7 +80,7 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
     heads = re.findall(r"<h2[^>]*>([^<]*)</h2>", page.replace("&#39;", "'"))
     assert heads == order
     for words in (
-        "python scripts/evaluate.py X",
+        "nnode evaluate X",
         "position in [400, 600] m: −6.1 ± 0.4 m/s, 71 % of the excess error",
         "platoons at other times",
         "car 1 jumps",

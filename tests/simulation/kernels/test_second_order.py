@@ -124,7 +124,11 @@ def test_effects_act_on_a_law_of_one_s_own(ragged: Any) -> None:
         ({"rate": {"x": "__import__('os').system('true')"}}, "not allowed"),
         ({"parameters": {"v0": "fast"}}, "no quantity"),
         ({"parameters": {"v0": {"low": "1 m/s"}}}, "expected a quantity"),
-        ({"parameters": {"v0": {"value": "1 m/s", "low": "2 s"}}}, "same kind of unit"),
+        ({"parameters": {"v0": {"value": "1 m/s", "low": "2 s"}}}, "one kind of unit"),
+        (
+            {"parameters": {"v0": {"value": "-1 m/s", "low": "2 m/s", "high": "9 m/s"}}},
+            "a start value of v0 must be at least 2 m/s and at most 9 m/s",
+        ),
         ({"parameters": {"a b": "1"}}, "cannot be a name"),
         ({"colour": "red"}, "unknown entries colour"),
     ],
