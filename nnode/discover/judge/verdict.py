@@ -147,10 +147,12 @@ def _absence(score: Score, way: Way) -> Absence:
     expected, detectable, least, where = strength.expected, math.inf, 0.0, ""
     if known and effect.consecutive:
         # the interval that explains most was chosen for chance: one of median precision is judged
-        one = sorted(score.evidence, key=lambda one: one.error)[len(score.evidence) // 2]
+        one = sorted(score.evidence, key=lambda each: each.error)[len(score.evidence) // 2]
         detectable, amount, error = way.detectable(score, one, expected), one.amount, one.error
-        ends, of = (one.options[end] for end in "ab"), effect.settings["a"].unit
-        where = "{:.0f} to {:.0f} ".format(*ends) + f"{of}: the median precision of such intervals"
+        where = (
+            f"from {one.options['a']:.0f} to {one.options['b']:.0f} {effect.settings['a'].unit}; "
+            "half of the intervals of this length are known better"
+        )
     elif known and effect.remembers():
         # what was tried at a size says nothing of smaller ones
         found = [

@@ -338,7 +338,7 @@ class Screen:
                         float(amount[k]),
                         float(error[k]),
                     )
-                    for k in np.flatnonzero(usual_length)
+                    for k in np.flatnonzero(usual_length).tolist()
                 ],
             )
         ]
