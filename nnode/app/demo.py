@@ -28,7 +28,8 @@ from nnode.app.cli.saved import GROUPS
 from nnode.app.python.report import Report
 from nnode.app.train import train
 from nnode.config import register
-from nnode.data.synthetic import SlowZone, demo_data
+from nnode.data.store import Store
+from nnode.data.synthetic import Forces, SlowZone, demo_data
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report.files import amount, interval
 from nnode.errors import NNodeError
@@ -43,12 +44,14 @@ from nnode.pages.page import (
     Text,
     write_page,
 )
-from nnode.plots import force_contours, measured_gaps, speed_curves
+from nnode.plots import force_figure, measured_gaps, speed_curves
 from nnode.program import configuration
 from nnode.simulation.base import DEFAULT_STEP
 
 #: Steps of Euler's scheme of the compared calibrations, s: the paper's, and ten times that.
 STEPS = (DEFAULT_STEP["traffic", 1], 10 * DEFAULT_STEP["traffic", 1])
+#: A force that is taken for none, N.
+_WEAK = 0.1
 #: What the page is called, in the demonstration's folder.
 PAGE = "demo"
 
@@ -107,7 +110,7 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     _step("Results")
     for what, path in {
         "checkpoints": f"{folder}/*/checkpoints/best.pt",
-        "force plots": f"{folder}/figures/law.png, {folder}/figures/force_x.png",
+        "force plots": f"{folder}/figures/law.png, {folder}/figures/force.png",
         "loss curves": f"tensorboard --logdir {folder}",
         "diagnosis in full": folder / "diagnosis" / "report.html",
         "your own table": "nnode check mine.csv",
@@ -148,7 +151,8 @@ def _summary(report: Report, nothing: Report) -> list[Block]:
             "law alone and with the effect that the diagnosis adds. Dashed lines are the edges of "
             "the hidden zone, which the diagnosis is not told. Every driver is simulated as the "
             "typical driver, for two seconds at a time, so differences between drivers remain on "
-            "the right. Grey: nobody was there.",
+            "the right. The law alone was fitted to the zone as well, so it deviates outside it "
+            "too. Grey: nobody was there.",
             f"Two space-time maps; {errors}.",
         ),
     ]
@@ -426,7 +430,7 @@ def _absent(report: Report) -> list[Block]:
         {
             "effect": one.name,
             "coefficient": one.coefficient,
-            "found from": one.detectable if one.testable else float("nan"),
+            "found from": amount(one.detectable if one.testable else None),
             "unit": "" if one.unit == "1" else one.unit,
             "remark": one.reason,
         }
@@ -439,9 +443,9 @@ def _absent(report: Report) -> list[Block]:
             "absences",
             pd.DataFrame(rows),
             "*Found from*: the smallest change of the coefficient that is named, and confirmed on "
-            "held-back platoons, with a probability of 80 %. Where nothing is hidden, a diagnosis "
-            f"names something in at most {100 * DiscoverOptions().alpha:g} % of such tables.",
-            digits=4,
+            "held-back platoons, with a probability of 80 %. The search has a level of "
+            f"{100 * DiscoverOptions().alpha:g} % over all effects: where nothing is hidden, it "
+            "may find something in about that share of tables.",
         ),
     ]
 
@@ -453,9 +457,10 @@ def _missed(report: Report) -> str:
         return ""
     if not zone.testable:
         return f"A slow zone may have been missed: {zone.reason}."
+    size = amount(100 * (zone.detectable or 0))
     return (
-        f"A zone that changes speeds by {100 * (zone.detectable or 0):.2g} % or more would have "
-        f"been named with a probability of at least 80 % ({zone.reason}); a weaker one may have "
+        f"A zone that changes speeds by {size} % or more would have been "
+        f"named with a probability of at least 80 % ({zone.reason}); a weaker one may have "
         "been missed."
     )
 
@@ -478,7 +483,8 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     train(config, folder)
     costs = json.loads((folder / RESULT).read_text(encoding="utf-8"))["summary"]
     checkpoint = folder / "checkpoints" / "best.pt"
-    model = nnode.load(checkpoint)
+    model, store, forces = nnode.load(checkpoint), Store(folder / "data"), Forces()
+    reach = 2 * forces.r + forces.B * np.log(forces.A / _WEAK)
     command = f"nnode train experiment=demo_crowd data.source={path.parents[1]}"
     return [
         Heading("Forces between people"),
@@ -491,16 +497,15 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
             f"{amount(costs['cost_heldout'])} m² s. The force is drawn from the checkpoint; "
             "TensorBoard shows the loss by epoch."
         ),
-        *(
-            FigureBlock(
-                f"force_{axis}",
-                force_contours(model, component),
-                f"The component of the force along {axis} by the relative position of two people, "
-                "for four relative velocities, as the paper draws it. The networks learn it where "
-                "people were; elsewhere it is extrapolated.",
-                f"Contours of the force along {axis} by relative position.",
-            )
-            for component, axis in enumerate("xy")
+        FigureBlock(
+            "force",
+            force_figure(model, [store[i] for i in range(len(store))]),
+            "Both components of the force on one of two people who meet head-on, by relative "
+            "position. Dots are relative positions of people who were measured at one time. The "
+            "data were made with a repulsion that falls below "
+            f"{_WEAK:g} N at {reach:.2g} m, so what is drawn beyond is the error of this short "
+            "calibration.",
+            "Contours of both components of a force by relative position.",
         ),
     ]
 
