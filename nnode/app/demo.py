@@ -92,7 +92,7 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     facts = how_made(("torch", "numpy", "scipy", "matplotlib"))
     page, *_ = write_page(
         [
-            *_summary(report, nothing),
+            *_summary(report, nothing, truth),
             *data,
             *checked,
             *calibration,
@@ -125,18 +125,18 @@ def _step(title: str) -> None:
     print(f"\n== {title}", flush=True)
 
 
-def _summary(report: Report, nothing: Report) -> list[Block]:
+def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
     gap = report.gap
     lines = [
         f"**With a hidden slow zone:** {report.sentence}",
         f"**With nothing hidden:** {nothing.sentence} {_missed(nothing)}",
     ]
     if report.effects:
-        lines.insert(1, f"**The estimate:** {_named(report)}.")
+        hidden = f"alpha = {truth.alpha:g}, a = {truth.a:g} m, b = {truth.b:g} m"
+        lines.insert(1, f"**Estimate:** {_named(report)}. **Hidden:** {hidden}.")
     figure = report.plot("map")
-    places = SlowZone()
     for ax in figure.axes[: 1 + bool(report.effects)]:
-        for place in (places.a, places.b):
+        for place in (truth.a, truth.b):
             ax.axhline(place, color="black", linewidth=0.9, linestyle="--")
     errors = f"error on held-back platoons: {amount(gap.before)} m²"
     if report.effects:
@@ -417,7 +417,8 @@ def _found(report: Report, truth: SlowZone) -> list[Block]:
             "sealed",
             report.plot("sealed"),
             f"Every held-back platoon before and after; mean {amount(gap.before)} m² before, "
-            f"{amount(gap.after)} m² after. {gap.definition}",
+            f"{amount(gap.after)} m² after. {gap.definition} The law and the effects are those of "
+            "the searched platoons; a driver's own deviation is estimated from the held-back one.",
             "Mean square errors of held-back platoons, in pairs.",
         ),
     ]
@@ -442,8 +443,9 @@ def _absent(report: Report) -> list[Block]:
         TableBlock(
             "absences",
             pd.DataFrame(rows),
-            "*Found from*: the smallest change of the coefficient that is named, and confirmed on "
-            "held-back platoons, with a probability of 80 %. The search has a level of "
+            "*Found from*: the smallest change of the coefficient, or the setting of an effect that "
+            "has no strength, that is named and confirmed on held-back platoons with a probability "
+            "of 80 %. The search has a level of "
             f"{100 * DiscoverOptions().alpha:g} % over all effects: where nothing is hidden, it "
             "may find something in about that share of tables.",
         ),
