@@ -443,9 +443,9 @@ def _absent(report: Report) -> list[Block]:
         TableBlock(
             "absences",
             pd.DataFrame(rows),
-            "*Found from*: the smallest change of the coefficient, or the setting of an effect that "
-            "has no strength, that is named and confirmed on held-back platoons with a probability "
-            "of 80 %. The search has a level of "
+            "*Found from*: the smallest change of the coefficient, or the setting of an effect "
+            "without a strength, that is named and confirmed on held-back platoons with a "
+            "probability of 80 %. The search has a level of "
             f"{100 * DiscoverOptions().alpha:g} % over all effects: where nothing is hidden, it "
             "may find something in about that share of tables.",
         ),
