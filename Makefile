@@ -13,30 +13,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"
 	touch $@
 
+# Check, calibration and diagnosis of synthetic tables, and the paper's crowd, on one page.
 demo: setup
 	rm -rf $(DEMO)
-	$(BIN)/python -m nnode.data.synthetic $(DEMO)/raw
-	@echo "== traffic: cars in a lane, linear law, true v0 = 25 m/s and L = 6 m"
-	$(BIN)/python scripts/train.py experiment=demo_traffic data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/traffic
-	@echo "== crowd: people in a corridor, forces as networks"
-	$(BIN)/python scripts/train.py experiment=demo_crowd data.source=$(DEMO)/raw hydra.run.dir=$(DEMO)/crowd
-	@echo "== what the table of platoons holds"
-	$(BIN)/python scripts/check.py $(DEMO)/raw/platoons.csv
-	@echo "== diagnosis: the linear law on platoons; hidden: a slow zone (speeds x 0.65 from 350 to 450 m),"
-	@echo "   drivers whose speeds differ by 5 %, noise of 0.1 m; 30 % of the platoons are held back"
-	$(BIN)/python scripts/discover.py model=lin model.leader=measured data=table data.domain=traffic \
-	  data.path=$(DEMO)/raw/platoons.csv 'discover.compare=[lin,log]' hydra.run.dir=$(DEMO)/diagnosis
-	@echo "== results"
-	@$(BIN)/python scripts/plot_forces.py checkpoint=$(DEMO)/traffic/checkpoints/best.pt hydra.run.dir=$(DEMO)/traffic/forces
-	@$(BIN)/python scripts/plot_forces.py checkpoint=$(DEMO)/crowd/checkpoints/best.pt hydra.run.dir=$(DEMO)/crowd/forces
-	@echo "== estimates beside the truth"
-	@$(BIN)/python -m nnode.data.synthetic --compare $(DEMO)
-	@echo "TensorBoard: $(BIN)/tensorboard --logdir $(DEMO)"
-	@echo "runs:        $(DEMO)/traffic/tensorboard $(DEMO)/crowd/tensorboard $(DEMO)/diagnosis/tensorboard"
-	@echo "checkpoints: $(DEMO)/traffic/checkpoints/best.pt $(DEMO)/crowd/checkpoints/best.pt"
-	@echo "force plots: $(DEMO)/traffic/forces/forces.png $(DEMO)/crowd/forces/nn_force_x.png"
-	@echo "a table of your own: $(BIN)/python scripts/check.py mine.csv"
-	@echo "diagnosis:   $(DEMO)/diagnosis/report.html"
+	$(BIN)/python -m nnode.app.demo $(DEMO)
 
 # Files of tests side by side, on at most four cores.
 test: setup

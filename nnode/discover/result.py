@@ -105,7 +105,8 @@ class Absence:
             included, with a probability of 80 %.
         coefficient: the strength that is limited; ``unit`` is its unit.
         detectable: smallest deviation from neutral that is named with 80 % power; of an effect
-            without a strength its setting.
+            without a strength its setting. Of an effect on an interval, for an interval of the
+            usual length and of median precision, which ``reason`` names.
         bound: it is absent to within this deviation (95 %); None where not testable.
         reason: in words.
     """

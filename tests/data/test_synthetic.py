@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -26,8 +25,7 @@ from nnode.data.synthetic import (
     social_force,
     traffic_recording,
 )
-from nnode.data.synthetic.truth import TRAFFIC, beside_truth
-from nnode.errors import ConfigError, DataError
+from nnode.errors import ConfigError
 
 
 def platoons(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -285,45 +283,13 @@ def test_drivers_and_noise_of_platoons_are_as_asked_for(tmp_path: Path) -> None:
     assert same[0] == same[1]
 
 
-def test_estimates_stand_beside_the_truth(tmp_path: Path) -> None:
-    truth = SlowZone()
-    parameters = {
-        name: {"value": value, "low": None, "high": None, "unit": unit}
-        for name, value, unit in (("lin.v0", 24.9, "m/s"), ("lin.L", 6.1, "m"))
-    }
-    effect = {
-        "name": "speed_zone",
-        "coefficients": {"alpha": {"value": 0.66, "low": 0.6, "high": 0.7, "unit": "1"}},
-    }
-    report = {
-        "verdict": "named",
-        "effects": [effect],
-        "drivers": [{"name": "v0", "estimate": 4.8, "lower": 4.1, "upper": 5.6}],
-        "split": {"open": ["a", "b"], "sealed": ["c"]},
-        "places": [
-            {"variable": "position", "low": 351, "high": 449, "deviation": -4.0, "error": 0.1}
-        ],
-        "base": {"lin.v0": {"after": 28.2, "unit": "m/s"}, "lin.L": {"after": 6.0, "unit": "m"}},
-        "gap": {"before": 30.0, "after": 0.25, "noise_floor": 0.011},
-    }
-    with pytest.raises(DataError, match="run `make demo` first"):
-        beside_truth(tmp_path)
-    for name, content in (
-        ("traffic/result", {"parameters": parameters}),
-        ("diagnosis/report", report),
-    ):
-        path = tmp_path / f"{name}.json"
-        path.parent.mkdir()
-        path.write_text(json.dumps(content))
-    told = beside_truth(tmp_path)
-    for words in (
-        f"v0 (m/s)                     truth {TRAFFIC['v0']:g}     estimate 24.9",
-        "3 platoons, among them 1 held back",
-        "effects named:      speed_zone (verdict: named)",
-        "between 351 and 449 m, by -4.00 ± 0.10 m/s (the slow zone lies between 350 and 450 m)",
-        f"speed_zone.alpha             truth {truth.alpha:g}   estimate 0.66 [0.6, 0.7]",
-        "v0 between drivers (%)       truth 5      estimate 4.8 [4.1, 5.6]",
-        "30 m² before, 0.25 m² after; noise 0.011 m² (truth: 0.01 m²)",
-        str(tmp_path / "diagnosis" / "report.html"),
-    ):
-        assert words in told, words
+def test_tables_of_the_demo_differ_in_the_zone_alone(demo: dict[str, Path]) -> None:
+    hidden, nothing = (pd.read_csv(demo[name]) for name in ("table", "nothing_hidden"))
+    assert hidden[["sequence", "time", "agent"]].equals(nothing[["sequence", "time", "agent"]])
+    assert hidden["sequence"].nunique() == 20
+    away = (hidden["x"] - nothing["x"]).abs()
+    # nobody of the platoon has reached the zone yet
+    before = hidden.groupby(["sequence", "time"])["x"].transform("max") < SlowZone().a - 1
+    assert before.any()
+    assert (away[before] < 1e-6).all()
+    assert away.max() > 10

@@ -41,7 +41,11 @@ def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes() -> 
     assert kappa.value == pytest.approx(0.4, abs=0.05)
     assert kappa.low < 0.4 < kappa.high
     assert kappa.unit == "1"
-    assert [one.name for one in d.absences] == ["speed_zone"]
+    (zone,) = d.absences
+    assert zone.name == "speed_zone"
+    # judged where half of the intervals of the usual length are known better
+    assert zone.testable
+    assert "half of the intervals" in zone.reason
     assert d.leads == d.agents == d.data_faults == []
     # eleven open clusters: no two-sided p-value is below 2^-10
     assert (d.clusters.open, d.clusters.sealed) == (d.screen.clusters, 5) == (11, 5)

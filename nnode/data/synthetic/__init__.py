@@ -6,12 +6,12 @@ on them is checked against something independent of the package's models and sol
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from nnode.data.synthetic.crowd import Forces, crowd_recording, social_force
 from nnode.data.synthetic.platoons import SlowZone, platoon_table
 from nnode.data.synthetic.traffic import traffic_recording
-from nnode.data.synthetic.truth import TRAFFIC
 
 __all__ = [
     "Forces",
@@ -24,24 +24,28 @@ __all__ = [
 ]
 
 
-def demo_data(folder: Path | str, seed: int = 0) -> dict[str, Path]:
-    """Write a small traffic and a small crowd recording, laid out like the real data, and a table
-    of platoons for the diagnosis.
+def demo_data(folder: Path | str, seed: int = 0, platoons: int = 20) -> dict[str, Path]:
+    """Write the demonstration's recordings: two tables of platoons, and a small traffic and a small
+    crowd recording that are laid out like the real data.
 
     Args:
-        folder: receives ``esimas/sequence_datademo.mat`` and ``juelich/demo_corridor.txt``;
-            ``data.source`` may point at it. ``platoons.csv`` is read with ``data=table``.
+        folder: receives ``platoons.csv``, the same platoons without the slow zone in
+            ``nothing_hidden.csv``, ``esimas/sequence_datademo.mat`` and
+            ``juelich/demo_corridor.txt``; ``data.source`` may point at it.
         seed: the same seed gives the same bytes.
+        platoons: number of platoons in each table.
 
     Returns:
-        The paths by data set, ``esimas``, ``juelich`` and ``table``.
+        The paths by data set: ``table``, ``nothing_hidden``, ``esimas`` and ``juelich``.
     """
     folder = Path(folder)
     traffic = folder / "esimas" / "sequence_datademo.mat"
     crowd = folder / "juelich" / "demo_corridor.txt"
+    table = partial(platoon_table, seed=seed, platoons=platoons, cars=4, duration=20.0)
     return {
-        "esimas": traffic_recording(traffic, seed=seed, v0=TRAFFIC["v0"], L=TRAFFIC["L"]),
+        "table": table(folder / "platoons.csv"),
+        "nothing_hidden": table(folder / "nothing_hidden.csv", truth=SlowZone(alpha=1.0)),
+        "esimas": traffic_recording(traffic, seed=seed, v0=25.0, L=6.0),
         # several times longer than anyone stays, so that a block of it can be held out
         "juelich": crowd_recording(crowd, seed=seed, people=45, duration=36.0),
-        "table": platoon_table(folder / "platoons.csv", seed=seed),
     }

@@ -144,8 +144,16 @@ def _absence(score: Score, way: Way) -> Absence:
     strength, k = effect.strengths[name], list(effect.strengths).index(name)
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
     known = error > 0 and math.isfinite(error) and bool(score.evidence)
-    expected, detectable, least = strength.expected, math.inf, 0.0
-    if known and effect.remembers():
+    expected, detectable, least, where = strength.expected, math.inf, 0.0, ""
+    if known and effect.consecutive:
+        # the interval that explains most was chosen for chance: one of median precision is judged
+        one = sorted(score.evidence, key=lambda each: each.error)[len(score.evidence) // 2]
+        detectable, amount, error = way.detectable(score, one, expected), one.amount, one.error
+        where = (
+            f"from {one.options['a']:.0f} to {one.options['b']:.0f} {effect.settings['a'].unit}; "
+            "half of the intervals of this length are known better"
+        )
+    elif known and effect.remembers():
         # what was tried at a size says nothing of smaller ones
         found = [
             max(one.size, way.detectable(score, one, max(one.size, expected)))
@@ -168,7 +176,7 @@ def _absence(score: Score, way: Way) -> Absence:
         unit=strength.unit,
         detectable=detectable if math.isfinite(detectable) else None,
         bound=bound if testable else None,
-        reason=""
+        reason=where
         if testable
         else (
             f"{name} would not be named with these data with a probability of {rules().power:.0%} "

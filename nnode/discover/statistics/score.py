@@ -65,6 +65,7 @@ class Evidence:
         size: of an effect with a memory, whose trace is that of a finite strength; otherwise 0.
         parts, grams: ``(G,)`` scores and their information.
         minimal: amount that is taken for none.
+        amount, error: the amount that explains most, and its standard error; of intervals.
     """
 
     options: dict[str, Any]
@@ -72,6 +73,8 @@ class Evidence:
     parts: np.ndarray
     grams: np.ndarray
     minimal: float
+    amount: float = float("nan")
+    error: float = float("nan")
 
 
 @dataclass
@@ -87,7 +90,7 @@ class Score:
         amount: strengths that explain most, less their neutral values.
         error: standard errors of ``amount``.
         evidence: of every strength; of an effect with a memory, or without a strength, of every
-            probe.
+            probe; of an effect on an interval, of every interval of the usual length.
     """
 
     effect: type[Effect]
@@ -298,28 +301,45 @@ class Screen:
         self._by_chance(trace.effect.name, flipped.max(1))
         total = each.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
-        i = int(np.argmax(gain))
         (name,) = trace.effect.strengths
         strength = trace.effect.strengths[name]
-        amount = -total[i] / size[i]
-        rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
-        blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
+        amount = -total / size
+        rest = ((each + amount * sizes) ** 2).sum(0)
+        blocks = size**2 / (sizes**2).sum(0)
         prior = rules().prior
-        error = np.sqrt((blocks * rest + prior * usual * size[i]) / (blocks + prior)) / size[i]
-        options = dict(trace.probes[0].options)
-        options["a"] = trace.probes[first[i]].options["a"]
-        options["b"] = trace.probes[last[i]].options["b"]
-        options[name] = strength.at(amount)
+        error = np.sqrt((blocks * rest + prior * usual * size) / (blocks + prior)) / size
+
+        def options(i: int) -> dict[str, Any]:
+            ends = {"a": trace.probes[first[i]].options["a"]}
+            ends["b"] = trace.probes[last[i]].options["b"]
+            return {**trace.probes[0].options, **ends, name: strength.at(amount[i])}
+
+        i = int(np.argmax(gain))
+        ends = trace.effect.settings
+        cell = trace.probes[0].options
+        length = (ends["b"].value - ends["a"].value) / (cell["b"] - cell["a"])
+        usual_length = last - first + 1 == np.clip(round(length), 1, cells)
         return [
             Score(
                 trace.effect,
-                options,
+                options(i),
                 float(flipped[0].max()),
                 1.0,
                 float(gain[i]),
-                {name: float(amount)},
-                {name: float(error)},
-                [Evidence(options, 0.0, each[:, i], sizes[:, i], minimal)],
+                {name: float(amount[i])},
+                {name: float(error[i])},
+                [
+                    Evidence(
+                        options(k),
+                        0.0,
+                        each[:, k],
+                        sizes[:, k],
+                        minimal,
+                        float(amount[k]),
+                        float(error[k]),
+                    )
+                    for k in np.flatnonzero(usual_length).tolist()
+                ],
             )
         ]
 

@@ -1,0 +1,531 @@
+"""The demonstration: ``python -m nnode.app.demo FOLDER``, which ``make demo`` runs.
+
+A table of platoons is checked, a law is calibrated, and a diagnosis finds what the law lacks; a
+second diagnosis shows what is said where nothing is hidden, and networks learn the forces in a
+crowd. Everything that is printed or shown comes from the results of this run.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from hydra import compose, initialize_config_dir
+from omegaconf import open_dict
+from scipy.optimize import least_squares
+
+import nnode
+from nnode.app.cli.runs import RESULT
+from nnode.app.cli.saved import GROUPS
+from nnode.app.python.report import Report
+from nnode.app.train import train
+from nnode.config import register
+from nnode.data.store import Store
+from nnode.data.synthetic import Forces, SlowZone, demo_data
+from nnode.discover.options import DiscoverOptions
+from nnode.discover.report.files import amount, interval
+from nnode.errors import NNodeError
+from nnode.files import write_text
+from nnode.machine import how_made
+from nnode.pages.page import (
+    Block,
+    FigureBlock,
+    Heading,
+    Provenance,
+    TableBlock,
+    Text,
+    write_page,
+)
+from nnode.plots import force_figure, measured_gaps, speed_curves
+from nnode.program import configuration
+from nnode.simulation.base import DEFAULT_STEP
+
+#: Steps of Euler's scheme of the compared calibrations, s: the paper's, and ten times that.
+STEPS = (DEFAULT_STEP["traffic", 1], 10 * DEFAULT_STEP["traffic", 1])
+#: A force that is taken for none, N.
+_WEAK = 0.1
+#: What the page is called, in the demonstration's folder.
+PAGE = "demo"
+
+
+def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -> Path:
+    """Run the demonstration, and write its page.
+
+    Args:
+        folder: receives data, runs and the page.
+        seed: of the data.
+        platoons: number of platoons in each table.
+        epochs: of the crowd's networks.
+
+    Returns:
+        The page.
+
+    Raises:
+        NNodeError: a folder that cannot be written to.
+    """
+    start = time.monotonic()
+    truth = SlowZone()
+    raw = demo_data(folder / "raw", seed, platoons)
+    _step("1/6 A table of platoons")
+    data = _data(raw["table"], truth, platoons)
+    _step("2/6 What does the table hold?")
+    checked = _checked(raw["table"], folder)
+    _step("3/6 Calibration, with nothing hidden: truth beside estimate")
+    calibration = _calibration(raw["nothing_hidden"], truth, folder)
+    _step("4/6 What does the law lack? A slow zone is hidden")
+    report = _diagnosed(raw["table"], folder / "diagnosis")
+    found = _found(report, truth)
+    _step("5/6 The same table with nothing hidden")
+    nothing = _diagnosed(raw["nothing_hidden"], None)
+    absent = _absent(nothing)
+    _step("6/6 Forces between people, learned by networks")
+    crowd = _crowd(raw["juelich"], folder / "crowd", epochs)
+    seconds = time.monotonic() - start
+    facts = how_made(("torch", "numpy", "scipy", "matplotlib"))
+    page, *_ = write_page(
+        [
+            *_summary(report, nothing, truth),
+            *data,
+            *checked,
+            *calibration,
+            *found,
+            *absent,
+            *crowd,
+            *_own(folder),
+            Provenance({**facts, "Seed of the data": f"{seed}", "Time": f"{seconds:.0f} s"}),
+        ],
+        folder,
+        title="nnode: what a law lacks, found in a table of platoons",
+        subtitle=_headline(report, nothing),
+        stem=PAGE,
+    )
+    _step("Results")
+    for what, path in {
+        "checkpoints": f"{folder}/*/checkpoints/best.pt",
+        "force plots": f"{folder}/figures/law.png, {folder}/figures/force.png",
+        "loss curves": f"tensorboard --logdir {folder}",
+        "diagnosis in full": folder / "diagnosis" / "report.html",
+        "your own table": "nnode check mine.csv",
+        "time": f"{time.monotonic() - start:.0f} s",
+        "page": page,
+    }.items():
+        print(f"{what + ':':<19}{path}")
+    return page
+
+
+def _step(title: str) -> None:
+    print(f"\n== {title}", flush=True)
+
+
+def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
+    gap = report.gap
+    lines = [
+        f"**With a hidden slow zone:** {report.sentence}",
+        f"**With nothing hidden:** {nothing.sentence} {_missed(nothing)}",
+    ]
+    if report.effects:
+        hidden = f"alpha = {truth.alpha:g}, a = {truth.a:g} m, b = {truth.b:g} m"
+        lines.insert(1, f"**Estimate:** {_named(report)}. **Hidden:** {hidden}.")
+    figure = report.plot("map")
+    for ax in figure.axes[: 1 + bool(report.effects)]:
+        for place in (truth.a, truth.b):
+            ax.axhline(place, color="black", linewidth=0.9, linestyle="--")
+    errors = f"error on held-back platoons: {amount(gap.before)} m²"
+    if report.effects:
+        errors += f" before, {amount(gap.after)} m² after; noise floor {amount(gap.noise_floor)} m²"
+    figure.suptitle(errors, fontsize=10)
+    return [
+        Text("\n".join(f"- {line}" for line in lines)),
+        FigureBlock(
+            "map",
+            figure,
+            "Measured minus simulated speed of all platoons by time and place, for the calibrated "
+            "law alone and with the effect that the diagnosis adds. Dashed lines are the edges of "
+            "the hidden zone, which the diagnosis is not told. Every driver is simulated as the "
+            "typical driver, for two seconds at a time, so differences between drivers remain on "
+            "the right. The law alone was fitted to the zone as well, so it deviates outside it "
+            "too. Grey: nobody was there.",
+            f"Two space-time maps; {errors}.",
+        ),
+    ]
+
+
+def _headline(report: Report, nothing: Report) -> str:
+    names = ", ".join(effect.name for effect in report.effects) or "nothing"
+    other = ", ".join(effect.name for effect in nothing.effects) or "nothing"
+    return (
+        "A stretch of road is secretly slower in one table of synthetic platoons: the diagnosis "
+        f"names **{names}**. The second table hides nothing: the diagnosis names **{other}**."
+    )
+
+
+def _named(report: Report) -> str:
+    return "; ".join(f"{effect.name}: {interval(effect)}" for effect in report.effects)
+
+
+# -- data and check --------------------------------------------------------------------------------
+
+
+def _data(path: Path, truth: SlowZone, platoons: int) -> list[Block]:
+    table = pd.read_csv(path)
+    words = (
+        f"{platoons} platoons of {table.agent.nunique() // platoons} cars, {len(table)} positions. "
+        f"Each car follows dx/dt = v0 (1 − L/gap) with L = {truth.L:g} m; drivers differ in v0 "
+        f"(mean {truth.v0:g} m/s, standard deviation {100 * truth.drivers:g} %). Positions carry "
+        f"an error of {truth.noise:g} m. Between {truth.a:g} and {truth.b:g} m all cars drive at "
+        f"{truth.alpha:g} times that speed: this is hidden."
+    )
+    print(words)
+    print(table.head(3).to_string(index=False))
+    return [
+        Heading("The table"),
+        Text(words + " A second table has the same drivers, leaders and errors, and no zone."),
+        TableBlock("rows", table.head(3), "The first rows: times in s, positions in m."),
+    ]
+
+
+def _checked(path: Path, folder: Path) -> list[Block]:
+    check = nnode.check(path)
+    check.write(folder / "check")
+    print(check)
+    rows = [{"level": one.level, "what": one.kind, "finding": one.text} for one in check.findings]
+    return [
+        Heading("What does the table hold?"),
+        Text(f"```sh\nnnode check {path}\n```"),
+        TableBlock(
+            "findings",
+            pd.DataFrame(rows),
+            "What `check` finds before anything is computed; its own page is `check/check.html`.",
+        ),
+    ]
+
+
+# -- calibration -----------------------------------------------------------------------------------
+
+
+def _calibration(path: Path, truth: SlowZone, folder: Path) -> list[Block]:
+    run = nnode.fit(path, "traffic", model="lin", leader="measured", drivers="auto", heldout=0.0)
+    assert run.drivers is not None
+    checkpoint = run.save(folder / "calibration" / "checkpoints" / "best.pt")
+    write_text(folder / "calibration" / "summary.txt", run.summary())
+    rows = {
+        "v0 of the median driver (m/s)": (truth.v0, *_row(run.parameters, "lin.v0")),
+        "L (m)": (truth.L, *_row(run.parameters, "lin.L")),
+    }
+    variability = run.drivers.variability
+    if "v0" in variability.index:
+        rows["v0 between drivers (%)"] = (100 * truth.drivers, *_row(variability, "v0"))
+    rows["error of positions (m)"] = (truth.noise, *_row(variability, "measurement"))
+    estimates = _beside_truth(rows)
+    print(estimates.to_string())
+    compared = _compared(path)
+    print(compared.to_string())
+    sequences = nnode.sequences(path, domain="traffic")
+    law = speed_curves({"lin": nnode.load(checkpoint)}, measured_gaps(sequences))
+    return [
+        Heading("Calibration"),
+        Text(
+            "```python\nrun = nnode.fit(table, 'traffic', model='lin', leader='measured', "
+            f"drivers='auto')\n```\n\nThe table without a zone, so that the law is the right one. "
+            f"All {run.fit.sequences} platoons are used. `auto` finds by the marginal likelihood "
+            f"that drivers differ in {' and '.join(run.drivers.differ) or 'nothing'}."
+        ),
+        TableBlock(
+            "estimates",
+            estimates,
+            "Truth beside estimate, with intervals of 95 % by platoons. *Covered*: the truth lies "
+            "in the interval.",
+            digits=3,
+        ),
+        FigureBlock(
+            "law",
+            law,
+            "The law of the median driver, read from its checkpoint, over the measured gaps.",
+            "Speed against gap, with a histogram of measured gaps.",
+        ),
+        Heading("Beside SciPy", 3),
+        Text(
+            "The same problem of least squares for both: two parameters that all drivers share, "
+            "the differences between simulated and measured positions of all followers, cars "
+            "simulated together behind the measured leader from their first measured positions, "
+            "Euler's scheme with the same step, the same start (v0 = 30 m/s, L = 5 m). SciPy's "
+            "`least_squares` has its default method (trust region) and tolerances, a simulation in "
+            "NumPy that advances all platoons at once, and differences for the Jacobian; nnode has "
+            "Gauss and Newton's method with compiled exact derivatives. Both wall times are from "
+            "the data in memory to the result; that of nnode includes intervals."
+        ),
+        TableBlock(
+            "scipy",
+            compared,
+            "Two programs, one problem; one run each. *First call*: with the compilation, or with "
+            "loading what an earlier run compiled. Here all drivers share their parameters; the "
+            "calibration above lets them differ.",
+            digits={"v0 (m/s)": 4, "L (m)": 4, "RMSE (m)": 5},
+        ),
+    ]
+
+
+def _row(table: pd.DataFrame, name: str) -> tuple[float, float, float]:
+    estimate, lower, upper = (float(table[key][name]) for key in ("estimate", "lower", "upper"))
+    return estimate, lower, upper
+
+
+def _beside_truth(rows: dict[str, tuple[float, float, float, float]]) -> pd.DataFrame:
+    """Truth, estimate and interval by name; ``covered`` is a dash where there is no interval."""
+    table = pd.DataFrame(rows, index=["truth", "estimate", "lower", "upper"]).T
+    inside = (table["lower"] <= table["truth"]) & (table["truth"] <= table["upper"])
+    known = table["lower"].notna() & table["upper"].notna()
+    table["covered"] = [
+        ("yes" if a else "no") if b else "–" for a, b in zip(inside, known, strict=True)
+    ]
+    return table
+
+
+def _compared(path: Path) -> pd.DataFrame:
+    """Both programs on the pooled problem, with each step."""
+    sequences = nnode.sequences(path, domain="traffic")
+    x, dt = np.stack([s.x[..., 0] for s in sequences], 1), sequences[0].dt
+    start = np.array([30.0, 5.0])
+    rows = []
+    for step in STEPS:
+        calibrator = nnode.Calibrator(
+            "lin", leader="measured", optimizer="gauss_newton", method="euler", dt=step
+        )
+        first, _ = _timed(partial(calibrator.fit, sequences))
+        seconds, _ = _timed(partial(calibrator.fit, sequences))
+        result = calibrator.result_
+        value = result.parameters["estimate"]
+        rows.append((step, "nnode", *value, result.fit.rmse, seconds, first))
+        residuals = partial(_residuals, x=x, dt=dt, step=step)
+        seconds, found = _timed(partial(least_squares, residuals, start, x_scale=start))
+        rmse = float(np.sqrt(np.mean(found.fun**2)))
+        rows.append((step, "SciPy", *found.x, rmse, seconds, np.nan))
+    heads = ["v0 (m/s)", "L (m)", "RMSE (m)", "wall time (s)", "first call (s)"]
+    table = pd.DataFrame(rows, columns=["step (s)", "program", *heads])
+    return table.set_index(["step (s)", "program"])
+
+
+def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    start = time.perf_counter()
+    found = work()
+    return time.perf_counter() - start, found
+
+
+def _residuals(row: np.ndarray, x: np.ndarray, dt: float, step: float) -> np.ndarray:
+    """Simulated minus measured positions of followers after the first sample, in plain NumPy.
+
+    Args:
+        row: v0 and L.
+        x: ``(K, B, N)`` measured positions, m; the last car leads, along straight lines between
+            its samples.
+        dt: sampling interval, s.
+        step: of Euler's scheme, s.
+    """
+    v0, length = row
+    number = round(dt / step)
+    state, path = x[0, :, :-1], []
+    for now, after in pairwise(x[:, :, -1:]):
+        for k in range(number):
+            leader = now + (after - now) * (k / number)
+            gap = np.diff(np.concatenate([state, leader], 1))
+            state = state + step * v0 * (1 - length / gap)
+        path.append(state)
+    away: np.ndarray = (np.stack(path) - x[1:, :, :-1]).ravel()
+    return away
+
+
+# -- diagnosis -------------------------------------------------------------------------------------
+
+
+def _diagnosed(path: Path, folder: Path | None) -> Report:
+    options = DiscoverOptions(compare=[], replay=False)  # one law is faster than all that are known
+    report = nnode.diagnose(path, "traffic", model="lin", folder=folder, options=options)
+    print(report.sentence)
+    return report
+
+
+def _found(report: Report, truth: SlowZone) -> list[Block]:
+    d, gap = report.diagnosis, report.gap
+    hidden = {"alpha": truth.alpha, "a": truth.a, "b": truth.b}
+    zone = next((one for one in report.effects if one.name == "speed_zone"), None)
+    known = {} if zone is None else zone.coefficients
+    rows = {
+        f"speed_zone.{name}" + ("" if known[name].unit == "1" else f" ({known[name].unit})"): (
+            value,
+            known[name].value,
+            known[name].low,
+            known[name].high,
+        )
+        for name, value in hidden.items()
+        if name in known
+    }
+    nan = float("nan")
+    rows |= {
+        f"{name} ({d.base[f'lin.{name}']['unit']})": (
+            value,
+            d.base[f"lin.{name}"]["after"],
+            nan,
+            nan,
+        )
+        for name, value in (("v0", truth.v0), ("L", truth.L))
+    }
+    for one in d.drivers:
+        if one.name == "v0":
+            values = one.estimate, one.lower, one.upper
+            rows["v0 between drivers (%)"] = (100 * truth.drivers, *values)
+    table = _beside_truth(rows)
+    print(table.to_string())
+    words = (
+        "Estimates with the effects, beside what was put into the data; intervals of 95 % by "
+        "platoons."
+    )
+    if zone is not None and "no" in list(table["covered"]):
+        words += (
+            " An interval allows for errors of measurement and for drivers, and takes the form of "
+            f"the effect for granted, `{zone.formula}`. The hidden zone ends in a step. Estimates "
+            "of its strength and ends shift by what the two forms differ, and of all other "
+            "intervals one in twenty misses the truth by chance."
+        )
+    at = next((p for p in d.places if p.variable == "position"), None)
+    where = ""
+    if at is not None:
+        where = (
+            f" Alone, the law deviates most between {at.low:.0f} and {at.high:.0f} m, by "
+            f"{amount(at.deviation)} ± {amount(at.error, 2)} m/s (mean and standard error)."
+        )
+        print(where.strip())
+    clusters = report.clusters
+    return [
+        Heading("What does the law lack?"),
+        Text(
+            "```python\nreport = nnode.diagnose(table, 'traffic', model='lin', folder='runs/mine')"
+            f"\n```\n\n{clusters.open} platoons are searched, {clusters.sealed} are held back to "
+            f"test what was found.{where} The catalogue has {len(d.absences) + len(d.effects)} "
+            "effects for this law and these data; the slow zone is one of them. The diagnosis in "
+            "full is `diagnosis/report.html`, the map is at the head of this page."
+        ),
+        TableBlock("effects", table, words, digits=4),
+        FigureBlock(
+            "sealed",
+            report.plot("sealed"),
+            f"Every held-back platoon before and after; mean {amount(gap.before)} m² before, "
+            f"{amount(gap.after)} m² after. {gap.definition} The law and the effects are those of "
+            "the searched platoons; a driver's own deviation is estimated from the held-back one.",
+            "Mean square errors of held-back platoons, in pairs.",
+        ),
+    ]
+
+
+def _absent(report: Report) -> list[Block]:
+    words = f"{report.sentence} {_missed(report)}"
+    print(_missed(report))
+    rows = [
+        {
+            "effect": one.name,
+            "coefficient": one.coefficient,
+            "found from": amount(one.detectable if one.testable else None),
+            "unit": "" if one.unit == "1" else one.unit,
+            "remark": one.reason,
+        }
+        for one in report.diagnosis.absences
+    ]
+    return [
+        Heading("The same table with nothing hidden"),
+        Text(words),
+        TableBlock(
+            "absences",
+            pd.DataFrame(rows),
+            "*Found from*: the smallest change of the coefficient, or the setting of an effect "
+            "without a strength, that is named and confirmed on held-back platoons with a "
+            "probability of 80 %. The search has a level of "
+            f"{100 * DiscoverOptions().alpha:g} % over all effects: where nothing is hidden, it "
+            "may find something in about that share of tables.",
+        ),
+    ]
+
+
+def _missed(report: Report) -> str:
+    """How strong a zone would have to be to be found."""
+    zone = next((a for a in report.diagnosis.absences if a.name == "speed_zone"), None)
+    if zone is None:
+        return ""
+    if not zone.testable:
+        return f"A slow zone may have been missed: {zone.reason}."
+    size = amount(100 * (zone.detectable or 0))
+    return (
+        f"A zone that changes speeds by {size} % or more would have been "
+        f"named with a probability of at least 80 % ({zone.reason}); a weaker one may have "
+        "been missed."
+    )
+
+
+# -- crowd -----------------------------------------------------------------------------------------
+
+
+def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
+    register()
+    words = [
+        "experiment=demo_crowd",
+        f"data.source={path.parents[1].absolute()}",
+        f"trainer.max_epochs={epochs}",
+    ]
+    with initialize_config_dir(str(configuration().absolute()), version_base="1.3"):
+        config = compose("train", words, return_hydra_config=True)
+    with open_dict(config):
+        groups = config.pop("hydra").runtime.choices
+        config.groups = {name: groups[name] for name in GROUPS}
+    train(config, folder)
+    costs = json.loads((folder / RESULT).read_text(encoding="utf-8"))["summary"]
+    checkpoint = folder / "checkpoints" / "best.pt"
+    model, store, forces = nnode.load(checkpoint), Store(folder / "data"), Forces()
+    reach = 2 * forces.r + forces.B * np.log(forces.A / _WEAK)
+    command = f"nnode train experiment=demo_crowd data.source={path.parents[1]}"
+    return [
+        Heading("Forces between people"),
+        Text(
+            f"```sh\n{command}\ntensorboard --logdir {folder}\n```\n\nThe paper's model of a crowd:"
+            " networks with one hidden layer are the forces from people and from walls, calibrated "
+            "by the gradient of the trajectory error through the simulation. The mean cost of a "
+            f"training sequence falls from {amount(costs['cost_start'])} to "
+            f"{amount(costs['cost_train'])} m² s; that of a held-out sequence is "
+            f"{amount(costs['cost_heldout'])} m² s. The force is drawn from the checkpoint; "
+            "TensorBoard shows the loss by epoch."
+        ),
+        FigureBlock(
+            "force",
+            force_figure(model, [store[i] for i in range(len(store))]),
+            "Both components of the force on one of two people who meet head-on, by relative "
+            "position. Dots are relative positions of people who were measured at one time. The "
+            "data were made with a repulsion that falls below "
+            f"{_WEAK:g} N at {reach:.2g} m, so what is drawn beyond is the error of this short "
+            "calibration.",
+            "Contours of both components of a force by relative position.",
+        ),
+    ]
+
+
+def _own(folder: Path) -> list[Block]:
+    return [
+        Heading("Your own table"),
+        Text(
+            "A CSV with a row per car and sample is enough; columns and units are recognised.\n\n"
+            "```sh\nnnode check mine.csv\n```\n\n"
+            "```python\nimport nnode\n\nreport = nnode.diagnose('mine.csv', model='idm', "
+            "folder='runs/mine')\nprint(report.summary())\n```"
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    try:
+        demo(Path(sys.argv[1] if len(sys.argv) > 1 else "runs/demo"))
+    except NNodeError as error:
+        sys.exit(f"error: {error}")
