@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 
 from nnode.data.sequence import Domain
-from nnode.discover.able import check_effect
+from nnode.discover.eligibility import check_effect
 from nnode.discover.rules import Rules
 from nnode.errors import ConfigError
 from nnode.model.effects import CATALOGUE

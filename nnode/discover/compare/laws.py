@@ -19,10 +19,10 @@ import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import divide
-from nnode.discover.judge.confirm import engine_of, windows_of
-from nnode.discover.name.search import Search, Step, begun
+from nnode.discover.eligibility import check_model, not_offered
+from nnode.discover.judge.model_comparison import engine_of, windows_of
+from nnode.discover.name.search import Search, Step, initial_fit
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
@@ -55,7 +55,10 @@ def compare_laws(
         DataError: too few sequences.
     """
     division = divide(sequences, options)
-    chosen, label = [sequences[i] for i in division.open], division.label[division.open]
+    chosen, label = (
+        [sequences[i] for i in division.exploration],
+        division.label[division.exploration],
+    )
     one = next(iter(candidates.values()))
     whole = engine_of(one, chosen, label, whole=True)
     found, refused = _calibrated(whole, candidates)
@@ -69,7 +72,7 @@ def compare_laws(
     engine = windows_of(one, chosen, label)
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
-        engine.settle(found[first].system, ParameterVector(found[first].system).row)
+        engine.fit_whitening(found[first].system, ParameterVector(found[first].system).row)
         found = {n: refine(engine, copy.deepcopy(fit.system)) for n, fit in found.items()}
         costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
         best = min(costs, key=lambda name: _level(costs[name]))
@@ -109,7 +112,7 @@ def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str,
 
 
 @dataclass(frozen=True)
-class Nearer:
+class BetterLaw:
     """A law that comes nearer than the one that is diagnosed, with what was found missing in it.
 
     Attributes:
@@ -121,7 +124,7 @@ class Nearer:
 
 
 def imitated(
-    engine: Engine, found: Search, label: np.ndarray, nearer: Nearer
+    engine: Engine, found: Search, label: np.ndarray, nearer: BetterLaw
 ) -> tuple[list[Step], float]:
     """Effects that a nearer law does without: they imitate that law, and are nothing of their own.
 
@@ -135,7 +138,7 @@ def imitated(
         The effects, and the one-sided p-value of that comparison.
     """
     common = windows_of(nearer.system, engine.sequences, label)
-    common.settle(nearer.system, ParameterVector(nearer.system).row)
+    common.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
     costs = [
         heldout(refine(common, copy.deepcopy(system)), common.cluster)
         for system in (found.fit.system, nearer.system)
@@ -170,7 +173,7 @@ def _calibrated(
         except ConfigError as error:
             refused[name] = str(error)
             continue
-        fit = begun(engine, copy.deepcopy(system).double())
+        fit = initial_fit(engine, copy.deepcopy(system).double())
         if fit is None:
             refused[name] = "it blows up on these data"
         else:

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.able import check_model
 from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows
-from nnode.discover.found import Simulation
+from nnode.discover.eligibility import check_model
+from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
@@ -140,7 +140,7 @@ class CrowdEngine:
         length = self.windows.length
         return 2 * self.windows.variance * (1 - 2 / length)
 
-    def settle(self, system: System, row: Tensor) -> None:
+    def fit_whitening(self, system: System, row: Tensor) -> None:
         """Take a model as the one around which residuals are whitened, weighted and linearised.
 
         Called after a fit was accepted; residuals from before cannot be compared with later ones,
@@ -241,7 +241,7 @@ class CrowdEngine:
 
     def _settled(self, system: System, row: Tensor) -> Whitening:
         if self._whitening is None:
-            self.settle(system, row)
+            self.fit_whitening(system, row)
         assert self._whitening is not None
         return self._whitening
 

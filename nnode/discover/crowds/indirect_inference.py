@@ -61,7 +61,7 @@ def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
         ]
         try:
             engine, system = CrowdEngine(measured), copy.deepcopy(fit.system)
-            engine.settle(system, ParameterVector(system).row)
+            engine.fit_whitening(system, ParameterVector(system).row)
             found.append(refine(engine, system, tolerance=ROUGH / 10).row)
         except SimulationError:
             log.debug("a simulated crowd could not be calibrated")

@@ -29,7 +29,7 @@ from nnode.discover.result import (
 )
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import clusters_to_tell
-from nnode.discover.statistics.power import Way
+from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.profile import intervals as edge_intervals
 from nnode.discover.statistics.random_effects import Individuals
 from nnode.discover.statistics.score import Evidence, Score
@@ -129,13 +129,13 @@ def _where(effect: type[Effect], found: dict[str, Coefficient], options: dict[st
     return "everybody, everywhere"
 
 
-def absences(search: Search, way: Way) -> list[Absence]:
+def absences(search: Search, way: PowerSimulation) -> list[Absence]:
     """What the final screening says of the effects that were not found, by the power of the whole
     way."""
     return [_absence(score, way) for score in search.scores]
 
 
-def _absence(score: Score, way: Way) -> Absence:
+def _absence(score: Score, way: PowerSimulation) -> Absence:
     effect = score.effect
     if not effect.strengths:
         return _without_strength(score, way)
@@ -177,7 +177,7 @@ def _absence(score: Score, way: Way) -> Absence:
     )
 
 
-def _without_strength(score: Score, way: Way) -> Absence:
+def _without_strength(score: Score, way: PowerSimulation) -> Absence:
     """Of an effect that is there or not: the weakest of its settings that would be named."""
     effect = score.effect
     name, setting = next(iter(effect.settings.items()))

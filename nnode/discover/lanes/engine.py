@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.found import Simulation
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
+from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
@@ -294,7 +294,7 @@ class TrafficEngine:
         found.filter = self.filter
         return found
 
-    def settle(self, system: System, row: Tensor) -> None:
+    def fit_whitening(self, system: System, row: Tensor) -> None:
         """Fit the filter to the residuals that a model leaves."""
         shortest = int(self.batch.valid.any(-1).sum(0).min())
         order = min(ORDER, max(0, (shortest - 2) // 3))

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import (
     LARGE,
     STEP,
@@ -32,6 +31,7 @@ from nnode.discover.lanes.engine import (
     drawn_in,
     weights_of,
 )
+from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Curve
 from nnode.model.effects import Effect, Probe
@@ -80,7 +80,7 @@ class FollowersEngine(TrafficEngine):
             drivers and of starts are estimated.
 
     Attributes:
-        population: what :meth:`settle` estimated last; None before.
+        population: what :meth:`fit_whitening` estimated last; None before.
     """
 
     def __init__(
@@ -187,10 +187,10 @@ class FollowersEngine(TrafficEngine):
         assert self.population is not None
         found = FollowersEngine(sequences, large=np.inf, like=self)
         model = self.population.model
-        found.settle(model.system, ParameterVector(model.system).row)
+        found.fit_whitening(model.system, ParameterVector(model.system).row)
         return found
 
-    def settle(self, system: System, row: Tensor) -> None:
+    def fit_whitening(self, system: System, row: Tensor) -> None:
         """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
         if self._like is not None and self._like.population is not None:
             there = self._like.population
@@ -206,14 +206,14 @@ class FollowersEngine(TrafficEngine):
         else:
             self._take(fit_again(before, fixed, paths, fixed=self._like is not None))
 
-    def settle_among(self, systems: list[System]) -> None:
+    def fit_whitening_among(self, systems: list[System]) -> None:
         """Estimate with each of some models, and keep what the best of them says, by Schwarz's
         criterion: what a missing effect does would be taken for pushes that last, and hidden."""
         best, level = self, -np.inf
         for system in systems:
             one = copy.copy(best)
             row = ParameterVector(system).row
-            one.settle(system, row)
+            one.fit_whitening(system, row)
             assert one.population is not None
             price = len(row) * np.log(max(len(one.population.estimate.agents), 2)) / 2
             if (likelihood := one.population.marginal.loglik - price) > level:

@@ -16,7 +16,7 @@ from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
 from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.bias import made, mean_scores
+from nnode.discover.statistics.bias import mean_scores, simulated_fits
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
@@ -77,7 +77,7 @@ def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> l
         first += len(look.squares)
         p_value = float((least <= own + 1e-12).mean())
         if p_value < rules().sure and not look.variable.lengths:
-            drawn = made(engine, fit, seed) if drawn is None else drawn
+            drawn = simulated_fits(engine, fit, seed) if drawn is None else drawn
             columns = partial(columns_of, variable=look.variable)
             bias = mean_scores(drawn, columns, engine.cluster)
             again = _Look(engine, fit, screen, look.variable, bias)

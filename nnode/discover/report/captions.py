@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.deviation import Deviation, deviation
 from nnode.discover.report.figures.maps import (
     approach_maps,
@@ -58,7 +58,7 @@ def unit_of(system: System) -> str:
     return "m/s" if system.order == 1 else "m/s²"
 
 
-def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
+def figures(inputs: Inputs, found: DiagnosisOutcome, options: DiscoverOptions) -> Figures:
     """Draw everything that the diagnosis gives occasion to."""
     drawn = Figures()
     d = found.diagnosis
@@ -93,7 +93,7 @@ def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
     return drawn
 
 
-def figure(which: str, inputs: Inputs, found: Found, options: DiscoverOptions) -> Figure:
+def figure(which: str, inputs: Inputs, found: DiagnosisOutcome, options: DiscoverOptions) -> Figure:
     """One figure of a diagnosis by its name on the page.
 
     Args:
@@ -111,7 +111,7 @@ def figure(which: str, inputs: Inputs, found: Found, options: DiscoverOptions) -
     return every[which]
 
 
-def _sealed(found: Found) -> FigureBlock:
+def _sealed(found: DiagnosisOutcome) -> FigureBlock:
     d = found.diagnosis
     columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
     names, before, after = columns
@@ -143,7 +143,7 @@ def _faults(inputs: Inputs) -> FigureBlock:
     )
 
 
-def _places(found: Found) -> list[FigureBlock]:
+def _places(found: DiagnosisOutcome) -> list[FigureBlock]:
     unit = unit_of(found.base)
     blocks = []
     curves = [place for place in found.diagnosis.places if place.curve][:PLACES]
@@ -164,7 +164,9 @@ def _places(found: Found) -> list[FigureBlock]:
     return blocks
 
 
-def _map_figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[FigureBlock]:
+def _map_figures(
+    inputs: Inputs, found: DiagnosisOutcome, options: DiscoverOptions
+) -> list[FigureBlock]:
     """Maps of deviations by place, and by the nearest agent; none where nothing was simulated."""
     maps, unit = _maps(inputs, found, options), UNITS[inputs.domain]
     if not len(next(iter(maps.values())).time):
@@ -206,7 +208,9 @@ def _spread(map_: Deviation) -> str:
     return amount(float(np.sqrt(np.mean(sizes**2))), 2)
 
 
-def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, Deviation]:
+def _maps(
+    inputs: Inputs, found: DiagnosisOutcome, options: DiscoverOptions
+) -> dict[str, Deviation]:
     titles = {"before": BEFORE, "after": AFTER}
     systems = {"before": found.base, "after": found.extended}
     if not found.diagnosis.effects:
@@ -217,7 +221,7 @@ def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, D
     }
 
 
-def _paths(found: Found, options: DiscoverOptions) -> list[FigureBlock | ReplayBlock]:
+def _paths(found: DiagnosisOutcome, options: DiscoverOptions) -> list[FigureBlock | ReplayBlock]:
     every = scenes(found)
     if not every:
         return []

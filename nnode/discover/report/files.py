@@ -15,7 +15,7 @@ from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.optimizers import build_optimizer
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.found import Found
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.result import Coefficient, Diagnosis, Laws, NamedEffect
 from nnode.files import write_text
 from nnode.model import FeedForward, System, build_model
@@ -268,7 +268,7 @@ def rebuilt(options: Mapping[str, Any], system: System) -> System:
 
 
 def checkpoint_of(
-    found: Found,
+    found: DiagnosisOutcome,
     sequences: list[Sequence],
     config: dict[str, Any],
     manifest: dict[str, Any],
@@ -285,10 +285,10 @@ def checkpoint_of(
     model = rebuilt(config["model"], found.extended)
     speed = None
     if model.domain == "traffic":
-        speed = best_common_speed([collate([sequences[i] for i in found.open])], model)
-    used = {*found.open, *found.sealed}
+        speed = best_common_speed([collate([sequences[i] for i in found.exploration])], model)
+    used = {*found.exploration, *found.confirmation}
     dropped = [i for i in range(len(sequences)) if i not in used]
-    parts = {"train": found.open, "heldout": found.sealed, "dropped": dropped}
+    parts = {"train": found.exploration, "heldout": found.confirmation, "dropped": dropped}
     return Checkpoint(
         config=config,
         manifest=manifest,

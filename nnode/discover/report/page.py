@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.logbook import Logbook
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report import tables
 from nnode.discover.report.captions import Figures, figures, unit_of
 from nnode.discover.report.files import (
@@ -46,7 +46,7 @@ _NETWORK = (
 
 def draw(
     inputs: Inputs,
-    found: Found,
+    found: DiagnosisOutcome,
     options: DiscoverOptions,
     config: dict[str, Any],
     commands: list[str],
@@ -77,7 +77,7 @@ def draw(
 
 
 def page_blocks(
-    inputs: Inputs, found: Found, drawn: Figures, commands: list[str], folder: Path
+    inputs: Inputs, found: DiagnosisOutcome, drawn: Figures, commands: list[str], folder: Path
 ) -> list[Block]:
     """The page in the order of the diagnosis, the verdict first."""
     d = found.diagnosis
@@ -167,7 +167,7 @@ def _gap_words(d: Diagnosis) -> str:
     return f"The effects close {closed(d)} of the gap between the model and the noise."
 
 
-def _coefficients(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
+def _coefficients(d: Diagnosis, drawn: Figures, found: DiagnosisOutcome) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
     if has_network(found.base):
         blocks.append(Text(_NETWORK))
@@ -317,7 +317,7 @@ def _shown(d: Diagnosis, drawn: Figures) -> list[Block]:
     return [Heading("A sealed sequence"), *drawn.paths]
 
 
-def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> list[Block]:
+def _usage(d: Diagnosis, commands: list[str], folder: Path, found: DiagnosisOutcome) -> list[Block]:
     more = ""
     if has_network(found.base):
         more += (
@@ -357,7 +357,9 @@ def _names(names: list[str]) -> str:
     return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
 
 
-def write_events(found: Found, pictures: list[Path], config: dict[str, Any], folder: Path) -> Path:
+def write_events(
+    found: DiagnosisOutcome, pictures: list[Path], config: dict[str, Any], folder: Path
+) -> Path:
     """Write TensorBoard's events: step 0 is the model as it was given, step 1 the extended one.
 
     Events of an earlier run in the folder are replaced.

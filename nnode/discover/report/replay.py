@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from nnode.discover.found import Found
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.files import amount
 from nnode.discover.result import Diagnosis, NamedEffect
 from nnode.pages.replay import ReplayBlock, Scene, Zone
@@ -17,7 +17,7 @@ SCENES = 16
 BEFORE, AFTER = "without effects", "with effects"
 
 
-def telling(found: Found) -> list[int]:
+def telling(found: DiagnosisOutcome) -> list[int]:
     """Rows of ``diagnosis.sealed``, first the one whose error falls most, or without effects the
     one with the largest error. Rows without two finite errors are left out."""
     rows = found.diagnosis.sealed
@@ -30,7 +30,7 @@ def telling(found: Found) -> list[int]:
     return sorted(finite, key=gain, reverse=True)
 
 
-def scenes(found: Found) -> list[Scene]:
+def scenes(found: DiagnosisOutcome) -> list[Scene]:
     """Sealed sequences and the simulations that their errors were computed from, without and with
     effects, in the order of :func:`telling`.
 
@@ -50,9 +50,9 @@ def scenes(found: Found) -> list[Scene]:
     return every
 
 
-def player(found: Found, every: list[Scene]) -> ReplayBlock:
+def player(found: DiagnosisOutcome, every: list[Scene]) -> ReplayBlock:
     """The player of :func:`scenes`."""
-    sealed = len(found.sealed)
+    sealed = len(found.confirmation)
     shaded = zones(found.diagnosis)
     named = f" Shaded: {', '.join(zone.label for zone in shaded)}." if shaded else ""
     return ReplayBlock(

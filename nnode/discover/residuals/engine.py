@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence
-from nnode.discover.found import Simulation
+from nnode.discover.outcome import Simulation
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.system import System
 from nnode.model.term import State
@@ -109,7 +109,7 @@ class Engine(Protocol):
         """``(M, n)`` derivatives of the residuals with respect to M amounts of every unit."""
         ...
 
-    def settle(self, system: System, row: Tensor) -> None:
+    def fit_whitening(self, system: System, row: Tensor) -> None:
         """Fit what the residuals are whitened and weighted with to what a model leaves."""
         ...
 

@@ -21,10 +21,10 @@ from nnode.discover.statistics.leverage import orthonormal
 from nnode.errors import SimulationError
 
 #: Engines of paths that a model has made, and what it leaves of them.
-Made = list[tuple[Engine, Fit]]
+SimulatedFits = list[tuple[Engine, Fit]]
 
 
-def made(engine: Engine, fit: Fit, seed: int) -> Made:
+def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
     """What a calibrated model leaves of paths that it has made; nothing where the engine makes
     none, or where the model blows up.
 
@@ -37,12 +37,12 @@ def made(engine: Engine, fit: Fit, seed: int) -> Made:
         drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
     except SimulationError:
         return []
-    found: Made = [(one, evaluated(one, fit.system)) for one in drawn]
+    found: SimulatedFits = [(one, evaluated(one, fit.system)) for one in drawn]
     return found if all(np.isfinite(own.residual).all() for _, own in found) else []
 
 
 def mean_scores(
-    drawn: Made, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
+    drawn: SimulatedFits, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
 ) -> np.ndarray | float:
     """``(G, k)`` mean scores of directions by cluster in paths that a model has made.
 

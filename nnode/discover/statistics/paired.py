@@ -25,14 +25,14 @@ def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
     return sums(_left_out(fit, cluster) ** 2, cluster)
 
 
-def there(before: Fit, after: Fit, cluster: np.ndarray) -> float:
+def presence_pvalue(before: Fit, after: Fit, cluster: np.ndarray) -> float:
     """One-sided p-value that held-out residuals of a model do not lean the way that another one,
-    an extension of it, bends its predictions; see :func:`leaning`."""
+    an extension of it, bends its predictions; see :func:`score_toward`."""
     first, second = _left_out(before, cluster), _left_out(after, cluster)
-    return better(leaning(first, second, cluster))
+    return better(score_toward(first, second, cluster))
 
 
-def outdone(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
+def j_test(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
     """Of two models neither of which extends the other: whether held-out residuals of the first
     lean towards the second's predictions, which they do not if the first one is true.
 
@@ -41,11 +41,11 @@ def outdone(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
 
     Source: Davidson & MacKinnon 1981 (tests of models against rivals that they do not contain).
     """
-    lean = leaning(_left_out(first, cluster), _left_out(second, cluster), cluster)
+    lean = score_toward(_left_out(first, cluster), _left_out(second, cluster), cluster)
     return replace(_student(lean), p_value=better(lean))
 
 
-def leaning(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
+def score_toward(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
     """``(G,)`` how far the residuals of a model lean towards another one's predictions, each
     cluster's relative to its greater cost.
 

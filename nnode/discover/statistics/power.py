@@ -25,18 +25,18 @@ SIZES = 2.0 ** np.linspace(-3, 3, 13)
 
 
 @dataclass(frozen=True)
-class Way:
+class PowerSimulation:
     """What an effect must pass.
 
     Attributes:
         screen: that its score comes from.
         alpha: level of the screen, over all effects.
-        sealed: number of sealed clusters.
+        confirmation_clusters: number of confirmation clusters.
     """
 
     screen: Screen
     alpha: float
-    sealed: int
+    confirmation_clusters: int
 
     def power(self, score: Score, one: Evidence, size: float, seed: int = 0) -> float:
         """Share of the simulations in which an effect of a size is found and confirmed."""
@@ -53,8 +53,10 @@ class Way:
         costs = _with_effect(self.screen.costs(name)[:, None], parts, grams, size)
         others = -(parts.sum(0) - parts) / np.maximum(total - grams, 1e-300)
         gain = _gain(others, parts, grams, costs)
-        leaning = _leaning(others, parts, grams, costs)
-        passed &= (gain.mean(0) > 0) & (_t(leaning) > stats.t.ppf(1 - rules().level, number - 1))
+        score_toward = _score_toward(others, parts, grams, costs)
+        passed &= (gain.mean(0) > 0) & (
+            _t(score_toward) > stats.t.ppf(1 - rules().level, number - 1)
+        )
         amount = -parts.sum(0) / total
         error = np.sqrt((number - 1) / number * ((others - others.mean(0)) ** 2).sum(0))
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
@@ -71,18 +73,20 @@ class Way:
         amount: np.ndarray,
     ) -> np.ndarray:
         """``(R,)`` whether sealed clusters lean towards the effect and are predicted better."""
-        if rules().level * 2**self.sealed < 1:
+        if rules().level * 2**self.confirmation_clusters < 1:
             return np.zeros(RUNS, dtype=bool)
-        chosen = rng.integers(0, len(grams), (self.sealed, RUNS))
+        chosen = rng.integers(0, len(grams), (self.confirmation_clusters, RUNS))
         drawn = grams[chosen]
         parts = rng.choice([-1.0, 1.0], chosen.shape) * rest[chosen] - size * drawn
         costs = _with_effect(costs[chosen], parts, drawn, size)
         gain = _gain(amount, parts, drawn, costs)
-        leaning = _leaning(amount, parts, drawn, costs)
+        score_toward = _score_toward(amount, parts, drawn, costs)
         likelier: np.ndarray = gain.mean(0) > 0
-        if self.sealed > 12:
-            return likelier & (_t(leaning) > stats.t.ppf(1 - rules().level, self.sealed - 1))
-        totals = every_sign(self.sealed) @ leaning
+        if self.confirmation_clusters > 12:
+            return likelier & (
+                _t(score_toward) > stats.t.ppf(1 - rules().level, self.confirmation_clusters - 1)
+            )
+        totals = every_sign(self.confirmation_clusters) @ score_toward
         passed: np.ndarray = (totals >= totals[0] - 1e-12).mean(0) <= rules().level
         return likelier & passed
 
@@ -117,7 +121,7 @@ def _gain(
     return found
 
 
-def _leaning(
+def _score_toward(
     amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
     """How far each cluster leans towards an amount, relative to the greater cost."""

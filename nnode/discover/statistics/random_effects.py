@@ -20,7 +20,13 @@ from scipy import stats
 
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, evaluated, grams, sums
-from nnode.discover.statistics.variance_components import LONGEST, Curve, ratio, seen_in, shares
+from nnode.discover.statistics.variance_components import (
+    LONGEST,
+    Curve,
+    period_estimates,
+    ratio,
+    shares,
+)
 from nnode.model.effects import IndividualEffect
 from nnode.model.extend import effects_of, extended, without
 from nnode.model.system import System
@@ -43,7 +49,7 @@ class Individuals:
             is one only), ``sequence``, ``agent`` and ``mood``.
         lags: s; ``common``: what parts at that lag have in common, per lag.
         lasts: s, the longest mood that can be told from a number of one's own.
-        mood: variance of what passes, and its time constant in s.
+        transient: variance of the transient deviation, and its time constant in s.
         shared: variance of what the agents of a sequence have in common.
         settings: intervals of 95 % of settings that were chosen among neighbouring ones.
     """
@@ -57,7 +63,7 @@ class Individuals:
     lags: list[float]
     common: list[float]
     lasts: float
-    mood: tuple[float, float]
+    transient: tuple[float, float]
     shared: float
     settings: dict[str, tuple[float, float]] = field(default_factory=dict)
     left_out: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -136,7 +142,7 @@ def numbers(
 
 def _passing(engine: Engine, one: Individuals) -> float:
     """Variance of the mean mood over the time that sequences last."""
-    height, tau = one.mood
+    height, tau = one.transient
     last = np.array([s.time[-1] - s.time[0] for s in engine.sequences]).mean()
     x = max(float(last) / max(tau, 1e-9), 1e-9)
     return height * 2 / x * (1 + np.expm1(-x) / x)
@@ -170,7 +176,7 @@ def with_people(system: System, one: Individuals, people: dict[str, list[float]]
 def _at(
     engine: Engine, fit: Fit, effect: type[IndividualEffect], options: dict[str, Any]
 ) -> Individuals | None:
-    seen = seen_in(engine, fit, _directions(engine, fit, effect, options))
+    seen = period_estimates(engine, fit, _directions(engine, fit, effect, options))
     if len(seen.agent) < 2:
         return None
     curve = Curve.of(seen)
@@ -198,7 +204,7 @@ def _at(
         lags=curve.lags.tolist(),
         common=(ratio(curve.same) - ratio(curve.between)).tolist(),
         lasts=float(LONGEST * curve.lags[-1]),
-        mood=(mood[0], mood[1]),
+        transient=(mood[0], mood[1]),
         shared=max(curve.plateau(ratio(curve.between), curve.between[1].sum(0))[0], 0.0),
         left_out=left_out,
     )

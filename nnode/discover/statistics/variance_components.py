@@ -24,7 +24,7 @@ NONE = 1e-6
 
 
 @dataclass
-class Seen:
+class PeriodEstimates:
     """Numbers of agents in parts of their time: O of them.
 
     Attributes:
@@ -54,7 +54,7 @@ class Seen:
         return weight
 
 
-def seen_in(engine: Engine, fit: Fit, z: np.ndarray) -> Seen:
+def period_estimates(engine: Engine, fit: Fit, z: np.ndarray) -> PeriodEstimates:
     """The numbers of everybody in every part of his time."""
     number = len(engine.sequences)
     first, last = np.full(number, np.inf), np.full(number, -np.inf)
@@ -92,11 +92,11 @@ def seen_in(engine: Engine, fit: Fit, z: np.ndarray) -> Seen:
             places.append(engine.sequences[b].n_agents - n)
     columns = list(zip(*rows, strict=True)) or [()] * 7
     agent, sequence, cluster_of, recording, when, values, info = (np.array(c) for c in columns)
-    seen = Seen(agent, sequence, cluster_of, recording, when, values, info)
+    seen = PeriodEstimates(agent, sequence, cluster_of, recording, when, values, info)
     return seen if alone else _beyond_places(seen, np.array(places, dtype=int))
 
 
-def _beyond_places(seen: Seen, place: np.ndarray) -> Seen:
+def _beyond_places(seen: PeriodEstimates, place: np.ndarray) -> PeriodEstimates:
     """Numbers beyond what all at a place of the platoon have in common.
 
     The mean of a place takes a part of every cluster's numbers along; the rest is enlarged by it
@@ -113,7 +113,7 @@ def _beyond_places(seen: Seen, place: np.ndarray) -> Seen:
         value[at] = away / np.sqrt(np.maximum(1 - share, 1e-9))[:, None]
     kept = np.flatnonzero(known)
     parts = {f.name: getattr(seen, f.name)[kept] for f in fields(seen)}
-    return Seen(**{**parts, "value": value[kept]})
+    return PeriodEstimates(**{**parts, "value": value[kept]})
 
 
 class _Identity:
@@ -147,7 +147,7 @@ class Curve:
     between: np.ndarray
 
     @classmethod
-    def of(cls, seen: Seen) -> Curve | None:
+    def of(cls, seen: PeriodEstimates) -> Curve | None:
         """None where there are fewer than three lags."""
         weight = seen.weight
         value = weight[:, None] * seen.value / np.sqrt(seen.value.shape[1])
@@ -243,7 +243,7 @@ def ratio(sums_of: np.ndarray) -> np.ndarray:
     return found
 
 
-def shares(seen: Seen, curve: Curve, own: float, mood: float) -> dict[str, float | None]:
+def shares(seen: PeriodEstimates, curve: Curve, own: float, mood: float) -> dict[str, float | None]:
     """Variance by what a number belongs to, as shares of their sum; negative ones are none."""
     shared, passing, _ = curve.plateau(ratio(curve.between), curve.between[1].sum(0))
     weight = seen.weight

@@ -46,7 +46,7 @@ def calibrated(
         [make_law("relaxation", tau=walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)]
     )
     engine = CrowdEngine(data)
-    engine.settle(system, ParameterVector(system).row)
+    engine.fit_whitening(system, ParameterVector(system).row)
     return refine(engine, system), data, engine
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.able import not_offered
+from nnode.discover.eligibility import not_offered
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System, build_model

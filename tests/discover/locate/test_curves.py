@@ -11,7 +11,7 @@ import torch
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import columns_of, curves, weighed, with_curve
-from nnode.discover.name.search import search, settled
+from nnode.discover.name.search import converged_fit, search
 from nnode.discover.residuals.engine import square_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Variable, hats, lengths_of
@@ -30,7 +30,7 @@ def _wavy(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
 def wavy() -> tuple[TrafficEngine, Fit]:
     # as many clusters as it takes to be sure of one curve among many
     engine = TrafficEngine(platoons(_wavy, number=16, driver=0.1))
-    return engine, settled(engine, model())
+    return engine, converged_fit(engine, model())
 
 
 def test_a_wave_along_the_road_is_found(wavy: tuple[TrafficEngine, Fit]) -> None:

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.inputs import Inputs
-from nnode.discover.judge.sealed import defined
+from nnode.discover.judge.confirmation import defined
 from nnode.discover.report.captions import Figures
 from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
@@ -202,7 +202,7 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
 
 def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
     found = deepcopy(traffic.found)
-    names = [traffic.inputs.sequences[i].name for i in found.sealed]
+    names = [traffic.inputs.sequences[i].name for i in found.confirmation]
     rows = [
         {"name": names[0], "before": 5.0, "after": 4.5},
         {"name": names[1], "before": 4.0, "after": 1.0},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import settled
+from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.profile import Profile, intervals, moved, profiles
 from nnode.model.build import add_effects, build_model
@@ -29,7 +29,7 @@ def fitted(engine: TrafficEngine, a: float, b: float) -> Fit:
     options = {"leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0}
     system = build_model({"term": "lin", "name": "lin", **options})
     add_effects(system, [{"name": "speed_period", "alpha": 0.95, "a": a, "b": b}])
-    return settled(engine, system)
+    return converged_fit(engine, system)
 
 
 def test_an_edge_may_lie_anywhere_between_two_sequences(engine: TrafficEngine) -> None:
