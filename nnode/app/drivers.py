@@ -234,7 +234,7 @@ def calibrated_drivers(
             short[name]: float(np.expm1(bias) if in_logs else bias)
             for name, bias, in_logs in zip(followers.names, found.bias, followers.logs, strict=True)
         },
-        observations=int(found.estimate.data.seen.sum()),
+        observations=int(found.estimate.data.observed.sum()),
         variances=int((variances.low < variances.high).sum()),
         # that of the restricted likelihood would not compare laws with other parameters
         log_likelihood=float(found.marginal.each.sum()),

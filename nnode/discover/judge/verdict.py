@@ -56,14 +56,14 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
         where=_where(effect, coefficients, step.chosen.score.options),
         alternatives=[
             Alternative(
-                name=other.name,
-                loss=float(other.losses.sum() / step.chosen.losses.sum()),
+                name=rival.name,
+                loss=float(rival.losses.sum() / step.chosen.losses.sum()),
                 p_value=test.p_value,
                 separated_by=effect.distinguishing_data,
-                clusters=clusters_to_tell(test, apart_at(step.chosen, other)),
-                profile=_profile(engine, fit, other, apart_at(step.chosen, other)),
+                clusters=clusters_to_tell(test, apart_at(step.chosen, rival)),
+                profile=_profile(engine, fit, rival, apart_at(step.chosen, rival)),
             )
-            for other, test in step.rivals
+            for rival, test in step.rivals
         ],
         p_value=step.chosen.score.p_value,
         gain=step.chosen.gain.gain,
@@ -77,23 +77,23 @@ def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profil
     return advised(engine, fit.system, rival.fit.system, level)
 
 
-def named_agents(one: Individuals, confirmed: float, order: int) -> NamedEffect:
+def named_agents(estimate: Individuals, confirmed: float, order: int) -> NamedEffect:
     """An individual effect that was confirmed, in a law of an order."""
-    effect = one.effect
-    found = {}
+    effect = estimate.effect
+    coefficients = {}
     for name, strength in effect.strengths.items():
-        found[name] = Coefficient(one.sigma, *one.interval(), strength.unit)
+        coefficients[name] = Coefficient(estimate.sigma, *estimate.interval(), strength.unit)
     for name, setting in effect.settings.items():
-        value = float(one.options[name])
-        low, high = one.settings.get(name, (float("nan"), float("nan")))
-        found[name] = Coefficient(value, low, high, setting.unit)
+        value = float(estimate.options[name])
+        low, high = estimate.settings.get(name, (float("nan"), float("nan")))
+        coefficients[name] = Coefficient(value, low, high, setting.unit)
     return NamedEffect(
         name=effect.name,
         formula=effect.formula_for(order),
         source=effect.source,
-        coefficients=found,
+        coefficients=coefficients,
         where="everybody, everywhere",
-        p_value=one.p_value,
+        p_value=estimate.p_value,
         confirmed=confirmed,
     )
 
@@ -101,65 +101,68 @@ def named_agents(one: Individuals, confirmed: float, order: int) -> NamedEffect:
 def _coefficients(engine: Engine, fit: Fit, step: Step) -> dict[str, Coefficient]:
     effect = step.chosen.score.effect
     place = place_of(fit.system, effect.name)
-    own = fit.system.terms[place]
+    term = fit.system.terms[place]
     intervals = fit.intervals(engine.cluster)
     edges = edge_intervals(engine, fit, effect.name) if effect.consecutive else {}
-    found = {}
+    coefficients = {}
     units = {name: strength.unit for name, strength in effect.strengths.items()}
     units |= {name: setting.unit for name, setting in effect.settings.items()}
     for name, unit in units.items():
-        value = float(getattr(own, name).detach())
+        value = float(getattr(term, name).detach())
         full = f"terms.{place}.{name}"
         low, high = value, value
         if full in fit.names:
             low, high = (float(end) for end in intervals[fit.names.index(full)])
         low, high = edges.get(name, (low, high))
-        found[name] = Coefficient(value, low, high, unit)
-    return found
+        coefficients[name] = Coefficient(value, low, high, unit)
+    return coefficients
 
 
-def _where(effect: type[Effect], found: dict[str, Coefficient], options: dict[str, Any]) -> str:
+def _where(
+    effect: type[Effect], coefficients: dict[str, Coefficient], options: dict[str, Any]
+) -> str:
     if effect.consecutive:
-        what = "x" if found["a"].unit == "m" else "t"
-        return f"{what} in [{found['a'].value:.4g}, {found['b'].value:.4g}] {found['a'].unit}"
+        what = "x" if coefficients["a"].unit == "m" else "t"
+        a, b = coefficients["a"], coefficients["b"]
+        return f"{what} in [{a.value:.4g}, {b.value:.4g}] {a.unit}"
     if "kind" in options:
         return f"vehicles of class {options['kind']}"
-    if {"x_o", "y_o"} <= set(found):
-        return f"around ({found['x_o'].value:.2f}, {found['y_o'].value:.2f}) m"
+    if {"x_o", "y_o"} <= set(coefficients):
+        return f"around ({coefficients['x_o'].value:.2f}, {coefficients['y_o'].value:.2f}) m"
     return "everybody, everywhere"
 
 
-def absences(search: Search, way: PowerSimulation) -> list[Absence]:
+def absences(search: Search, power: PowerSimulation) -> list[Absence]:
     """What the final screening says of the effects that were not found, by the power of the whole
     way."""
-    return [_absence(score, way) for score in search.scores]
+    return [_absence(score, power) for score in search.scores]
 
 
-def _absence(score: Score, way: PowerSimulation) -> Absence:
+def _absence(score: Score, power: PowerSimulation) -> Absence:
     effect = score.effect
     if not effect.strengths:
-        return _without_strength(score, way)
+        return _without_strength(score, power)
     # the strength that is known best in units of what is plausible
     name = min(effect.strengths, key=lambda n: _relative(effect, n, score.error.get(n, 0.0)))
     strength, k = effect.strengths[name], list(effect.strengths).index(name)
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
-    known = error > 0 and math.isfinite(error) and bool(score.evidence)
-    expected, detectable, least = strength.expected, math.inf, 0.0
-    if known and effect.remembers():
+    estimable = error > 0 and math.isfinite(error) and bool(score.evidence)
+    expected, detectable, smallest_tested = strength.expected, math.inf, 0.0
+    if estimable and effect.remembers():
         # what was tried at a size says nothing of smaller ones
-        found = [
-            max(one.size, way.detectable(score, one, max(one.size, expected)))
-            for one in score.evidence
+        detectable_sizes = [
+            max(evidence.size, power.detectable(score, evidence, max(evidence.size, expected)))
+            for evidence in score.evidence
         ]
-        best = int(np.argmin(found))
-        detectable, least = found[best], score.evidence[best].size
-    elif known:
-        detectable = way.detectable(
+        best = int(np.argmin(detectable_sizes))
+        detectable, smallest_tested = detectable_sizes[best], score.evidence[best].size
+    elif estimable:
+        detectable = power.detectable(
             score, score.evidence[min(k, len(score.evidence) - 1)], expected
         )
-    degrees = max(len(way.screen.costs(effect.name)) - 1, 1)
-    bound = max(least, abs(amount) + float(stats.t.ppf(0.975, degrees)) * error)
-    testable = known and detectable <= expected
+    degrees = max(len(power.screen.costs(effect.name)) - 1, 1)
+    bound = max(smallest_tested, abs(amount) + float(stats.t.ppf(0.975, degrees)) * error)
+    testable = estimable and detectable <= expected
     unit = "" if strength.unit == "1" else f" {strength.unit}"
     return Absence(
         name=effect.name,
@@ -177,16 +180,16 @@ def _absence(score: Score, way: PowerSimulation) -> Absence:
     )
 
 
-def _without_strength(score: Score, way: PowerSimulation) -> Absence:
+def _without_strength(score: Score, power: PowerSimulation) -> Absence:
     """Of an effect that is there or not: the weakest of its settings that would be named."""
     effect = score.effect
     name, setting = next(iter(effect.settings.items()))
-    found = [
-        one
-        for one in score.evidence
-        if one.grams.sum() > 0 and way.power(score, one, 1.0) >= rules().power
+    detectable_settings = [
+        evidence
+        for evidence in score.evidence
+        if evidence.grams.sum() > 0 and power.power(score, evidence, 1.0) >= rules().power
     ]
-    weakest = min(found, key=_information, default=None)
+    weakest = min(detectable_settings, key=_information, default=None)
     value = None if weakest is None else float(weakest.options[name])
     return Absence(
         effect.name,
@@ -199,18 +202,18 @@ def _without_strength(score: Score, way: PowerSimulation) -> Absence:
     )
 
 
-def _information(one: Evidence) -> float:
-    return float(one.grams.sum())
+def _information(evidence: Evidence) -> float:
+    return float(evidence.grams.sum())
 
 
-def agents_absent(one: Individuals, alpha: float, enough: bool) -> Absence:
+def agents_absent(estimate: Individuals, alpha: float, enough_clusters: bool) -> Absence:
     """What the open clusters say of numbers that nobody was found to have of his own."""
-    (name,) = one.effect.strengths
-    strength = one.effect.strengths[name]
-    detectable, (_, high) = one.detectable(alpha), one.interval()
-    testable = enough and 0 < detectable <= strength.expected
+    (name,) = estimate.effect.strengths
+    strength = estimate.effect.strengths[name]
+    detectable, (_, high) = estimate.detectable(alpha), estimate.interval()
+    testable = enough_clusters and 0 < detectable <= strength.expected
     return Absence(
-        one.effect.name,
+        estimate.effect.name,
         testable,
         name,
         strength.unit,
@@ -229,7 +232,7 @@ def _relative(effect: type[Effect], name: str, error: float) -> float:
     return error / effect.strengths[name].expected if error > 0 else math.inf
 
 
-def places(found: list[Curves], excess: float) -> list[Place]:
+def places(curves: list[Curves], excess: float) -> list[Place]:
     """Where each curve is largest of where it stands out, the one that explains most first.
 
     Args:
@@ -237,52 +240,52 @@ def places(found: list[Curves], excess: float) -> list[Place]:
         excess: share of the squared errors that is not noise of the measurement.
     """
     result = []
-    number = sum(len(one.heights) for one in found)
-    for one in found:
-        chance = tail(one, number)
-        known = chance <= rules().sure
-        if not known.any() or one.removed <= 0:
+    number = sum(len(curve.heights) for curve in curves)
+    for curve in curves:
+        p_values = tail(curve, number)
+        significant = p_values <= rules().sure
+        if not significant.any() or curve.removed <= 0:
             continue
-        best = int(np.argmax(np.where(known, np.abs(one.heights), 0.0)))
-        sign = np.sign(one.statistic)
-        alike = (sign == sign[best]) & (np.abs(one.statistic) > WIDE)
-        first = last = best
-        while first > 0 and alike[first - 1]:
-            first -= 1
-        while last < len(alike) - 1 and alike[last + 1]:
-            last += 1
-        part = slice(first, last + 1)
-        weight = 1 / one.errors[part] ** 2
-        mean = float((one.heights[part] * weight).sum() / weight.sum())
-        knots = one.variable.knots
+        best = int(np.argmax(np.where(significant, np.abs(curve.heights), 0.0)))
+        sign = np.sign(curve.statistic)
+        same_sign = (sign == sign[best]) & (np.abs(curve.statistic) > WIDE)
+        left = right = best
+        while left > 0 and same_sign[left - 1]:
+            left -= 1
+        while right < len(same_sign) - 1 and same_sign[right + 1]:
+            right += 1
+        part = slice(left, right + 1)
+        weight = 1 / curve.errors[part] ** 2
+        mean = float((curve.heights[part] * weight).sum() / weight.sum())
+        knots = curve.variable.knots
         result.append(
             Place(
-                variable=one.variable.name,
-                unit=one.variable.unit,
-                low=knots[first],
-                high=knots[last],
+                variable=curve.variable.name,
+                unit=curve.variable.unit,
+                low=knots[left],
+                high=knots[right],
                 deviation=mean,
                 error=float(1 / math.sqrt(weight.sum())),
-                share=min(one.removed / excess, 1.0),
-                p_value=float(chance[best]),
+                share=min(curve.removed / excess, 1.0),
+                p_value=float(p_values[best]),
                 curve={
                     "at": list(knots),
-                    "deviation": one.heights.tolist(),
-                    "error": one.errors.tolist(),
+                    "deviation": curve.heights.tolist(),
+                    "error": curve.errors.tolist(),
                 },
             )
         )
     return result
 
 
-def structure(found: list[Curves]) -> Structure:
+def structure(curves: list[Curves]) -> Structure:
     """What is left, by the curves that are significant."""
-    best = found[0]
-    at = np.array(best.variable.knots)
+    best = curves[0]
+    knots = np.array(best.variable.knots)
     return Structure(
-        variables=[one.variable.name for one in found],
+        variables=[curve.variable.name for curve in curves],
         gain=best.removed,
-        hint=symbolic(best.variable.name, at, best.heights, best.errors),
-        curve={"at": at.tolist(), "deviation": best.heights.tolist()},
+        hint=symbolic(best.variable.name, knots, best.heights, best.errors),
+        curve={"at": knots.tolist(), "deviation": best.heights.tolist()},
         unit=best.variable.unit,
     )

@@ -138,9 +138,9 @@ def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
         label: ``(S,)`` of the sequences; None: every sequence is a cluster.
         sequence: ``(n,)`` of the residuals.
     """
-    own = sequence if label is None else np.asarray(label)[sequence]
-    found: np.ndarray = np.unique(own, return_inverse=True)[1].reshape(-1)
-    return found
+    clusters = sequence if label is None else np.asarray(label)[sequence]
+    numbered: np.ndarray = np.unique(clusters, return_inverse=True)[1].reshape(-1)
+    return numbered
 
 
 def square_of(engine: Engine, system: System) -> float:

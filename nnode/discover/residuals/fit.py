@@ -80,11 +80,11 @@ class Fit:
         return self._errors(self.influence(cluster), cluster, power)
 
     def _errors(self, influence: ClusterInfluence, cluster: np.ndarray, power: float) -> np.ndarray:
-        found = np.full(len(self.row), np.nan)
+        errors = np.full(len(self.row), np.nan)
         if len(np.unique(cluster)) >= 3 and self.free.any():
             variance = np.diag(influence.covariance(power))
-            found[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
-        return found if self.simulated is None else np.hypot(found, self.simulated)
+            errors[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
+        return errors if self.simulated is None else np.hypot(errors, self.simulated)
 
     def jackknife_intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
         """``(K, 2)`` cautious intervals that decide whether an effect is kept: :meth:`errors`
@@ -108,8 +108,8 @@ def sums(values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None
     number, count = int(label.max()) + 1, len(label)
     weight = np.ones(count) if weight is None else weight
     member = csr_array((weight, (label, np.arange(count))), (number, count))
-    found: np.ndarray = member @ values
-    return found
+    totals: np.ndarray = member @ values
+    return totals
 
 
 def members(label: np.ndarray) -> list[np.ndarray]:
@@ -133,15 +133,15 @@ class _EngineProblem:
         self.engine, self.system = engine, system
         self.vector = ParameterVector(system)
         self.low, self.high = self.vector.bounds
-        self._rows, self._found = np.empty((0, len(self.low))), np.empty((0, 0))
+        self._rows, self._residuals = np.empty((0, len(self.low))), np.empty((0, 0))
         self._fit: Fit | None = None
 
     def costs(self, trials: np.ndarray) -> np.ndarray:
         """``(T, 1)`` of trials ``(T, 1, K)``; inf where one blows up."""
         self._rows = trials[:, 0]
-        self._found = self.engine.residuals(self.system, torch.from_numpy(self._rows)).numpy()
-        finite = np.isfinite(self._found).all(1)
-        return np.where(finite, (self._found**2).sum(1), np.inf)[:, None]
+        self._residuals = self.engine.residuals(self.system, torch.from_numpy(self._rows)).numpy()
+        finite = np.isfinite(self._residuals).all(1)
+        return np.where(finite, (self._residuals**2).sum(1), np.inf)[:, None]
 
     def __call__(self, rows: np.ndarray) -> Quadratic:
         """Costs and their derivatives ``(1, ...)``.
@@ -163,7 +163,7 @@ class _EngineProblem:
             return self._fit
         if not (self._rows == row).all(1).any():
             self.costs(row[None, None])
-        residual = self._found[np.flatnonzero((self._rows == row).all(1))[0]]
+        residual = self._residuals[np.flatnonzero((self._rows == row).all(1))[0]]
         jacobian = np.zeros((len(residual), len(row)))
         if np.isfinite(residual).all():
             jacobian = self.engine.tangents(self.system, torch.from_numpy(row)).numpy().T
@@ -193,7 +193,7 @@ def refine(
         SimulationError: the start cannot be simulated.
     """
     problem = _EngineProblem(engine, system)
-    found = least_squares(
+    solution = least_squares(
         problem,
         problem.costs,
         problem.vector.row.numpy()[None],
@@ -204,8 +204,8 @@ def refine(
         dampings=DAMPINGS,
         hopeless=hopeless,
     )
-    problem.vector.fill_(found.row[0])
-    return problem.fit(found.row[0])
+    problem.vector.fill_(solution.row[0])
+    return problem.fit(solution.row[0])
 
 
 def evaluated(engine: Engine, system: System) -> Fit:

@@ -45,17 +45,17 @@ class Variable:
         if self.lengths:
             turn = 2 * torch.pi / torch.tensor(self.lengths, dtype=value.dtype)
             # a clock is the same for all agents
-            own = value[..., :1] if value.stride(-1) == 0 else value
-            angle = own[..., None] * turn
-            found = torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
-            return found.expand(*value.shape, -1)
+            values = value[..., :1] if value.stride(-1) == 0 else value
+            angle = values[..., None] * turn
+            waves = torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+            return waves.expand(*value.shape, -1)
         return hats(value, self.knots)
 
     def wave(self, number: int) -> Variable:
         """One wave alone."""
         length = self.lengths[number]
-        first = self.knots[0]
-        knots = tuple(first + float(s) * length for s in np.linspace(0, WAVES, WAVE_KNOTS))
+        start = self.knots[0]
+        knots = tuple(start + float(s) * length for s in np.linspace(0, WAVES, WAVE_KNOTS))
         return replace(self, lengths=(length,), knots=knots)
 
     def curve(self, value: Tensor, amounts: Tensor) -> Tensor:
@@ -75,8 +75,8 @@ class Variable:
         if not self.lengths:
             return amounts
         turn = 2 * np.pi * np.array(self.knots) / self.lengths[0]
-        found: np.ndarray = np.stack([np.sin(turn), np.cos(turn)], 1) @ amounts
-        return found
+        heights: np.ndarray = np.stack([np.sin(turn), np.cos(turn)], 1) @ amounts
+        return heights
 
 
 class Curve(Term):
@@ -105,17 +105,17 @@ def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:
     inside = value.clamp(float(at[0]), float(at[-1]))[..., None]
     left, right = at[:-1], at[1:]
     share = ((inside - left) / (right - left)).clamp(0, 1)
-    one = torch.ones_like(share[..., :1])
-    return torch.cat([one, share], -1) - torch.cat([share, 0 * one], -1)
+    ones = torch.ones_like(share[..., :1])
+    return torch.cat([ones, share], -1) - torch.cat([share, 0 * ones], -1)
 
 
 def knots_of(values: np.ndarray, most: int = 9) -> tuple[float, ...]:
     """Quantiles of observed values, apart from each other; two at least."""
-    found = np.unique(np.quantile(values, np.linspace(0.01, 0.99, most)).round(6))
-    wide = 1e-3 * max(float(np.ptp(values)), 1e-9)
-    kept = [found[0]]
-    for knot in found[1:]:
-        if knot - kept[-1] > wide:
+    quantiles = np.unique(np.quantile(values, np.linspace(0.01, 0.99, most)).round(6))
+    separation = 1e-3 * max(float(np.ptp(values)), 1e-9)
+    kept = [quantiles[0]]
+    for knot in quantiles[1:]:
+        if knot - kept[-1] > separation:
             kept.append(knot)
     if len(kept) < 2:
         kept = [kept[0], kept[0] + 1.0]
@@ -209,5 +209,5 @@ class Curves:
     @property
     def statistic(self) -> np.ndarray:
         """Of each knot, in its standard error."""
-        found: np.ndarray = self.heights / self.errors
-        return found
+        ratio: np.ndarray = self.heights / self.errors
+        return ratio
