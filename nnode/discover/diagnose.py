@@ -14,7 +14,7 @@ import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.compare.laws import BetterLaw, imitated
+from nnode.discover.compare.laws import BetterLaw
 from nnode.discover.division import Division, divide
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.confirmation import ConfirmationSet
@@ -28,7 +28,7 @@ from nnode.discover.judge.verdict import (
     structure,
 )
 from nnode.discover.lanes.followers import FollowersEngine
-from nnode.discover.locate.curves import curves, weighed
+from nnode.discover.locate.curves import curves, significant_curves
 from nnode.discover.name.search import (
     Search,
     converged_fit,
@@ -277,7 +277,7 @@ def _unexplained(exploration: _Exploration, selection: Search) -> list[Curves]:
     engine, remaining = exploration.engine, exploration.base_curves
     if selection.fit is not exploration.base:
         remaining = curves(engine, selection.fit, exploration.variables)
-        remaining = weighed(engine, selection.fit, remaining, rules().sure)
+        remaining = significant_curves(engine, selection.fit, remaining, rules().sure)
     return [curve for curve in remaining if curve.removed > rules().least]
 
 
@@ -317,7 +317,9 @@ def _without_imitations(
         notes: the reason is added to them.
     """
     engine, selection, division = exploration.engine, exploration.selection, exploration.division
-    steps, p_value = imitated(engine, selection, division.label[division.exploration], nearer)
+    steps, p_value = explained_by_law(
+        engine, selection, division.label[division.exploration], nearer
+    )
     imitations = [named(engine, selection.fit, step, math.nan) for step in steps]
     if steps:
         names = ", ".join(step.chosen.name for step in steps)
@@ -365,7 +367,7 @@ def _explore(
     clock.lap("calibrate")
     stages.begin("locating")
     variables = engine.variables() if options.structure else []
-    base_curves = weighed(engine, base, curves(engine, base, variables), rules().sure)
+    base_curves = significant_curves(engine, base, curves(engine, base, variables), rules().sure)
     located = places(base_curves, _excess(engine, base))
     clock.lap("locate")
     stages.begin("naming")

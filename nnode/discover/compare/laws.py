@@ -55,60 +55,60 @@ def compare_laws(
         DataError: too few sequences.
     """
     division = divide(sequences, options)
-    chosen, label = (
+    exploration, label = (
         [sequences[i] for i in division.exploration],
         division.label[division.exploration],
     )
-    one = next(iter(candidates.values()))
-    whole = engine_of(one, chosen, label, whole=True)
-    found, refused = _calibrated(whole, candidates)
-    if not found:
+    any_system = next(iter(candidates.values()))
+    whole = engine_of(any_system, exploration, label, whole=True)
+    fits, refused = _calibrated(whole, candidates)
+    if not fits:
         return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
-    errors = {name: heldout(fit, whole.cluster) / number for name, fit in found.items()}
-    if one.domain == "crowd":  # whose residuals are no positions
-        errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in found.items()}
-    first = min(errors, key=lambda name: float(errors[name].mean()))
-    engine = windows_of(one, chosen, label)
+    errors = {name: heldout(fit, whole.cluster) / number for name, fit in fits.items()}
+    if any_system.domain == "crowd":  # whose residuals are no positions
+        errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in fits.items()}
+    reference = min(errors, key=lambda name: float(errors[name].mean()))
+    engine = windows_of(any_system, exploration, label)
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
-        engine.fit_whitening(found[first].system, ParameterVector(found[first].system).row)
-        found = {n: refine(engine, copy.deepcopy(fit.system)) for n, fit in found.items()}
-        costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
+        engine.fit_whitening(fits[reference].system, ParameterVector(fits[reference].system).row)
+        fits = {n: refine(engine, copy.deepcopy(fit.system)) for n, fit in fits.items()}
+        costs = {name: heldout(fit, engine.cluster) for name, fit in fits.items()}
         best = min(costs, key=lambda name: _level(costs[name]))
-        if best == first:
+        if best == reference:
             break
-        first = best
+        reference = best
     ranking = []
     for name in sorted(costs, key=lambda name: _level(costs[name])):
-        against = compare(costs[name], costs[best])
-        system = found[name].system
+        comparison = compare(costs[name], costs[best])
+        system = fits[name].system
         ranking.append(
             ComparedLaw(
                 name=name,
-                parameters=len(found[name].row),
+                parameters=len(fits[name].row),
                 error=float(errors[name].mean()),
                 behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
-                p_value=1.0 if name == best else against.p_value,
+                p_value=1.0 if name == best else comparison.p_value,
                 values={k: (float(v), unit) for k, (v, unit) in system.physical().items()},
             )
         )
-    systems = {name: fit.system for name, fit in found.items()}
+    systems = {name: fit.system for name, fit in fits.items()}
     return Laws(ranking, refused, int(engine.cluster.max()) + 1), systems
 
 
 def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str, System]:
     """Copies of laws with those effects that they have a place for, from the values given."""
-    found = {}
+    extended_laws = {}
     for name, law in laws.items():
-        known = CATALOGUE.of(cast(Domain, law.domain), law.order)
-        own = {effect.name for effect in effects_of(law)}
+        offered = CATALOGUE.of(cast(Domain, law.domain), law.order)
+        present = {effect.name for effect in effects_of(law)}
         for effect in effects:
             kind = type(effect)
-            if kind in known and effect.name not in own and not not_offered(kind, law):
+            if kind in offered and effect.name not in present and not not_offered(kind, law):
                 law, _ = extended(law, kind(**effect.options()))
-        found[name] = copy.deepcopy(law)
-    return found
+        extended_laws[name] = copy.deepcopy(law)
+    return extended_laws
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ class BetterLaw:
     system: System
 
 
-def imitated(
-    engine: Engine, found: Search, label: np.ndarray, nearer: BetterLaw
+def explained_by_law(
+    engine: Engine, selection: Search, label: np.ndarray, nearer: BetterLaw
 ) -> tuple[list[Step], float]:
     """Effects that a nearer law does without: they imitate that law, and are nothing of their own.
 
@@ -137,11 +137,11 @@ def imitated(
     Returns:
         The effects, and the one-sided p-value of that comparison.
     """
-    common = windows_of(nearer.system, engine.sequences, label)
-    common.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
+    engine_of_law = windows_of(nearer.system, engine.sequences, label)
+    engine_of_law.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
     costs = [
-        heldout(refine(common, copy.deepcopy(system)), common.cluster)
-        for system in (found.fit.system, nearer.system)
+        heldout(refine(engine_of_law, copy.deepcopy(system)), engine_of_law.cluster)
+        for system in (selection.fit.system, nearer.system)
     ]
     p_value = compare(*costs).p_value
     if p_value > rules().level:
@@ -149,7 +149,7 @@ def imitated(
     shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [
         step
-        for step in found.steps
+        for step in selection.steps
         if not step.chosen.score.effect.built_into_laws and step.chosen.name not in shared
     ]
     return steps, p_value
@@ -157,15 +157,15 @@ def imitated(
 
 def _level(costs: np.ndarray) -> float:
     """Mean logarithm of the clusters' costs: no cluster dominates."""
-    found = np.log(np.maximum(np.nan_to_num(costs, nan=np.inf), 1e-300)).mean()
-    return float(found)
+    level = np.log(np.maximum(np.nan_to_num(costs, nan=np.inf), 1e-300)).mean()
+    return float(level)
 
 
 def _calibrated(
     engine: Engine, candidates: Mapping[str, System]
 ) -> tuple[dict[str, Fit], dict[str, str]]:
     """Every law from the better of two starts, by the engine's residuals as they are."""
-    found: dict[str, Fit] = {}
+    fits: dict[str, Fit] = {}
     refused: dict[str, str] = {}
     for name, system in candidates.items():
         try:
@@ -177,5 +177,5 @@ def _calibrated(
         if fit is None:
             refused[name] = "it blows up on these data"
         else:
-            found[name] = fit
-    return found, refused
+            fits[name] = fit
+    return fits, refused

@@ -91,15 +91,15 @@ class CrowdEngine:
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions, without what start states explain."""
-        which = self.windows.person[:, 0]
+        window = self.windows.person[:, 0]
         squares = (self._away(system, row) ** 2).sum(-1)
-        each = squares.shape[1]
-        return Squares(squares.ravel(), self.windows.sequence[which].repeat(each))
+        n_samples = squares.shape[1]
+        return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """Windows one after the other, each from the start state that suits the model best."""
-        away, length = self._away(system, row), self.windows.length
-        found: list[Simulation | None] = [None] * len(self.sequences)
+        difference, length = self._away(system, row), self.windows.length
+        simulations: list[Simulation | None] = [None] * len(self.sequences)
         for i in self.windows.used:
             s, first, stride = self.sequences[i], *self.windows.compared[i]
             windows = np.flatnonzero(self.windows.sequence == i)
@@ -116,23 +116,23 @@ class CrowdEngine:
             for number, window in enumerate(windows):
                 people = self.windows.person[:, 0] == window
                 who = self.windows.person[people, 1]
-                x[number * length : (number + 1) * length, who] -= away[people].swapaxes(0, 1)
-            found[i] = Simulation(part, x, restart=length)
-        return found
+                x[number * length : (number + 1) * length, who] -= difference[people].swapaxes(0, 1)
+            simulations[i] = Simulation(part, x, restart=length)
+        return simulations
 
     def _away(self, system: System, row: Tensor) -> np.ndarray:
         """``(P, L, 2)`` m: measured minus simulated positions, without what starts explain."""
         whitening = self._settled(system, row)
-        found: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
-        return found.reshape(len(found), -1, 2)
+        projected: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
+        return projected.reshape(len(projected), -1, 2)
 
     def variables(self) -> list[Variable]:
         """What deviations of people may depend on."""
-        windows, nothing = self.windows, Crowd([])
+        windows, no_forces = self.windows, Crowd([])
         measured = torch.cat([windows.batch.x[::2], windows.batch.v[::2]], -1)
-        run = RunAlone(windows.around(nothing), nothing, measured)
-        first = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
-        return crowd_variables(run.state, first)
+        run = RunAlone(windows.around(no_forces), no_forces, measured)
+        start_of = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
+        return crowd_variables(run.state, start_of)
 
     def noise_floor(self) -> float:
         """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed
@@ -148,23 +148,23 @@ class CrowdEngine:
         """
         self._run = self._simulated(system, row)
         start, forced = self._run[-1].unit_responses()
-        every = self.windows.sub
+        stride = self.windows.sub
         difference = self._differences(system, row[None])[0].numpy()
         self._whitening = Whitening.fit(
-            difference, start[:, ::every].numpy(), self._turns(), self.windows.variance
+            difference, start[:, ::stride].numpy(), self._turns(), self.windows.variance
         )
         self._matrix = torch.as_tensor(self._whitening.matrix())
-        self._response = self._matrix @ forced[:, ::every].flatten(1, 2)
+        self._response = self._matrix @ forced[:, ::stride].flatten(1, 2)
         self._label(self._matrix.shape[1])
 
-    def _label(self, each: int) -> None:
+    def _label(self, n_residuals: int) -> None:
         """Say whose ``each`` residuals of every person's window are."""
-        which = self.windows.person[:, 0]
-        self.sequence = self.windows.sequence[which].repeat(each)
+        window = self.windows.person[:, 0]
+        self.sequence = self.windows.sequence[window].repeat(n_residuals)
         self.cluster = of_residuals(self._clusters, self.sequence)
-        self.clock = self.windows.batch.start.numpy()[which].repeat(each)
-        self.component = np.tile(np.arange(each), len(which))
-        self.unit = self._unit.repeat(each)
+        self.clock = self.windows.batch.start.numpy()[window].repeat(n_residuals)
+        self.component = np.tile(np.arange(n_residuals), len(window))
+        self.unit = self._unit.repeat(n_residuals)
 
     # -- linear response ----------------------------------------------------------------------
 
@@ -207,14 +207,14 @@ class CrowdEngine:
         the order of its ``steps``; the change by the effect as a whole where it has no strength."""
 
         def rates(state: State) -> list[Tensor]:
-            without, found = effect(**probe.options)(state), []
+            base, changes = effect(**probe.options)(state), []
             if not probe.steps:
-                return [without]
+                return [base]
             for name, step in probe.steps.items():
                 changed = effect(**probe.options)
                 getattr(changed, name).add_(step)
-                found.append((changed(state) - without) / step)
-            return found
+                changes.append((changed(state) - base) / step)
+            return changes
 
         return self.response(system, row, rates)
 
@@ -227,11 +227,11 @@ class CrowdEngine:
         As people walk alone, the derivative with respect to one person's amount is the same
         column, restricted to the residuals of this unit.
         """
-        names, most = set(self.batch.names), self.windows.batch.x.shape[2]
+        names, n_agents = set(self.batch.names), self.windows.batch.x.shape[2]
 
         def rates(state: State) -> list[Tensor]:
             return [
-                effect(people={name: [number] * most for name in names}, **values)(state)
+                effect(people={name: [number] * n_agents for name in names}, **values)(state)
                 for values, number in effect.directions(options)
             ]
 
@@ -266,31 +266,31 @@ class CrowdEngine:
             self._around = windows.around(system)
         w, n = windows.batch.agent.shape
         first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
-        found = []
+        states = []
         for part in rows.split(max(1, CHUNK // (w * n * n))):
             rhs = PersonAlone(self._around, system, ParameterVector(system).runs(part))
-            found.append(rhs.simulated(first, windows.steps))
-        return torch.cat(found, 1)
+            states.append(rhs.simulated(first, windows.steps))
+        return torch.cat(states, 1)
 
     def _turns(self) -> np.ndarray:
         """``(P, 2, 2)``: rows along and across each person's way in his window."""
-        which, who = self.windows.person.T
-        x = self.windows.batch.x[:, which, who].numpy()
-        goal = self.windows.batch.destination[which, who].numpy()
-        way, far = x[-1] - x[0], goal - x[0]
-        slow = np.hypot(*way.T) < 0.1
-        way = np.where(slow[:, None], far, way)
-        way = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
-        return np.stack([way, np.stack([-way[:, 1], way[:, 0]], 1)], 1)
+        window, person = self.windows.person.T
+        x = self.windows.batch.x[:, window, person].numpy()
+        goal = self.windows.batch.destination[window, person].numpy()
+        displacement, to_goal = x[-1] - x[0], goal - x[0]
+        standing = np.hypot(*displacement.T) < 0.1
+        displacement = np.where(standing[:, None], to_goal, displacement)
+        displacement = displacement / np.maximum(np.hypot(*displacement.T), 1e-9)[:, None]
+        return np.stack([displacement, np.stack([-displacement[:, 1], displacement[:, 0]], 1)], 1)
 
 
 def _differences(system: System) -> list[float]:
     """``(K,)``: differences of the parameters by which derivatives are taken."""
-    found = []
+    differences = []
     for name, p in ParameterVector(system).parameters.items():
         _, place, key = name.split(".", 2)
         term = system.terms[int(place)]
         strength = term.strengths.get(key) if isinstance(term, Effect) else None
         size = 1e-3 * max(1.0, float(p.detach().abs().max()))
-        found += [size if strength is None else abs(strength.step)] * p.numel()
-    return found
+        differences += [size if strength is None else abs(strength.step)] * p.numel()
+    return differences

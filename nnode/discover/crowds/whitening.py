@@ -54,17 +54,19 @@ class Whitening:
         p, length = difference.shape[:2]
         basis, _ = np.linalg.qr(start.reshape(p, 2 * length, 4))
         project = np.eye(2 * length) - basis @ basis.transpose(0, 2, 1)
-        left = np.einsum("pab,pb->pa", project, difference.reshape(p, -1)).reshape(p, length, 2)
-        left = np.einsum("pcd,pld->pcl", turn, left)
+        projected = np.einsum("pab,pb->pa", project, difference.reshape(p, -1)).reshape(
+            p, length, 2
+        )
+        projected = np.einsum("pcd,pld->pcl", turn, projected)
         weight = np.ones(p)
         for _ in range(ROUNDS):
-            total = np.einsum("p,pcl,pcm->clm", weight, left, left) / weight.sum()
+            total = np.einsum("p,pcl,pcm->clm", weight, projected, projected) / weight.sum()
             covariance = total + NUMERICAL**2 * np.eye(length)
             filters = _filters(covariance, variance)
-            size = (np.einsum("mcl,pcl->pm", filters, left) ** 2).mean(1)
+            size = (np.einsum("mcl,pcl->pm", filters, projected) ** 2).mean(1)
             # outliers are measured against the usual person, not against each other
-            usual = max(float(np.median(size)), 1e-12)
-            weight = 1 / (1 + size / usual / OUTLYING**2)
+            median_size = max(float(np.median(size)), 1e-12)
+            weight = 1 / (1 + size / median_size / OUTLYING**2)
         return cls(project, turn, filters, weight, covariance)
 
     def projected(self, difference: np.ndarray) -> np.ndarray:
@@ -83,13 +85,13 @@ class Whitening:
 
 def _filters(covariance: np.ndarray, variance: float) -> np.ndarray:
     """``(M, 2, L)``: from the ``(2, L, L)`` covariances of the differences along and across."""
-    found = []
+    filters = []
     for c, part in enumerate(covariance):
         value, vector = np.linalg.eigh(part)
         # start states took away two directions
-        telling = np.flatnonzero(value > TELLING * (variance + NUMERICAL**2))
-        first = int(np.clip(len(value) - len(telling), 2, max(2, len(value) - FEWEST)))
-        own = np.zeros((len(value) - first, *covariance.shape[::2]))
-        own[:, c] = (vector[:, first:] / np.sqrt(value[first:])).T
-        found.append(own)
-    return np.concatenate(found)
+        informative = np.flatnonzero(value > TELLING * (variance + NUMERICAL**2))
+        start = int(np.clip(len(value) - len(informative), 2, max(2, len(value) - FEWEST)))
+        rows = np.zeros((len(value) - start, *covariance.shape[::2]))
+        rows[:, c] = (vector[:, start:] / np.sqrt(value[start:])).T
+        filters.append(rows)
+    return np.concatenate(filters)

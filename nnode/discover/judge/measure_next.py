@@ -42,7 +42,9 @@ PERIODS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 POWER = 0.9
 
 
-def advised(engine: TrafficEngine, first: System, second: System, level: float) -> Profile | None:
+def best_profile(
+    engine: TrafficEngine, first: System, second: System, level: float
+) -> Profile | None:
     """The profile that needs the fewest platoons; None if all simulations diverge or no number is
     sufficient.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from nnode.discover.judge.measure_next import advised
+from nnode.discover.judge.measure_next import best_profile
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import tail
 from nnode.discover.locate.symbolic import symbolic
@@ -74,7 +74,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
 def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profile | None:
     if not isinstance(engine, TrafficEngine):
         return None
-    return advised(engine, fit.system, rival.fit.system, level)
+    return best_profile(engine, fit.system, rival.fit.system, level)
 
 
 def named_agents(estimate: Individuals, confirmed: float, order: int) -> NamedEffect:

@@ -142,7 +142,9 @@ class TrafficEngine:
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` whitened residuals, the largest drawn in."""
-        return drawn_in(self.filter(self.deviations(system, rows))[:, self.compared], self.large)
+        return huber_residuals(
+            self.filter(self.deviations(system, rows))[:, self.compared], self.large
+        )
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)`` derivatives of the residuals, by linear response."""
@@ -161,14 +163,14 @@ class TrafficEngine:
         base = response.rates(response.system)
         sources = [
             (response.rates(changed) - base) / step
-            for changed, step in changed_by_each(response.system, effect, probe)
+            for changed, step in with_each_strength(response.system, effect, probe)
         ]
         return self._columns(response, response.response(torch.stack(sources)))
 
     def _whole(self, response: LinearResponse, effect: type[Effect], probe: Probe) -> Tensor:
         """``(1, n)`` change of the residuals by an effect of finite strength; zero where vehicles
         would be moved by more than all the road that was seen: that is no small change."""
-        changed, amount = changed_as_whole(response.system, effect, probe)
+        changed, amount = with_all_strengths(response.system, effect, probe)
         with torch.no_grad():
             x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
         displacement = torch.where(self.follows, x - response.states[..., 0], 0.0)
@@ -304,7 +306,7 @@ class TrafficEngine:
         self.filter = PlatoonFilter.fitted(difference, self.compared, order)
 
 
-def drawn_in(residual: Tensor, most: float = LARGE) -> Tensor:
+def huber_residuals(residual: Tensor, most: float = LARGE) -> Tensor:
     """Residuals whose squares are Huber's loss: a vehicle that breaks down does not outweigh
     all others.
 
@@ -318,12 +320,12 @@ def drawn_in(residual: Tensor, most: float = LARGE) -> Tensor:
 
 
 def weights_of(residual: Tensor, most: float) -> Tensor:
-    """Derivatives of :func:`drawn_in`: less than 1 for large residuals."""
-    size = drawn_in(residual, most).abs()
+    """Derivatives of :func:`huber_residuals`: less than 1 for large residuals."""
+    size = huber_residuals(residual, most).abs()
     return torch.where(residual.abs() <= most, 1.0, most / size)
 
 
-def changed_as_whole(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
+def with_all_strengths(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
     """A model with an effect whose strengths are all varied by a probe's steps, and by how much;
     by 1 where it varies none."""
     values, amount = dict(probe.options), 1.0
@@ -332,15 +334,15 @@ def changed_as_whole(system: System, effect: type[Effect], probe: Probe) -> tupl
     return extended(system, effect(**values))[0], amount
 
 
-def changed_by_each(
+def with_each_strength(
     system: System, effect: type[Effect], probe: Probe
 ) -> list[tuple[System, float]]:
     """A model with an effect of which one strength at a time is varied by a probe's step, and by
     how much; as it is, by 1, where the probe varies none."""
     if not probe.steps:
-        return [changed_as_whole(system, effect, probe)]
+        return [with_all_strengths(system, effect, probe)]
     probes = [replace(probe, steps={name: step}) for name, step in probe.steps.items()]
-    return [changed_as_whole(system, effect, single) for single in probes]
+    return [with_all_strengths(system, effect, single) for single in probes]
 
 
 def fastest(system: System, rows: Tensor) -> float:

@@ -26,10 +26,10 @@ from nnode.discover.lanes.engine import (
     LARGE,
     STEP,
     TrafficEngine,
-    changed_as_whole,
-    changed_by_each,
-    drawn_in,
+    huber_residuals,
     weights_of,
+    with_all_strengths,
+    with_each_strength,
 )
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
@@ -109,7 +109,7 @@ class FollowersEngine(TrafficEngine):
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` whitened residuals, the largest drawn in."""
         difference = self._away(system, rows)[0]
-        return drawn_in(self._whitened(difference.transpose(2, 1, 0)), self.large)
+        return huber_residuals(self._whitened(difference.transpose(2, 1, 0)), self.large)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions after the first sample, with the deviations
@@ -154,10 +154,10 @@ class FollowersEngine(TrafficEngine):
         response; of an effect with a memory, the change by it as a whole."""
         run, changes = self._run_of(system, row), []
         if effect.remembers():
-            changed, amount = changed_as_whole(run.system, effect, probe)
+            changed, amount = with_all_strengths(run.system, effect, probe)
             return self._moved(run, self._finite(run, changed)[..., None] / amount)
         base = run.model.rates(run.parameters, run.states)
-        for changed, size in changed_by_each(run.system, effect, probe):
+        for changed, size in with_each_strength(run.system, effect, probe):
             model = self._model(changed, ParameterVector(changed).row)
             parameters = model.spread(model.start, self._deviations(model)[0])
             changes.append((model.rates(parameters, run.states) - base) / size)

@@ -46,29 +46,29 @@ class PlatoonFilter:
             order: p.
         """
         mean = torch.where(valid, residual, 0.0).sum(0) / valid.sum(0).clamp(min=1)
-        lively = torch.where(residual != 0, residual - mean, 0.0)
-        columns = _lagged(lively, order)
-        e, design = lively[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
+        centred = torch.where(residual != 0, residual - mean, 0.0)
+        columns = _lagged(centred, order)
+        e, design = centred[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
         gram = design.T @ design
         gram += max(rules().trust ** 2 * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
         weights = np.linalg.solve(gram, design.T @ e)
-        found = cls(weights[:order], weights[order:], 1.0)
-        scale = float(found(residual)[valid].square().mean().sqrt())
-        return replace(found, scale=max(scale, 1e-9))
+        unscaled = cls(weights[:order], weights[order:], 1.0)
+        scale = float(unscaled(residual)[valid].square().mean().sqrt())
+        return replace(unscaled, scale=max(scale, 1e-9))
 
     def __call__(self, residual: Tensor) -> Tensor:
         """``(..., K, B, N)`` whitened residuals of ``(..., K, B, N)``."""
-        rest, k = residual / self.scale, residual.shape[-3]
-        for late, weight in enumerate([0.0, *self.own]):
-            if weight and late < k:
+        whitened, k = residual / self.scale, residual.shape[-3]
+        for lag, weight in enumerate([0.0, *self.own]):
+            if weight and lag < k:
                 share = -float(weight) / self.scale
-                rest[..., late:, :, :].add_(residual[..., : k - late, :, :], alpha=share)
-        for late, weight in enumerate(self.ahead):
-            if weight and late < k:
+                whitened[..., lag:, :, :].add_(residual[..., : k - lag, :, :], alpha=share)
+        for lag, weight in enumerate(self.ahead):
+            if weight and lag < k:
                 share = -float(weight) / self.scale
-                own = rest[..., late:, :, :-1]
-                own.add_(residual[..., : k - late, :, 1:], alpha=share)
-        return rest
+                followers = whitened[..., lag:, :, :-1]
+                followers.add_(residual[..., : k - lag, :, 1:], alpha=share)
+        return whitened
 
 
 def _lagged(e: Tensor, order: int) -> list[Tensor]:

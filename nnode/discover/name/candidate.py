@@ -10,7 +10,7 @@ import numpy as np
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
-from nnode.discover.statistics.score import Score, Screen, minimal_of, traces
+from nnode.discover.statistics.score import Score, Screen, negligible_strengths, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import extended, place_of
@@ -62,7 +62,7 @@ class Candidate:
         """
         intervals, effect = self.fit.jackknife_intervals(cluster), self.score.effect
         place = place_of(self.fit.system, self.name)
-        negligible = minimal_of(effect, len(effect.strengths)) * minimal
+        negligible = negligible_strengths(effect, len(effect.strengths)) * minimal
         bounds = [
             (strength.neutral, margin, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
             for (name, strength), margin in zip(effect.strengths.items(), negligible, strict=True)

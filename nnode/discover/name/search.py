@@ -21,7 +21,7 @@ from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
 from nnode.discover.statistics.bias import SimulatedFits, mean_scores, simulated_fits
 from nnode.discover.statistics.paired import compare, heldout, j_test, presence_pvalue
-from nnode.discover.statistics.profile import moved
+from nnode.discover.statistics.profile import refined_edges
 from nnode.discover.statistics.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
@@ -163,7 +163,7 @@ def search(
         selection.steps.append(step)
         selection.fit = converged_fit(engine, step.chosen.fit.system, rounds=1)
         if step.chosen.score.effect.consecutive:
-            selection.fit = moved(engine, selection.fit, step.chosen.name)
+            selection.fit = refined_edges(engine, selection.fit, step.chosen.name)
         log.info("added %s", step.chosen.name)
     if doubtful is not None:  # the whitening was fitted with more effects
         selection = replace(doubtful, fit=converged_fit(engine, doubtful.fit.system, rounds=1))

@@ -188,7 +188,7 @@ class Curves:
         p_value: that there is nothing, with regard to all variables.
         shift: ``(K,)`` of the model's own parameters beside the curve.
         removed: share of the squared errors of positions that it removes; NaN until it is asked
-            for, see :func:`nnode.discover.locate.curves.weighed`.
+            for, see :func:`nnode.discover.locate.curves.significant_curves`.
     """
 
     variable: Variable

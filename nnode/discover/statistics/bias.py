@@ -34,15 +34,17 @@ def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
     if not isinstance(engine, FollowersEngine):
         return []
     try:
-        drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
+        engines = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
     except SimulationError:
         return []
-    found: SimulatedFits = [(one, evaluated(one, fit.system)) for one in drawn]
-    return found if all(np.isfinite(own.residual).all() for _, own in found) else []
+    fits: SimulatedFits = [(simulated, evaluated(simulated, fit.system)) for simulated in engines]
+    return (
+        fits if all(np.isfinite(simulated_fit.residual).all() for _, simulated_fit in fits) else []
+    )
 
 
 def mean_scores(
-    drawn: SimulatedFits, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
+    simulated: SimulatedFits, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
 ) -> np.ndarray | float:
     """``(G, k)`` mean scores of directions by cluster in paths that a model has made.
 
@@ -51,7 +53,7 @@ def mean_scores(
         label: ``(n,)`` clusters.
     """
     parts = []
-    for engine, fit in drawn:
-        basis, every = orthonormal(fit.tangents), columns(engine, fit)
-        parts.append(sums(every - basis @ (basis.T @ every), label, fit.residual))
+    for engine, fit in simulated:
+        basis, effect_columns = orthonormal(fit.tangents), columns(engine, fit)
+        parts.append(sums(effect_columns - basis @ (basis.T @ effect_columns), label, fit.residual))
     return np.asarray(np.mean(parts, 0)) if parts else 0.0

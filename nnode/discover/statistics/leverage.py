@@ -10,7 +10,7 @@ import numpy as np
 from nnode.discover.residuals.fit import grams, members
 
 
-def blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
+def leverage_adjusted(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
     """``(n,)`` residuals times (1 - H)^-1/2 of each cluster's part H of the projection onto an
     orthonormal basis; what one cluster alone determines stays as it is."""
     found = residual.copy()

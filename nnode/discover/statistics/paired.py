@@ -41,8 +41,8 @@ def j_test(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
 
     Source: Davidson & MacKinnon 1981 (tests of models against rivals that they do not contain).
     """
-    lean = score_toward(_left_out(first, cluster), _left_out(second, cluster), cluster)
-    return replace(_student(lean), p_value=better(lean))
+    scores = score_toward(_left_out(first, cluster), _left_out(second, cluster), cluster)
+    return replace(_student(scores), p_value=better(scores))
 
 
 def score_toward(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
@@ -59,10 +59,10 @@ def score_toward(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> 
     Source: Rao 1948 (scores).
     """
     with np.errstate(invalid="ignore"):
-        towards = 2 * sums(first * (first - second), cluster)
+        scores = 2 * sums(first * (first - second), cluster)
         larger = np.maximum(sums(first**2, cluster), sums(second**2, cluster))
-        found: np.ndarray = towards / np.where(larger > 0, larger, 1)
-    return found
+        relative: np.ndarray = scores / np.where(larger > 0, larger, 1)
+    return relative
 
 
 def _left_out(fit: Fit, cluster: np.ndarray) -> np.ndarray:
@@ -70,15 +70,17 @@ def _left_out(fit: Fit, cluster: np.ndarray) -> np.ndarray:
     if not columns.shape[1]:
         return residual
     moved = fit.influence(cluster).moved(1.0, ALONE)
-    found: np.ndarray = residual + (columns * moved[cluster]).sum(1)
-    return found
+    left_out: np.ndarray = residual + (columns * moved[cluster]).sum(1)
+    return left_out
 
 
 def gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """``(G,)`` (first - second) / max(first, second), 0 where both vanish."""
     larger = np.maximum(first, second)
-    found: np.ndarray = np.where(larger > 0, first - second, 0.0) / np.where(larger > 0, larger, 1)
-    return found
+    relative: np.ndarray = np.where(larger > 0, first - second, 0.0) / np.where(
+        larger > 0, larger, 1
+    )
+    return relative
 
 
 def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
@@ -124,10 +126,10 @@ def clusters_to_tell(test: Comparison, level: float, power: float = 0.9) -> int 
     ratio = error**2 * test.clusters / test.gain**2
     number = 2
     for _ in range(50):  # the quantiles depend on the number
-        free = max(number - 1, 1)
-        quantiles = float(stats.t.ppf(1 - level, free) + stats.t.ppf(power, free))
-        wanted = max(2, math.ceil(ratio * quantiles**2))
-        if wanted == number:
+        degrees = max(number - 1, 1)
+        quantiles = float(stats.t.ppf(1 - level, degrees) + stats.t.ppf(power, degrees))
+        needed = max(2, math.ceil(ratio * quantiles**2))
+        if needed == number:
             break
-        number = max(wanted, 2) if wanted < number else (number + wanted + 1) // 2
+        number = max(needed, 2) if needed < number else (number + needed + 1) // 2
     return max(number, test.clusters)

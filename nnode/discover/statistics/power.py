@@ -38,35 +38,39 @@ class PowerSimulation:
     alpha: float
     confirmation_clusters: int
 
-    def power(self, score: Score, one: Evidence, size: float, seed: int = 0) -> float:
+    def power(self, score: Score, evidence: Evidence, size: float, seed: int = 0) -> float:
         """Share of the simulations in which an effect of a size is found and confirmed."""
-        grams, total = one.grams[:, None], float(one.grams.sum())
+        grams, information = evidence.grams[:, None], float(evidence.grams.sum())
         number = len(grams)
-        if not total > 0 or number < 2:
+        if not information > 0 or number < 2:
             return 0.0
         rng = np.random.default_rng(seed)
-        rest = one.parts - one.grams * one.parts.sum() / total
-        rest = rest * np.sqrt(number / (number - 1))
-        parts = rng.choice([-1.0, 1.0], (number, RUNS)) * rest[:, None] - size * grams
+        null_parts = evidence.parts - evidence.grams * evidence.parts.sum() / information
+        null_parts = null_parts * np.sqrt(number / (number - 1))
+        parts = rng.choice([-1.0, 1.0], (number, RUNS)) * null_parts[:, None] - size * grams
         name = score.effect.name
-        passed = self.screen.statistic(one, parts) > self.screen.critical(name, self.alpha)
+        passed = self.screen.statistic(evidence, parts) > self.screen.critical(name, self.alpha)
         costs = _with_effect(self.screen.costs(name)[:, None], parts, grams, size)
-        others = -(parts.sum(0) - parts) / np.maximum(total - grams, 1e-300)
-        gain = _gain(others, parts, grams, costs)
-        score_toward = _score_toward(others, parts, grams, costs)
+        left_out_amounts = -(parts.sum(0) - parts) / np.maximum(information - grams, 1e-300)
+        gain = _gain(left_out_amounts, parts, grams, costs)
+        score_toward = _score_toward(left_out_amounts, parts, grams, costs)
         passed &= (gain.mean(0) > 0) & (
             _t(score_toward) > stats.t.ppf(1 - rules().level, number - 1)
         )
-        amount = -parts.sum(0) / total
-        error = np.sqrt((number - 1) / number * ((others - others.mean(0)) ** 2).sum(0))
+        amount = -parts.sum(0) / information
+        error = np.sqrt(
+            (number - 1) / number * ((left_out_amounts - left_out_amounts.mean(0)) ** 2).sum(0)
+        )
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
         costs = self.screen.costs(name)
-        return float((passed & self._confirmed(rng, rest, one.grams, costs, size, amount)).mean())
+        return float(
+            (passed & self._confirmed(rng, null_parts, evidence.grams, costs, size, amount)).mean()
+        )
 
     def _confirmed(
         self,
         rng: np.random.Generator,
-        rest: np.ndarray,
+        null_parts: np.ndarray,
         grams: np.ndarray,
         costs: np.ndarray,
         size: float,
@@ -77,7 +81,7 @@ class PowerSimulation:
             return np.zeros(RUNS, dtype=bool)
         chosen = rng.integers(0, len(grams), (self.confirmation_clusters, RUNS))
         drawn = grams[chosen]
-        parts = rng.choice([-1.0, 1.0], chosen.shape) * rest[chosen] - size * drawn
+        parts = rng.choice([-1.0, 1.0], chosen.shape) * null_parts[chosen] - size * drawn
         costs = _with_effect(costs[chosen], parts, drawn, size)
         gain = _gain(amount, parts, drawn, costs)
         score_toward = _score_toward(amount, parts, drawn, costs)
@@ -90,14 +94,14 @@ class PowerSimulation:
         passed: np.ndarray = (totals >= totals[0] - 1e-12).mean(0) <= rules().level
         return likelier & passed
 
-    def detectable(self, score: Score, one: Evidence, expected: float) -> float:
+    def detectable(self, score: Score, evidence: Evidence, expected: float) -> float:
         """The least size found with a probability of 80 %; infinite where none is."""
         sizes = expected * SIZES
-        powers = np.array([self.power(score, one, size) for size in sizes])
-        enough = np.flatnonzero(powers >= rules().power)
-        if not len(enough):
+        powers = np.array([self.power(score, evidence, size) for size in sizes])
+        sufficient = np.flatnonzero(powers >= rules().power)
+        if not len(sufficient):
             return float("inf")
-        k = int(enough[0])
+        k = int(sufficient[0])
         if k == 0:
             return float(sizes[0])
         share = (rules().power - powers[k - 1]) / (powers[k] - powers[k - 1])
@@ -108,8 +112,8 @@ def _with_effect(
     costs: np.ndarray, parts: np.ndarray, grams: np.ndarray, size: float
 ) -> np.ndarray:
     """Costs of clusters to whose residuals an effect of a size was added, with its scores."""
-    found: np.ndarray = costs - 2 * size * parts - size**2 * grams
-    return np.maximum(found, 0.0)
+    new_costs: np.ndarray = costs - 2 * size * parts - size**2 * grams
+    return np.maximum(new_costs, 0.0)
 
 
 def _gain(
@@ -117,24 +121,24 @@ def _gain(
 ) -> np.ndarray:
     """Improvement of each cluster's cost by an amount, relative to the greater cost."""
     gain = -(2 * amount * parts + amount**2 * grams)
-    found: np.ndarray = gain / _larger(amount, parts, grams, costs)
-    return found
+    relative: np.ndarray = gain / _larger(amount, parts, grams, costs)
+    return relative
 
 
 def _score_toward(
     amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
     """How far each cluster leans towards an amount, relative to the greater cost."""
-    found: np.ndarray = -2 * amount * parts / _larger(amount, parts, grams, costs)
-    return found
+    relative: np.ndarray = -2 * amount * parts / _larger(amount, parts, grams, costs)
+    return relative
 
 
 def _larger(
     amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
     """The greater one of a cluster's costs before and after."""
-    found: np.ndarray = np.maximum(costs, costs + 2 * amount * parts + amount**2 * grams)
-    return np.maximum(found, 1e-300)
+    larger: np.ndarray = np.maximum(costs, costs + 2 * amount * parts + amount**2 * grams)
+    return np.maximum(larger, 1e-300)
 
 
 def _t(gain: np.ndarray) -> np.ndarray:
@@ -142,5 +146,5 @@ def _t(gain: np.ndarray) -> np.ndarray:
     # where an effect leaves a cluster no cost, its gain is beyond all numbers: nothing is passed
     with np.errstate(over="ignore", invalid="ignore"):
         error = gain.std(0, ddof=1) / np.sqrt(len(gain))
-        found: np.ndarray = gain.mean(0) / np.maximum(error, 1e-300)
-    return found
+        statistic: np.ndarray = gain.mean(0) / np.maximum(error, 1e-300)
+    return statistic

@@ -41,26 +41,26 @@ class Profile:
 
     def interval(self, most: float) -> tuple[float, float]:
         """Ends of what can be reached from the edge at a rise of at most ``most``."""
-        found = []
+        ends = []
         for bound, (at, rise) in zip(self.bounds, self._sides(), strict=True):
             k = _crossing(rise, most)
             if k is None:
-                found.append(bound)
+                ends.append(bound)
             elif np.isfinite(rise[k]):
                 share = (most - rise[k - 1]) / (rise[k] - rise[k - 1])
-                found.append(float(at[k - 1] + share * (at[k] - at[k - 1])))
+                ends.append(float(at[k - 1] + share * (at[k] - at[k - 1])))
             else:
-                found.append(float(at[k]))
-        return found[0], found[1]
+                ends.append(float(at[k]))
+        return ends[0], ends[1]
 
     def between(self, most: float) -> np.ndarray:
         """Places between the last one below ``most`` and the first above it, on both sides."""
-        found = [np.empty(0)]
+        trial_places = [np.empty(0)]
         for at, rise in self._sides():
             k = _crossing(rise, most)
             if k is not None:
-                found.append(np.linspace(at[k - 1], at[k], PLACES + 2)[1:-1])
-        return np.concatenate(found)
+                trial_places.append(np.linspace(at[k - 1], at[k], PLACES + 2)[1:-1])
+        return np.concatenate(trial_places)
 
     def with_more(self, at: np.ndarray, rise: np.ndarray) -> Profile:
         """The profile with further places."""
@@ -84,13 +84,13 @@ def profiles(engine: Engine, fit: Fit, name: str) -> dict[str, Profile]:
     bounds = cells[0].options["a"], cells[-1].options["b"]
     index = {edge: fit.names.index(f"terms.{place}.{edge}") for edge in ("a", "b")}
     a, b = (float(fit.row[k]) for k in index.values())
-    found = {}
+    by_edge = {}
     for edge, low, high in (("a", bounds[0], b), ("b", a, bounds[1])):
         value = float(fit.row[index[edge]])
         at = _around(value, low, high, bounds[1] - bounds[0])
         rise = _rises(engine, fit, index[edge], at)
-        found[edge] = Profile(index[edge], value, at, rise, bounds)
-    return found
+        by_edge[edge] = Profile(index[edge], value, at, rise, bounds)
+    return by_edge
 
 
 def intervals(engine: Engine, fit: Fit, name: str) -> dict[str, tuple[float, float]]:
@@ -101,18 +101,22 @@ def intervals(engine: Engine, fit: Fit, name: str) -> dict[str, tuple[float, flo
     between sequences: an edge may lie anywhere in one.
     """
     most = float(stats.chi2.ppf(0.95, 1)) * _unit(engine, fit, name)
-    found = {}
-    for edge, one in profiles(engine, fit, name).items():
-        near = one.between(most)
-        found[edge] = one.with_more(near, _rises(engine, fit, one.index, near)).interval(most)
-    return found
+    by_edge = {}
+    for edge, profile in profiles(engine, fit, name).items():
+        trial_places = profile.between(most)
+        by_edge[edge] = profile.with_more(
+            trial_places, _rises(engine, fit, profile.index, trial_places)
+        ).interval(most)
+    return by_edge
 
 
-def moved(engine: Engine, fit: Fit, name: str) -> Fit:
+def refined_edges(engine: Engine, fit: Fit, name: str) -> Fit:
     """The fit with edges in the best minimum that their profiles show."""
     for _ in range(MOVES):
-        known = [one for one in profiles(engine, fit, name).values() if len(one.at)]
-        best = min(known, key=lambda one: float(one.rise.min()), default=None)
+        candidates = [
+            profile for profile in profiles(engine, fit, name).values() if len(profile.at)
+        ]
+        best = min(candidates, key=lambda profile: float(profile.rise.min()), default=None)
         if best is None or best.rise.min() >= 0:
             break
         row = fit.row.copy()
@@ -129,11 +133,11 @@ def moved(engine: Engine, fit: Fit, name: str) -> Fit:
 
 def _around(value: float, low: float, high: float, extent: float) -> np.ndarray:
     """Places on both sides, closer to each other near the edge, up to the bounds."""
-    found = []
-    for sign, room in ((-1.0, value - low), (1.0, high - value)):
-        if room > NEAREST * extent:
-            found += list(value + sign * np.geomspace(NEAREST * extent, room, PLACES))
-    return np.sort(np.array(found))
+    trial_places = []
+    for sign, extent_left in ((-1.0, value - low), (1.0, high - value)):
+        if extent_left > NEAREST * extent:
+            trial_places += list(value + sign * np.geomspace(NEAREST * extent, extent_left, PLACES))
+    return np.sort(np.array(trial_places))
 
 
 def _crossing(rise: np.ndarray, most: float) -> int | None:
@@ -144,20 +148,20 @@ def _crossing(rise: np.ndarray, most: float) -> int | None:
 
 def _rises(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
     """``(T,)`` changes of the cost when one parameter is at ``(T,)`` other places."""
-    found = np.full(len(at), np.inf)
+    rises = np.full(len(at), np.inf)
     if not len(at):
-        return found
+        return rises
     rows = np.repeat(fit.row[None], len(at), 0)
     rows[:, index] = at
     trials = engine.residuals(fit.system, torch.from_numpy(rows)).numpy()
-    good = np.isfinite(trials).all(1)
-    others = fit.free.copy()
-    others[index] = False
-    base, _ = np.linalg.qr(fit.jacobian[:, others])
-    every = np.concatenate([fit.residual[None], trials[good]])
-    cost = (every**2).sum(1) - ((every @ base) ** 2).sum(1)
-    found[good] = cost[1:] - cost[0]
-    return found
+    finite = np.isfinite(trials).all(1)
+    free = fit.free.copy()
+    free[index] = False
+    base, _ = np.linalg.qr(fit.jacobian[:, free])
+    residuals = np.concatenate([fit.residual[None], trials[finite]])
+    cost = (residuals**2).sum(1) - ((residuals @ base) ** 2).sum(1)
+    rises[finite] = cost[1:] - cost[0]
+    return rises
 
 
 def _unit(engine: Engine, fit: Fit, name: str) -> float:
@@ -170,5 +174,7 @@ def _unit(engine: Engine, fit: Fit, name: str) -> float:
     ratios = fit.errors(engine.cluster) ** 2 / plain
     effect = fit.system.terms[place]
     assert isinstance(effect, Effect)
-    own = [ratios[fit.names.index(f"terms.{place}.{strength}")] for strength in effect.strengths]
-    return variance * max([1.0, *(float(ratio) for ratio in own if np.isfinite(ratio))])
+    strength_ratios = [
+        ratios[fit.names.index(f"terms.{place}.{strength}")] for strength in effect.strengths
+    ]
+    return variance * max([1.0, *(float(ratio) for ratio in strength_ratios if np.isfinite(ratio))])

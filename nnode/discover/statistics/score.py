@@ -31,8 +31,8 @@ from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, sums
 from nnode.discover.residuals.fit import grams as grams_of
 from nnode.discover.rules import rules
-from nnode.discover.statistics.leverage import blown_up, orthonormal
-from nnode.discover.statistics.standard import joint, standardised, usual_of
+from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
+from nnode.discover.statistics.standard import cluster_variance_of, joint, standardised
 from nnode.model.effects import Effect, Probe
 
 #: Sign flips that a p-value comes from.
@@ -108,12 +108,14 @@ def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     if effect.consecutive:
         # cells of one size are neighbours of each other
         sizes = [tuple(probe.steps.values()) for probe in probes]
-        found = []
+        effect_traces = []
         for size in dict.fromkeys(sizes):
-            own = [i for i, other in enumerate(sizes) if other == size]
-            parts = [columns[i] for i in own]
-            found.append(Trace(effect, [probes[i] for i in own], np.concatenate(parts, 1)))
-        return found
+            cells = [i for i, other_size in enumerate(sizes) if other_size == size]
+            parts = [columns[i] for i in cells]
+            effect_traces.append(
+                Trace(effect, [probes[i] for i in cells], np.concatenate(parts, 1))
+            )
+        return effect_traces
     return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
 
 
@@ -144,14 +146,14 @@ class Screen:
         #: ``(F, G)``, the data as they are first
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
         #: of each effect's name the largest statistic of its probes under each flip
-        self._chance: dict[str, np.ndarray] = {}
+        self._null_statistics: dict[str, np.ndarray] = {}
         self._least = np.ones(len(self._signs))
-        self._blown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._adjusted_residuals: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
-    def beyond(self, columns: np.ndarray) -> np.ndarray:
+    def adjusted(self, columns: np.ndarray) -> np.ndarray:
         """``columns`` without what the model's own parameters can do."""
-        rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
-        return rest
+        adjusted: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
+        return adjusted
 
     def parts(self, z: np.ndarray, label: np.ndarray) -> np.ndarray:
         """``(G, k)`` scores of directions that are free of the model's parameters.
@@ -162,14 +164,17 @@ class Screen:
 
         Source: Bell & McCaffrey 2002 (CR2).
         """
-        own = id(label)
-        if own not in self._blown:
-            self._blown[own] = blown_up(self.residual, self._basis, label), label
+        key = id(label)
+        if key not in self._adjusted_residuals:
+            self._adjusted_residuals[key] = (
+                leverage_adjusted(self.residual, self._basis, label),
+                label,
+            )
         raw = z.T @ self.residual
-        found, size = sums(z, label, self._blown[own][0]), sums(z**2, label)
+        scores, size = sums(z, label, self._adjusted_residuals[key][0]), sums(z**2, label)
         share = size / np.maximum(size.sum(0), 1e-300)
-        spread: np.ndarray = found + (raw - found.sum(0)) * share
-        return spread
+        balanced: np.ndarray = scores + (raw - scores.sum(0)) * share
+        return balanced
 
     def flipped(self, parts: np.ndarray) -> np.ndarray:
         """``(F, C)`` sums of the clusters ``(G, C)``, as they are and with every flip."""
@@ -180,20 +185,20 @@ class Screen:
         """``(n,)`` the clusters that tell of an effect."""
         return self.levels.get(name, self.cluster)
 
-    def scores(self, found: Iterable[Trace]) -> list[Score]:
+    def scores(self, effect_traces: Iterable[Trace]) -> list[Score]:
         """The best trace of each effect, the one that explains most first."""
         best: dict[str, Score] = {}
         largest: dict[str, float] = {}
-        for trace in found:
+        for trace in effect_traces:
             scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
             for score in scores:
-                name, known = score.effect.name, best.get(score.effect.name)
+                name, previous = score.effect.name, best.get(score.effect.name)
                 largest[name] = max(largest.get(name, 0.0), score.statistic)
-                every = (known.evidence if known else []) + score.evidence
-                if known is None or score.gain > known.gain:
+                all_evidence = (previous.evidence if previous else []) + score.evidence
+                if previous is None or score.gain > previous.gain:
                     best[name] = score
                 if trace.effect.remembers() or not trace.effect.strengths:
-                    best[name].evidence = every
+                    best[name].evidence = all_evidence
         if best:
             self._judge(best, largest)
         return sorted(best.values(), key=lambda score: -score.gain)
@@ -201,51 +206,55 @@ class Screen:
     def _judge(self, best: dict[str, Score], largest: dict[str, float]) -> None:
         """P-values with regard to all effects."""
         # the data themselves are one of the flips
-        every = np.stack([np.append(largest[name], self._chance[name][1:]) for name in best])
-        share = np.stack([at_least(row) for row in every])
+        statistics = np.stack(
+            [np.append(largest[name], self._null_statistics[name][1:]) for name in best]
+        )
+        share = np.stack([at_least(row) for row in statistics])
         self._least = share.min(0)
-        for score, own in zip(best.values(), share[:, 0], strict=True):
-            score.p_value = float((self._least <= own + 1e-12).mean())
+        for score, p_value in zip(best.values(), share[:, 0], strict=True):
+            score.p_value = float((self._least <= p_value + 1e-12).mean())
 
     def critical(self, name: str, alpha: float = 0.05) -> float:
         """The statistic of an effect that it passes where the least p-value of all does so with
         probability ``alpha`` by chance."""
         share = float(np.quantile(self._least, alpha))
-        return float(np.quantile(self._chance[name], 1 - share))
+        return float(np.quantile(self._null_statistics[name], 1 - share))
 
-    def statistic(self, one: Evidence, parts: np.ndarray) -> np.ndarray:
+    def statistic(self, evidence: Evidence, parts: np.ndarray) -> np.ndarray:
         """``(R,)`` the statistic where the scores of a direction were ``parts`` ``(G, R)``."""
-        usual = usual_of(one.parts[:, None], one.grams[:, None], self.variance)
-        sizes = np.repeat(one.grams[:, None], parts.shape[1], 1)
-        amount = -parts.sum(0) / max(float(one.grams.sum()), 1e-300)
-        parts = parts + sizes * _less(amount, one.minimal)
-        return standardised(parts, sizes, np.ones((1, len(parts))), usual)[0]
+        cluster_variance = cluster_variance_of(
+            evidence.parts[:, None], evidence.grams[:, None], self.variance
+        )
+        sizes = np.repeat(evidence.grams[:, None], parts.shape[1], 1)
+        amount = -parts.sum(0) / max(float(evidence.grams.sum()), 1e-300)
+        parts = parts + sizes * _negligible(amount, evidence.minimal)
+        return standardised(parts, sizes, np.ones((1, len(parts))), cluster_variance)[0]
 
     def costs(self, name: str) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters that tell of an effect."""
         return sums(self.residual**2, self.label(name))
 
-    def _by_chance(self, name: str, statistics: np.ndarray) -> None:
+    def _store_null(self, name: str, statistics: np.ndarray) -> None:
         """Note an effect's statistics ``(F,)`` under the flips."""
-        self._chance[name] = np.maximum(self._chance.get(name, 0.0), statistics)
+        self._null_statistics[name] = np.maximum(self._null_statistics.get(name, 0.0), statistics)
 
     def _flips(self, name: str) -> np.ndarray:
         """``(F, G)`` signs of the clusters that tell of an effect, the data first."""
         if name not in self.levels:
             return self._signs
         shape = len(self._signs), int(self.levels[name].max()) + 1
-        drawn: np.ndarray = self._rng.choice([-1.0, 1.0], shape)
-        drawn[0] = 1.0
-        return drawn
+        flips: np.ndarray = self._rng.choice([-1.0, 1.0], shape)
+        flips[0] = 1.0
+        return flips
 
     def _single(self, trace: Trace) -> Score:
-        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        z, label = self.adjusted(trace.columns), self.label(trace.effect.name)
         parts = self.parts(z, label) - trace.bias
         grams = grams_of(z, label)
-        minimal = minimal_of(trace.effect, z.shape[1])
-        less = _less(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
-        beyond = parts + grams @ less
-        chance = joint(beyond, grams, self._flips(trace.effect.name), self.variance)
+        minimal = negligible_strengths(trace.effect, z.shape[1])
+        margin = _negligible(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
+        shifted = parts + grams @ margin
+        chance = joint(shifted, grams, self._flips(trace.effect.name), self.variance)
         statistic = float(chance[0])
         amount, error, gain = self._estimate(parts, grams)
         (probe,) = trace.probes
@@ -259,7 +268,7 @@ class Screen:
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
             if share < rules().forbidden:
                 statistic, gain = statistic * share, gain * share * (2 - share)
-        self._by_chance(trace.effect.name, chance)
+        self._store_null(trace.effect.name, chance)
         # of an effect with a memory the trace is that of a finite strength, where it has one
         size = max(map(abs, probe.steps.values()), default=0.0) if trace.effect.remembers() else 0.0
         evidence = [
@@ -270,13 +279,13 @@ class Screen:
 
     def _interval(self, trace: Trace) -> list[Score]:
         """The best interval of neighbouring cells."""
-        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        z, label = self.adjusted(trace.columns), self.label(trace.effect.name)
         parts = self.parts(z, label) - trace.bias
         grams = grams_of(z, label)
         cells = z.shape[1]
         first, last = np.triu_indices(cells)
         cumulative = np.concatenate([np.zeros((len(parts), 1)), parts.cumsum(1)], 1)
-        each = cumulative[:, last + 1] - cumulative[:, first]
+        interval_parts = cumulative[:, last + 1] - cumulative[:, first]
         square = np.zeros((len(parts), cells + 1, cells + 1))
         square[:, 1:, 1:] = grams.cumsum(1).cumsum(2)
         sizes = (
@@ -287,25 +296,30 @@ class Screen:
         )
         size = sizes.sum(0)
         usable = size > 1e-9 * max(size.max(), 1e-300)
-        each, sizes, size = each[:, usable], sizes[:, usable], size[usable]
+        interval_parts, sizes, size = interval_parts[:, usable], sizes[:, usable], size[usable]
         if not size.size:
             return []
         first, last = first[usable], last[usable]
-        usual = usual_of(parts, np.einsum("bii->bi", grams), self.variance)
-        (minimal,) = minimal_of(trace.effect, 1)
-        beyond = each + sizes * _less(-each.sum(0) / size, minimal)
-        flipped = standardised(beyond, sizes, self._flips(trace.effect.name), usual)
-        self._by_chance(trace.effect.name, flipped.max(1))
-        total = each.sum(0)
+        cluster_variance = cluster_variance_of(parts, np.einsum("bii->bi", grams), self.variance)
+        (minimal,) = negligible_strengths(trace.effect, 1)
+        shifted = interval_parts + sizes * _negligible(-interval_parts.sum(0) / size, minimal)
+        flipped = standardised(shifted, sizes, self._flips(trace.effect.name), cluster_variance)
+        self._store_null(trace.effect.name, flipped.max(1))
+        total = interval_parts.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
         i = int(np.argmax(gain))
         (name,) = trace.effect.strengths
         strength = trace.effect.strengths[name]
         amount = -total[i] / size[i]
-        rest = ((each[:, i] + amount * sizes[:, i]) ** 2).sum()
+        residual_square = ((interval_parts[:, i] + amount * sizes[:, i]) ** 2).sum()
         blocks = size[i] ** 2 / (sizes[:, i] ** 2).sum()
         prior = rules().prior
-        error = np.sqrt((blocks * rest + prior * usual * size[i]) / (blocks + prior)) / size[i]
+        error = (
+            np.sqrt(
+                (blocks * residual_square + prior * cluster_variance * size[i]) / (blocks + prior)
+            )
+            / size[i]
+        )
         options = dict(trace.probes[0].options)
         options["a"] = trace.probes[first[i]].options["a"]
         options["b"] = trace.probes[last[i]].options["b"]
@@ -319,7 +333,7 @@ class Screen:
                 float(gain[i]),
                 {name: float(amount)},
                 {name: float(error)},
-                [Evidence(options, 0.0, each[:, i], sizes[:, i], minimal)],
+                [Evidence(options, 0.0, interval_parts[:, i], sizes[:, i], minimal)],
             )
         ]
 
@@ -329,20 +343,20 @@ class Screen:
         inverse = np.linalg.pinv(grams.sum(0), rcond=1e-10)
         total = parts.sum(0)
         amount = -inverse @ total
-        rest = parts + np.einsum("bij,j->bi", grams, amount)
-        cov = inverse @ (rest.T @ rest) @ inverse
+        residual_parts = parts + np.einsum("bij,j->bi", grams, amount)
+        cov = inverse @ (residual_parts.T @ residual_parts) @ inverse
         gain = float(total @ inverse @ total / (self.residual @ self.residual))
         return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
 
 
-def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
+def negligible_strengths(effect: type[Effect], number: int) -> np.ndarray:
     """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
     not say what size is usual."""
     found = [rules().minimal * (one.min_effect_size or 0.0) for one in effect.strengths.values()]
     return np.array(found or [0.0] * number)[:number]
 
 
-def _less(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
+def _negligible(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
     """What is taken off amounts to bring them nearer to none."""
     found: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
     return found

@@ -11,7 +11,7 @@ from scipy import stats
 from nnode.discover.judge.measure_next import (
     COMFORTABLE,
     POWER,
-    advised,
+    best_profile,
     distance,
     evaluated_profiles,
 )
@@ -61,8 +61,8 @@ def test_the_number_of_platoons_tells_with_the_probability_that_is_asked_for(
 ) -> None:
     first, second = model(**DELAY), model(**INERTIA)
     found = list(evaluated_profiles(engine, first, second, 0.05))
-    best = advised(engine, first, second, 0.05)
-    surer = advised(engine, first, second, 0.01)
+    best = best_profile(engine, first, second, 0.05)
+    surer = best_profile(engine, first, second, 0.01)
     assert best is not None
     assert surer is not None
     assert surer.platoons > best.platoons

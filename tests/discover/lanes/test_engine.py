@@ -9,8 +9,8 @@ import torch
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence
-from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, drawn_in
-from nnode.discover.locate.curves import curves, weighed
+from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, huber_residuals
+from nnode.discover.locate.curves import curves, significant_curves
 from nnode.discover.name.search import converged_fit, search
 from nnode.discover.residuals.fit import Fit, refine, sums
 from nnode.discover.statistics.paired import compare, heldout
@@ -76,7 +76,7 @@ def test_windows_share_out_what_is_compared() -> None:
 
 def test_large_residuals_are_drawn_in() -> None:
     r = torch.tensor([0.5, -LARGE, 10 * LARGE], dtype=torch.float64)
-    found = drawn_in(r)
+    found = huber_residuals(r)
     assert found[:2].tolist() == r[:2].tolist()
     # the square is Huber's loss
     assert float(found[2] ** 2) == pytest.approx(2 * LARGE * 10 * LARGE - LARGE**2)
@@ -148,7 +148,7 @@ def test_nothing_is_named_where_nothing_is_hidden(plain: list[Sequence]) -> None
     base = converged_fit(engine, model())
     found = search(engine, base, CATALOGUE.of("traffic"))
     assert not found.steps
-    assert not weighed(engine, base, curves(engine, base, engine.variables()), 0.01)
+    assert not significant_curves(engine, base, curves(engine, base, engine.variables()), 0.01)
     assert base.row == pytest.approx([V0, LENGTH], rel=0.05)
 
 

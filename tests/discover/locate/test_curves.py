@@ -10,7 +10,7 @@ import torch
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.locate.curves import columns_of, curves, weighed, with_curve
+from nnode.discover.locate.curves import columns_of, curves, significant_curves, with_curve
 from nnode.discover.name.search import converged_fit, search
 from nnode.discover.residuals.engine import square_of
 from nnode.discover.residuals.fit import Fit
@@ -35,7 +35,7 @@ def wavy() -> tuple[TrafficEngine, Fit]:
 
 def test_a_wave_along_the_road_is_found(wavy: tuple[TrafficEngine, Fit]) -> None:
     engine, fit = wavy
-    best = weighed(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
+    best = significant_curves(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
     assert best.variable.name == "waves of position"
     assert best.variable.lengths[0] == pytest.approx(WAVE, rel=0.05)
     assert best.removed > 0.5
@@ -68,7 +68,7 @@ def test_the_scale_of_a_curve_is_calibrated_before_it_is_weighed(
     wavy: tuple[TrafficEngine, Fit],
 ) -> None:
     engine, fit = wavy
-    best = weighed(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
+    best = significant_curves(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
     before, after = (square_of(engine, s) for s in (fit.system, with_curve(fit, best)))
     assert 0.5 < 1 - after / before <= best.removed < 1
 
