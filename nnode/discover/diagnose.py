@@ -14,7 +14,7 @@ import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.compare.laws import BetterLaw
+from nnode.discover.compare.laws import BetterLaw, explained_by_law
 from nnode.discover.division import Division, divide
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.confirmation import ConfirmationSet

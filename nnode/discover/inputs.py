@@ -77,7 +77,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
     Raises:
         DataError: fewer than three sequences are left, or no vehicle follows another.
     """
-    names = {one.name for one in fields(Fault)}
+    names = {item.name for item in fields(Fault)}
     faults: dict[str, list[Fault]] = {}
     reported = []
     for entry in store.manifest.get("faults", []):
@@ -115,15 +115,15 @@ def _check_enough(
     sound: list[Sequence], faults: dict[str, list[Fault]], read: int, options: DataOptions
 ) -> None:
     if options.domain == "traffic" and all(s.n_agents < 2 for s in sound) and read:
-        alone = [f for found in faults.values() for f in found if f.kind == "too_short"]
-        if sound or len(alone) == sum(map(len, faults.values())):
+        too_short = [f for faults_of in faults.values() for f in faults_of if f.kind == "too_short"]
+        if sound or len(too_short) == sum(map(len, faults.values())):
             raise DataError(
                 f"data={options.name}: no vehicle follows another in any of the {read} sequences; "
                 "a diagnosis of traffic needs sequences of two or more vehicles of one lane"
             )
     if len(sound) >= LEAST:
         return
-    counts = Counter(kind for found in faults.values() for kind in {f.kind for f in found})
+    counts = Counter(kind for faults_of in faults.values() for kind in {f.kind for f in faults_of})
     why = ", ".join(f"{kind} in {n}" for kind, n in counts.most_common())
     raise DataError(
         f"data={options.name}: {len(sound)} of {read} sequences are without a fault"

@@ -1,10 +1,9 @@
-"""Base laws compared on clusters that their calibration left out: a wrong law is the commonest
-missing effect.
+"""Comparison of base laws by leave-one-cluster-out costs.
 
-Every law is calibrated to the positions of whole sequences, the best of them tells how residuals
-depend on each other in time, and all are calibrated once more to residuals that are whitened so:
-laws are compared by the same numbers. Their costs are those of clusters that a calibration left
-out. Where another law comes out best, it tells the whitening, and all are compared once more.
+Every law is calibrated to the positions of whole sequences. The whitening is fitted to the
+residuals of the best law, and all laws are recalibrated to residuals with this common whitening.
+Their costs are those of left-out clusters. If another law is then the best, the whitening is fitted
+to its residuals and the comparison is repeated.
 """
 
 from __future__ import annotations
@@ -34,18 +33,18 @@ from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.extend import effects_of, extended
 from nnode.model.system import System
 
-#: Rounds of choosing the law that tells the whitening.
+#: Largest number of repetitions with another law's whitening.
 ROUNDS = 3
 
 
 def compare_laws(
     candidates: Mapping[str, System], sequences: list[Sequence], options: DiscoverOptions
 ) -> tuple[Laws, dict[str, System]]:
-    """Rank laws on the open clusters of a diagnosis with the same options.
+    """Rank laws on the exploration clusters of a diagnosis with the same options.
 
     Args:
         candidates: models by name; they are not changed. Those that the diagnosis cannot simulate
-            are told as refused, with the reason.
+            are reported as refused, with the reason.
         sequences: without faults, at least three of them.
 
     Returns:
@@ -55,10 +54,8 @@ def compare_laws(
         DataError: too few sequences.
     """
     division = divide(sequences, options)
-    exploration, label = (
-        [sequences[i] for i in division.exploration],
-        division.label[division.exploration],
-    )
+    exploration = [sequences[i] for i in division.exploration]
+    label = division.label[division.exploration]
     any_system = next(iter(candidates.values()))
     whole = engine_of(any_system, exploration, label, whole=True)
     fits, refused = _calibrated(whole, candidates)
@@ -66,7 +63,7 @@ def compare_laws(
         return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
     errors = {name: heldout(fit, whole.cluster) / number for name, fit in fits.items()}
-    if any_system.domain == "crowd":  # whose residuals are no positions
+    if any_system.domain == "crowd":  # its residuals are not positions
         errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in fits.items()}
     reference = min(errors, key=lambda name: float(errors[name].mean()))
     engine = windows_of(any_system, exploration, label)
@@ -98,7 +95,7 @@ def compare_laws(
 
 
 def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str, System]:
-    """Copies of laws with those effects that they have a place for, from the values given."""
+    """Copies of laws with those effects that apply to them, with the given start values."""
     extended_laws = {}
     for name, law in laws.items():
         offered = CATALOGUE.of(cast(Domain, law.domain), law.order)
@@ -113,10 +110,10 @@ def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str,
 
 @dataclass(frozen=True)
 class BetterLaw:
-    """A law that comes nearer than the one that is diagnosed, with what was found missing in it.
+    """A law that fits better than the diagnosed one, with the effects selected for it.
 
     Attributes:
-        system: calibrated on the same open clusters.
+        system: calibrated on the same exploration clusters.
     """
 
     name: str
@@ -126,10 +123,11 @@ class BetterLaw:
 def explained_by_law(
     engine: Engine, selection: Search, label: np.ndarray, nearer: BetterLaw
 ) -> tuple[list[Step], float]:
-    """Effects that a nearer law does without: they imitate that law, and are nothing of their own.
+    """Selected effects that a better-fitting law does not need: they imitate that law.
 
-    None where the nearer law does not predict left-out clusters better than the diagnosed one with
-    its effects. Effects that laws have in themselves stay, and those that the nearer one lacks too.
+    There are none if that law does not predict left-out clusters better than the diagnosed one
+    with its effects. Effects that are built into laws, and those that the better law lacks too,
+    are not returned.
 
     Args:
         label: ``(S,)`` clusters of the engine's sequences.
@@ -156,7 +154,7 @@ def explained_by_law(
 
 
 def _level(costs: np.ndarray) -> float:
-    """Mean logarithm of the clusters' costs: no cluster dominates."""
+    """Mean logarithm of the clusters' costs, so that no cluster dominates."""
     level = np.log(np.maximum(np.nan_to_num(costs, nan=np.inf), 1e-300)).mean()
     return float(level)
 
@@ -164,7 +162,7 @@ def _level(costs: np.ndarray) -> float:
 def _calibrated(
     engine: Engine, candidates: Mapping[str, System]
 ) -> tuple[dict[str, Fit], dict[str, str]]:
-    """Every law from the better of two starts, by the engine's residuals as they are."""
+    """Every law, calibrated from the better of two starts with the present whitening."""
     fits: dict[str, Fit] = {}
     refused: dict[str, str] = {}
     for name, system in candidates.items():

@@ -72,17 +72,17 @@ class Smoother:
                 flat = item.x[part].reshape(part.stop - part.start, -1)
                 pieces.setdefault(len(flat), []).append(flat)
         stacks = {k: np.concatenate(parts, 1) for k, parts in pieces.items()}
-        freedom = np.zeros(len(PENALTIES))
-        left = np.zeros(len(PENALTIES))
+        degrees = np.zeros(len(PENALTIES))
+        residual_square = np.zeros(len(PENALTIES))
         for k, y in stacks.items():
             value, vector = _modes(k)
             power = ((vector.T @ y) ** 2).sum(1)
             keep = 1 / (1 + PENALTIES[:, None] * value)
-            left += ((1 - keep) ** 2 * power).sum(1)
-            freedom += (1 - keep).sum(1) * y.shape[1]
-        best = int(np.argmin(left / freedom**2))
+            residual_square += ((1 - keep) ** 2 * power).sum(1)
+            degrees += (1 - keep).sum(1) * y.shape[1]
+        best = int(np.argmin(residual_square / degrees**2))
         self.penalty = float(PENALTIES[best])
-        self.variance = float(left[best] / freedom[best])
+        self.variance = float(residual_square[best] / degrees[best])
 
     def path(self, item: Sequence, t: np.ndarray) -> Path:
         """The smoothed paths of one of the sequences at times ``t`` (s since the first)."""
@@ -92,9 +92,9 @@ class Smoother:
             value, vector = _modes(part.stop - part.start)
             keep = 1 / (1 + self.penalty * value)
             # the ends of a piece know only one side: they count less where pieces overlap
-            own = np.minimum(np.arange(1, len(value) + 1), np.arange(len(value), 0, -1))[:, None]
-            smooth[part] += own * (vector @ (keep[:, None] * (vector.T @ flat[part])))
-            weight[part] += own
+            taper = np.minimum(np.arange(1, len(value) + 1), np.arange(len(value), 0, -1))[:, None]
+            smooth[part] += taper * (vector @ (keep[:, None] * (vector.T @ flat[part])))
+            weight[part] += taper
         line = make_interp_spline(item.dt * np.arange(k), smooth / weight, k=min(5, k - 1))
         shape = (len(t), item.n_agents, 2)
         x, v, a = (line(t, nu=order).reshape(shape) for order in range(3))
@@ -111,13 +111,13 @@ def _pieces(k: int) -> list[slice]:
     ]
 
 
-_KNOWN: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+_MODES: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
 
 def _modes(k: int) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues ``(k,)`` and eigenvectors ``(k, k)`` of the roughness penalty."""
-    if k not in _KNOWN:
+    if k not in _MODES:
         third = np.diff(np.eye(k), 3, axis=0)
         value, vector = np.linalg.eigh(third.T @ third)
-        _KNOWN[k] = value.clip(min=0), vector
-    return _KNOWN[k]
+        _MODES[k] = value.clip(min=0), vector
+    return _MODES[k]

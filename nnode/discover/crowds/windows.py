@@ -55,15 +55,15 @@ class Windows:
         dt = sequences[0].dt
         stride = max(1, round(INTERVAL / dt))
         count = [(item.n_samples + stride - 1) // stride for item in sequences]
-        enough = sorted(number for number in count if number >= LEAST)
-        if not enough:
+        sufficient = sorted(number for number in count if number >= LEAST)
+        if not sufficient:
             raise DataError(
                 f"the longest sequence has {max(item.n_samples for item in sequences)} samples "
                 f"of {dt:g} s, a window needs {LEAST * stride}; use longer sequences"
             )
         # one long sequence among short ones is no reason to leave the short ones out
-        most = enough[int(LEFT_OUT * len(enough))]
-        length = min(max(LEAST + 1, round(window / (stride * dt))), most)
+        longest = sufficient[int(LEFT_OUT * len(sufficient))]
+        length = min(max(LEAST + 1, round(window / (stride * dt))), longest)
         self.used = [i for i, number in enumerate(count) if number >= length]
         smoother = Smoother([sequences[i] for i in self.used])
         self.variance = smoother.variance

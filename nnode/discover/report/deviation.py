@@ -66,19 +66,19 @@ def simulate(
     Returns:
         None for a sequence whose simulation blows up.
     """
-    found: list[np.ndarray | None] = []
+    paths: list[np.ndarray | None] = []
     like = next(system.parameters(), torch.zeros((), dtype=torch.float64))
     for first in range(0, len(sequences), TOGETHER):
         part = sequences[first : first + TOGETHER]
         try:
-            found += _together(system, part, step, like)
+            paths += _together(system, part, step, like)
         except SimulationError:
             for sequence in part:
                 try:
-                    found += _together(system, [sequence], step, like)
+                    paths += _together(system, [sequence], step, like)
                 except SimulationError:
-                    found.append(None)
-    return found
+                    paths.append(None)
+    return paths
 
 
 def _together(

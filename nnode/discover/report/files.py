@@ -47,9 +47,9 @@ UNTRAINED: dict[str, float] = {
 
 def plain_report(diagnosis: Diagnosis) -> dict[str, Any]:
     """The content of ``report.json``: plain types, None for what is no number."""
-    found = _finite(diagnosis.plain())
-    assert isinstance(found, dict)
-    return {"schema": SCHEMA, **found}
+    content = _finite(diagnosis.plain())
+    assert isinstance(content, dict)
+    return {"schema": SCHEMA, **content}
 
 
 def _finite(value: Any) -> Any:
@@ -105,8 +105,8 @@ def interval(effect: NamedEffect) -> str:
 def ranked(laws: Laws) -> str:
     """The best laws in one line, and by how much they are behind."""
     return ", ".join(
-        one.name + (f" (+{100 * one.behind:.3g} %)" if one.behind > 0 else "")
-        for one in laws.ranking[:5]
+        law.name + (f" (+{100 * law.behind:.3g} %)" if law.behind > 0 else "")
+        for law in laws.ranking[:5]
     )
 
 
@@ -118,18 +118,18 @@ def sentence(diagnosis: Diagnosis) -> str:
 
 def remarks(diagnosis: Diagnosis) -> list[str]:
     """What must be known beside the verdict: a law that comes nearer, faults of the measurement."""
-    found, laws = [], diagnosis.laws_again or diagnosis.laws
+    sentences, laws = [], diagnosis.laws_again or diagnosis.laws
     if laws is not None and laws.best not in ("", diagnosis.model):
-        beside = f" with {_listed(laws.effects)}" if laws.effects else ""
-        found.append(f"Of the laws that were compared, {laws.best}{beside} comes nearer.")
+        qualifier = f" with {_listed(laws.effects)}" if laws.effects else ""
+        sentences.append(f"Of the laws that were compared, {laws.best}{qualifier} comes nearer.")
     faults = diagnosis.data_faults
     if faults:
         where = len({fault.sequence for fault in faults})
-        found.append(
+        sentences.append(
             f"Beside that the measurement holds {_count(len(faults), 'fault')} in "
             f"{_count(where, 'sequence')}, which were left out."
         )
-    return found
+    return sentences
 
 
 def verdict(d: Diagnosis) -> str:
@@ -144,11 +144,14 @@ def verdict(d: Diagnosis) -> str:
         gain += (
             ", in the last part of each sequence, each agent's number being taken from the first"
         )
-    also = f" {_listed([one.name for one in d.leads])} was found too, but not confirmed."
+    unconfirmed = f" {_listed([one.name for one in d.leads])} was found too, but not confirmed."
     match d.verdict:
         case "named":
-            them = "it" if len(d.effects) == 1 else "them"
-            return f"The model {d.model} lacks {names}: with {them}, {gain}." + also * bool(d.leads)
+            pronoun = "it" if len(d.effects) == 1 else "them"
+            return (
+                f"The model {d.model} lacks {names}: with {pronoun}, {gain}."
+                + unconfirmed * bool(d.leads)
+            )
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
             beside = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
@@ -170,11 +173,13 @@ def verdict(d: Diagnosis) -> str:
                 f"{c.why}), and about {c.enough} in all would do. Nothing is named."
             )
         case "unknown":
-            on = _listed(d.unknown.variables) if d.unknown else "variables that were not found"
-            first = f"Beyond {names} the" if d.effects else "The"
+            variables = (
+                _listed(d.unknown.variables) if d.unknown else "variables that were not found"
+            )
+            subject = f"Beyond {names} the" if d.effects else "The"
             return (
-                f"{first} model {d.model} lacks something that is not in the catalogue; it "
-                f"depends on {on}."
+                f"{subject} model {d.model} lacks something that is not in the catalogue; it "
+                f"depends on {variables}."
             )
         case "none":
             return (
@@ -212,7 +217,7 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
     Args:
         options: what the model was built from before it was calibrated and extended.
     """
-    own = {
+    law_options = {
         name: float(getattr(term, name).detach())
         for term in system.terms
         if term not in effects_of(system)
@@ -224,8 +229,8 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
     name = "_".join([str(options["name"]).split("_with_")[0], "with", *names])
     if not effects:
         name = f"{options['name']}_calibrated"
-    rest = {key: value for key, value in options.items() if key != "effects"}
-    return {**rest, "name": name, **own, "effects": effects}
+    options_kept = {key: value for key, value in options.items() if key != "effects"}
+    return {**options_kept, "name": name, **law_options, "effects": effects}
 
 
 def individual(system: System) -> list[str]:
@@ -241,10 +246,10 @@ def has_network(system: System) -> bool:
 def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
     """A model's options as a file for ``conf/model``."""
     # in a comment: a line break would end it
-    name, own = " ".join(str(options["name"]).split()), "" if scripts() else "--config-dir conf "
+    name, option = " ".join(str(options["name"]).split()), "" if scripts() else "--config-dir conf "
     lines = [
         f"# Made by {typed('python scripts/discover.py')}. "
-        f"Copy it to conf/model/{name}.yaml, then: {own}model={name}",
+        f"Copy it to conf/model/{name}.yaml, then: {option}model={name}",
     ]
     if networks:
         lines.append(f"# The weights of the network are in {CHECKPOINT} only: these would be new.")
@@ -259,16 +264,16 @@ def rebuilt(options: Mapping[str, Any], system: System) -> System:
     target = {effect.name: effect for effect in effects_of(model)}
     for effect in effects_of(system):
         target[effect.name].load_state_dict(effect.state_dict())
-    ours, theirs = (
+    model_terms, system_terms = (
         [term for term in s.terms if term not in effects_of(s)] for s in (model, system)
     )
-    for mine, given in zip(ours, theirs, strict=True):
-        mine.load_state_dict(given.state_dict())
+    for mine, source in zip(model_terms, system_terms, strict=True):
+        mine.load_state_dict(source.state_dict())
     return model
 
 
 def checkpoint_of(
-    found: DiagnosisOutcome,
+    outcome: DiagnosisOutcome,
     sequences: list[Sequence],
     config: dict[str, Any],
     manifest: dict[str, Any],
@@ -282,13 +287,13 @@ def checkpoint_of(
         manifest: where the data come from.
         optimizer: options of the optimiser that training would go on with.
     """
-    model = rebuilt(config["model"], found.extended)
+    model = rebuilt(config["model"], outcome.extended)
     speed = None
     if model.domain == "traffic":
-        speed = best_common_speed([collate([sequences[i] for i in found.exploration])], model)
-    used = {*found.exploration, *found.confirmation}
+        speed = best_common_speed([collate([sequences[i] for i in outcome.exploration])], model)
+    used = {*outcome.exploration, *outcome.confirmation}
     dropped = [i for i in range(len(sequences)) if i not in used]
-    parts = {"train": found.exploration, "heldout": found.confirmation, "dropped": dropped}
+    parts = {"train": outcome.exploration, "heldout": outcome.confirmation, "dropped": dropped}
     return Checkpoint(
         config=config,
         manifest=manifest,

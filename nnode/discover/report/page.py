@@ -46,7 +46,7 @@ _NETWORK = (
 
 def draw(
     inputs: Inputs,
-    found: DiagnosisOutcome,
+    outcome: DiagnosisOutcome,
     options: DiscoverOptions,
     config: dict[str, Any],
     commands: list[str],
@@ -62,37 +62,37 @@ def draw(
     Returns:
         What writes the page and the events into the folder and returns their paths.
     """
-    drawn = figures(inputs, found, options)
-    blocks = page_blocks(inputs, found, drawn, commands, folder)
-    title = f"Diagnosis of {found.diagnosis.model} on {config['data']['name']}"
+    drawn = figures(inputs, outcome, options)
+    blocks = page_blocks(inputs, outcome, drawn, commands, folder)
+    title = f"Diagnosis of {outcome.diagnosis.model} on {config['data']['name']}"
 
     def write() -> dict[str, Path]:
-        subtitle = verdict(found.diagnosis)
+        subtitle = verdict(outcome.diagnosis)
         page, *others = write_page(blocks, folder, title=title, subtitle=subtitle, stem="report")
         pictures = [path for path in others if path.suffix == ".png"]
-        events = write_events(found, pictures, config, folder / TENSORBOARD)
+        events = write_events(outcome, pictures, config, folder / TENSORBOARD)
         return {"page": page, "tensorboard": events}
 
     return write
 
 
 def page_blocks(
-    inputs: Inputs, found: DiagnosisOutcome, drawn: Figures, commands: list[str], folder: Path
+    inputs: Inputs, outcome: DiagnosisOutcome, drawn: Figures, commands: list[str], folder: Path
 ) -> list[Block]:
     """The page in the order of the diagnosis, the verdict first."""
-    d = found.diagnosis
-    unit = unit_of(found.base)
+    d = outcome.diagnosis
+    unit = unit_of(outcome.base)
     return [
         *_first(d),
         *_map(drawn),
         *_gap(d, drawn),
-        *_coefficients(d, drawn, found),
+        *_coefficients(d, drawn, outcome),
         *_agents(d),
         *_model(d),
         *_shown(d, drawn),
         *_places(d, drawn, unit),
         *_rest(d, drawn, unit),
-        *_usage(d, commands, folder, found),
+        *_usage(d, commands, folder, outcome),
         *_decided(d, drawn),
         *_data(d, drawn),
         *_laws(d),
@@ -118,21 +118,21 @@ def _laws(d: Diagnosis) -> list[Block]:
     if d.laws is None or not d.laws.ranking:
         return []
     compared = [d.laws] if d.laws_again is None else [d.laws, d.laws_again]
-    last = compared[-1]
-    own = next((one for one in last.ranking if one.name == d.model), None)
-    beside = f", with {', '.join(last.effects)}," if last.effects else ""
-    if last.best == d.model:
-        words = f"Of the laws that were compared, {d.model}{beside} comes nearest."
-    elif own is None:
-        words = f"{last.best}{beside} comes nearest; {d.model} was not compared."
+    latest = compared[-1]
+    asked = next((law for law in latest.ranking if law.name == d.model), None)
+    qualifier = f", with {', '.join(latest.effects)}," if latest.effects else ""
+    if latest.best == d.model:
+        words = f"Of the laws that were compared, {d.model}{qualifier} comes nearest."
+    elif asked is None:
+        words = f"{latest.best}{qualifier} comes nearest; {d.model} was not compared."
     else:
         words = (
-            f"**{last.best}{beside} comes nearer than {d.model}**, whose held-out cost is "
-            f"{100 * own.behind:.3g} % higher (p = {amount(own.p_value, 2)}). What {d.model} "
+            f"**{latest.best}{qualifier} comes nearer than {d.model}**, whose held-out cost is "
+            f"{100 * asked.behind:.3g} % higher (p = {amount(asked.p_value, 2)}). What {d.model} "
             f"lacks may be no effect but the other law: `nearest_law/` holds its diagnosis."
         )
     words += (
-        f" Costs are those of {last.clusters} open clusters that calibrations left out in turn."
+        f" Costs are those of {latest.clusters} open clusters that calibrations left out in turn."
     )
     if d.laws.refused:
         words += (
@@ -144,7 +144,7 @@ def _laws(d: Diagnosis) -> list[Block]:
     return [
         Heading("Which base law"),
         Text(words),
-        *(tables.laws_table(*one, d.domain) for one in zip(compared, names, strict=False)),
+        *(tables.laws_table(*law, d.domain) for law in zip(compared, names, strict=False)),
     ]
 
 
@@ -167,9 +167,9 @@ def _gap_words(d: Diagnosis) -> str:
     return f"The effects close {closed(d)} of the gap between the model and the noise."
 
 
-def _coefficients(d: Diagnosis, drawn: Figures, found: DiagnosisOutcome) -> list[Block]:
+def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
-    if has_network(found.base):
+    if has_network(outcome.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
         blocks += [tables.coefficients_table(d.effects), *drawn.effects]
@@ -228,18 +228,18 @@ def _agents(d: Diagnosis) -> list[Block]:
     if not d.agents:
         return []
     words = [
-        f"- {one.name}: "
-        + ("named." if one.named else f"not named: {one.reason}.")
-        + f" What lasts longer than {amount(one.lasts, 2)} s cannot be told from a number of "
+        f"- {estimate.name}: "
+        + ("named." if estimate.named else f"not named: {estimate.reason}.")
+        + f" What lasts longer than {amount(estimate.lasts, 2)} s cannot be told from a number of "
         "one's own."
-        for one in d.agents
+        for estimate in d.agents
     ]
     blocks: list[Block] = [
         Heading("Do agents differ?"),
         Text("\n".join(words)),
         tables.agents_table(d),
     ]
-    if any(one.later for one in d.agents):
+    if any(estimate.later for estimate in d.agents):
         blocks.append(tables.later_table(d))
     return blocks
 
@@ -317,14 +317,16 @@ def _shown(d: Diagnosis, drawn: Figures) -> list[Block]:
     return [Heading("A sealed sequence"), *drawn.paths]
 
 
-def _usage(d: Diagnosis, commands: list[str], folder: Path, found: DiagnosisOutcome) -> list[Block]:
+def _usage(
+    d: Diagnosis, commands: list[str], folder: Path, outcome: DiagnosisOutcome
+) -> list[Block]:
     more = ""
-    if has_network(found.base):
+    if has_network(outcome.base):
         more += (
             " The weights of the network are in the checkpoint alone; trained from the "
             "configuration it starts anew."
         )
-    for name in individual(found.extended):
+    for name in individual(outcome.extended):
         more += (
             f" {name} knows the agents of the open sequences; for all others it does not act, so "
             "that the errors that the command `evaluate` gives on sealed sequences are those "
@@ -358,7 +360,7 @@ def _names(names: list[str]) -> str:
 
 
 def write_events(
-    found: DiagnosisOutcome, pictures: list[Path], config: dict[str, Any], folder: Path
+    outcome: DiagnosisOutcome, pictures: list[Path], config: dict[str, Any], folder: Path
 ) -> Path:
     """Write TensorBoard's events: step 0 is the model as it was given, step 1 the extended one.
 
@@ -367,7 +369,7 @@ def write_events(
     Args:
         pictures: the page's figures.
     """
-    d = found.diagnosis
+    d = outcome.diagnosis
     shutil.rmtree(folder, ignore_errors=True)
     book = Logbook(folder, config)
     for step, (cost, key) in enumerate(((d.gap.before, "before"), (d.gap.after, "after"))):

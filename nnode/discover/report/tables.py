@@ -52,17 +52,17 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
     """Base laws, the best first."""
     rows = [
         {
-            "law": one.name,
-            "parameters": one.parameters,
-            "held-out cost above the best (%)": amount(100 * one.behind),
-            "p": amount(one.p_value, 2),
-            "error on left-out open clusters (m²)": amount(one.error),
+            "law": law.name,
+            "parameters": law.parameters,
+            "held-out cost above the best (%)": amount(100 * law.behind),
+            "p": amount(law.p_value, 2),
+            "error on left-out open clusters (m²)": amount(law.error),
             "calibrated": ", ".join(
                 f"{name.partition('.')[2] or name} {amount(value)}{in_unit(unit)}"
-                for name, (value, unit) in one.values.items()
+                for name, (value, unit) in law.values.items()
             ),
         }
-        for one in laws.ranking
+        for law in laws.ranking
     ]
     beside = ""
     if laws.effects:
@@ -90,16 +90,16 @@ def screen_table(d: Diagnosis) -> TableBlock:
     """What explains most in the open sequences."""
     rows = [
         {
-            "effect": one["name"],
-            "share of the squared residuals": _percent(one["share"]),
-            "p": amount(one["p_value"], 2),
+            "effect": score["name"],
+            "share of the squared residuals": _percent(score["share"]),
+            "p": amount(score["p_value"], 2),
             "about": ", ".join(
                 f"{name} {amount(value)}"
-                for name, value in one.items()
+                for name, value in score.items()
                 if name not in ("name", "share", "p_value")
             ),
         }
-        for one in d.screen.leads
+        for score in d.screen.leads
     ]
     return _table(
         "screen",
@@ -114,14 +114,14 @@ def agents_table(d: Diagnosis) -> TableBlock:
     """Numbers of agents, and what their variance belongs to."""
     rows = [
         {
-            "effect": one.name,
-            "strength": f"{amount(one.strength, 2)} [{amount(one.low, 2)}, {amount(one.high, 2)}]",
-            "unit": _unit(one.unit),
-            "p": amount(one.p_value, 2),
-            **{who: "–" if share is None else _percent(share) for who, share in one.share.items()},
-            "p on sealed clusters": amount(one.confirmed, 2),
+            "effect": a.name,
+            "strength": f"{amount(a.strength, 2)} [{amount(a.low, 2)}, {amount(a.high, 2)}]",
+            "unit": _unit(a.unit),
+            "p": amount(a.p_value, 2),
+            **{who: "–" if share is None else _percent(share) for who, share in a.share.items()},
+            "p on sealed clusters": amount(a.confirmed, 2),
         }
-        for one in d.agents
+        for a in d.agents
     ]
     return _table(
         "agents",
@@ -134,22 +134,22 @@ def agents_table(d: Diagnosis) -> TableBlock:
 
 def drivers_table(d: Diagnosis) -> TableBlock:
     """What differs between drivers and over time."""
-    known = {
+    labels = {
         "push": "pushes",
         "push_time": "time that pushes last",
         "measurement": "measured positions",
     }
     rows = [
         {
-            "what": known.get(one.name, f"{one.name} between drivers"),
-            "standard deviation or time": amount(one.estimate),
+            "what": labels.get(variation.name, f"{variation.name} between drivers"),
+            "standard deviation or time": amount(variation.estimate),
             "95 % interval": "not estimable"
-            if math.isnan(one.lower)
-            else f"[{amount(one.lower)}, {amount(one.upper)}]",
-            "unit": _unit(one.unit),
-            "left open per driver": _percent(one.shrinkage),
+            if math.isnan(variation.lower)
+            else f"[{amount(variation.lower)}, {amount(variation.upper)}]",
+            "unit": _unit(variation.unit),
+            "left open per driver": _percent(variation.shrinkage),
         }
-        for one in d.drivers
+        for variation in d.drivers
     ]
     return _table(
         "drivers",
@@ -165,12 +165,12 @@ def later_table(d: Diagnosis) -> TableBlock:
     """Who predicts the last part of sealed sequences."""
     rows = [
         {
-            "effect": one.name,
+            "effect": estimate.name,
             "who predicts": "the model without effects" if who == "base" else who,
             "mean square error (m²)": amount(error),
         }
-        for one in d.agents
-        for who, error in one.later.items()
+        for estimate in d.agents
+        for who, error in estimate.later.items()
     ]
     return _table(
         "later",
@@ -379,11 +379,11 @@ def absent_table(d: Diagnosis) -> TableBlock:
 
 def not_testable_table(d: Diagnosis) -> TableBlock:
     """Effects about which the data say nothing."""
-    known = {absence.name: absence for absence in d.absences if not absence.testable}
-    names = list(dict.fromkeys([*known, *d.not_testable]))
+    by_name = {absence.name: absence for absence in d.absences if not absence.testable}
+    names = list(dict.fromkeys([*by_name, *d.not_testable]))
     rows = []
     for name in names:
-        absence = known.get(name)
+        absence = by_name.get(name)
         needed = amount(absence.detectable) if absence else "–"
         rows.append(
             {

@@ -127,7 +127,7 @@ def clock(state: State) -> Tensor:
     return (state.scene.start + state.t)[:, None].expand(state.x.shape[:2])
 
 
-def since_start(first: dict[str, float]) -> Callable[[State], Tensor]:
+def since_start(start_of: dict[str, float]) -> Callable[[State], Tensor]:
     """``(B, N)`` s: the time since the first sample of the sequence.
 
     Args:
@@ -135,7 +135,7 @@ def since_start(first: dict[str, float]) -> Callable[[State], Tensor]:
     """
 
     def value(state: State) -> Tensor:
-        start = torch.tensor([first[name] for name in state.scene.names], dtype=state.x.dtype)
+        start = torch.tensor([start_of[name] for name in state.scene.names], dtype=state.x.dtype)
         return (state.scene.start - start + state.t)[:, None].expand(state.x.shape[:2])
 
     return value
@@ -155,8 +155,8 @@ def waves_of(
     name: str,
     unit: str,
     value: Callable[[State], Tensor],
-    seen: Tensor,
-    between: tuple[float, float],
+    observed: Tensor,
+    length_range: tuple[float, float],
     directions: dict[str, Callable[[State], Tensor]],
 ) -> list[Variable]:
     """Waves of a variable in each direction; none where the data span too little of it.
@@ -166,8 +166,8 @@ def waves_of(
         between: the shortest and the longest wave.
         directions: by level, see :class:`Variable`.
     """
-    low, high = float(seen.min()), float(seen.max())
-    lengths = lengths_of(*between, high - low)
+    low, high = float(observed.min()), float(observed.max())
+    lengths = lengths_of(*length_range, high - low)
     return [
         Variable(f"waves of {name}", unit, value, (low, high), direction, level, lengths)
         for level, direction in directions.items()

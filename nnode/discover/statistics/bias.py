@@ -38,9 +38,8 @@ def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
     except SimulationError:
         return []
     fits: SimulatedFits = [(simulated, evaluated(simulated, fit.system)) for simulated in engines]
-    return (
-        fits if all(np.isfinite(simulated_fit.residual).all() for _, simulated_fit in fits) else []
-    )
+    finite = all(np.isfinite(simulated_fit.residual).all() for _, simulated_fit in fits)
+    return fits if finite else []
 
 
 def mean_scores(

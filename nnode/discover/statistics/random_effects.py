@@ -1,10 +1,10 @@
-"""Effects that differ from agent to agent: what of an agent's number carries far enough.
+"""Random effects of agents, separated from transient deviations.
 
-An agent's number is estimated in every part of his time. What two parts far from each other have in
-common, beyond what he shares with the others of his sequence then, is his own; what they have in
-common only while they are near is a mood that lasts for some time. Both are told apart by their
-fall with the lag: a constant, and an exponential of at most a third of the longest lag. What lasts
-longer than that cannot be told from a number of his own and is called so.
+An agent's parameter is estimated in every part of its time. The autocovariance over these parts,
+beyond that between different agents of a sequence, is modelled as a constant plus an exponential
+decay. The constant is the variance between agents. The exponential is a transient deviation with a
+time constant of at most a third of the longest lag; longer ones cannot be distinguished from a
+constant difference between agents.
 
 Source: MacKinnon, Nielsen & Webb 2023 (jackknife by cluster).
 """
@@ -31,7 +31,7 @@ from nnode.model.effects import IndividualEffect
 from nnode.model.extend import effects_of, extended, without
 from nnode.model.system import System
 
-#: Rounds in which numbers are linearised again, and the largest change in one.
+#: Number of relinearisations of the parameters, and the largest change in each.
 SHARPER, LEAP = 3, 0.1
 
 
@@ -70,7 +70,7 @@ class Individuals:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the numbers, per direction."""
+        """Standard deviation between agents, per direction."""
         return float(np.sqrt(max(self.variance, 0.0)))
 
     @property
@@ -79,19 +79,19 @@ class Individuals:
         return self.effect.spread(self.spread)
 
     def interval(self) -> tuple[float, float]:
-        """Of 95 % of the strength."""
+        """The 95 % interval of the strength."""
         half = float(stats.t.ppf(0.975, max(len(self.left_out) - 1, 1))) * self.error
         low, high = (float(np.sqrt(np.maximum(self.variance + s * half, 0.0))) for s in (-1, 1))
         return self.effect.spread(low), self.effect.spread(high)
 
     def detectable(self, alpha: float, power: float = 0.8) -> float:
-        """The least strength whose variance stands out with a probability of 80 %."""
+        """The smallest strength whose variance is significant with a power of 80 %."""
         quantiles = stats.t.ppf([1 - alpha, power], max(len(self.left_out) - 1, 1))
         return self.effect.spread(float(np.sqrt(self.error * quantiles.sum())))
 
 
 def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Individuals | None:
-    """The best setting of an individual effect; None where nobody is seen for long enough."""
+    """The best setting of an individual effect; None if no agent is observed long enough."""
     probes = effect.probes(engine.batch, fit.system)
     fits = [_at(engine, fit, effect, probe.options) for probe in probes]
     estimates = [estimate for estimate in fits if estimate is not None]
@@ -107,17 +107,17 @@ def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Ind
 def numbers(
     engine: Engine, system: System, estimate: Individuals, *, common: bool = False
 ) -> dict[str, list[float]]:
-    """Sequence name to its agents' numbers, from all the time that the engine holds.
+    """The agents' parameters by sequence name, from all data of the engine.
 
-    Linearised around the motion that they lead to: who is much slower than the others is not
-    where a linear response expects him. Drawn to zero as the variance of the numbers says, and
-    that of the moods, which are noise to them.
+    They are empirical Bayes modes: shrunk according to the variance between agents and that of
+    transient deviations, which are noise. They are relinearised, because the linear response is
+    inaccurate for agents that differ much from the others.
 
     Args:
-        engine: settled.
+        engine: with fitted whitening.
         system: with the effect or without.
-        one: whose spread and settings are used.
-        common: one number for all agents of a sequence.
+        estimate: provides the variances and settings.
+        common: one parameter for all agents of a sequence.
     """
     system = with_people(system, estimate, {})
     effect = next(t for t in system.terms if isinstance(t, estimate.effect))
@@ -143,7 +143,7 @@ def numbers(
 
 
 def _mean_transient_variance(engine: Engine, estimate: Individuals) -> float:
-    """Variance of the mean mood over the time that sequences last."""
+    """Variance of the transient deviation averaged over the duration of sequences."""
     height, tau = estimate.transient
     last = np.array([s.time[-1] - s.time[0] for s in engine.sequences]).mean()
     x = max(float(last) / max(tau, 1e-9), 1e-9)
@@ -153,7 +153,7 @@ def _mean_transient_variance(engine: Engine, estimate: Individuals) -> float:
 def _with_transient_variance(
     gram: np.ndarray, score: np.ndarray, transient: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Information and scores of numbers that moods of a variance are added to."""
+    """Information and scores of parameters, with transient deviations as additional noise."""
     if transient <= 0:
         return gram, score
     number = gram.shape[1]
@@ -165,7 +165,7 @@ def _with_transient_variance(
 
 
 def with_people(system: System, estimate: Individuals, people: dict[str, list[float]]) -> System:
-    """A copy of a model with an individual effect and its agents' numbers."""
+    """A copy of a model with an individual effect and its agents' parameters."""
     if any(isinstance(effect, estimate.effect) for effect in effects_of(system)):
         system = without(system, estimate.effect.name)
     options = dict(estimate.options)
@@ -195,7 +195,7 @@ def _at(
         ]
     )
     error = float(np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum()))
-    if count < 3:  # as for all intervals
+    if count < 3:  # as for all jackknife intervals
         error = float("nan")
     p_value = float(stats.t.sf(constant / error, count - 1)) if error > 0 else 1.0
     return Individuals(
@@ -217,15 +217,15 @@ def _at(
 def _directions(
     engine: Engine, fit: Fit, effect: type[IndividualEffect], options: dict[str, Any]
 ) -> np.ndarray:
-    """``(n, M)`` derivatives of the residuals with respect to the numbers of every unit."""
+    """``(n, M)`` derivatives of the residuals with respect to the parameters of every unit."""
     row = torch.from_numpy(fit.row)
     directions: np.ndarray = engine.individual(fit.system, row, effect, options).numpy().T
     return directions
 
 
 def _with_interval(estimates: list[Individuals], best: Individuals) -> None:
-    """The interval of the one setting: where parabolas through neighbouring variances have their
-    tops, each cluster left out in turn."""
+    """Interpolate the setting with the largest variance by a parabola through its neighbours, with
+    a jackknife interval."""
     (name,) = best.options
     estimates = sorted(estimates, key=lambda estimate: float(estimate.options[name]))
     place = estimates.index(best)
@@ -245,8 +245,7 @@ def _with_interval(estimates: list[Individuals], best: Individuals) -> None:
 
 
 def _vertex(at: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """``(S,)`` where parabolas through ``(S, 3)`` gains at three places are highest; within
-    them."""
+    """``(S,)`` maxima of parabolas through ``(S, 3)`` gains at three places, clipped to them."""
     left = (gain[:, 1] - gain[:, 0]) / (at[1] - at[0])
     right = (gain[:, 2] - gain[:, 1]) / (at[2] - at[1])
     bend = np.minimum((right - left) / (at[2] - at[0]), -1e-300)

@@ -1,16 +1,17 @@
-"""Efficient scores: which effect's trace is in what the calibrated model leaves.
+"""Score tests of missing effects by sign flips of clusters.
 
-The trace of an effect is the change of the residuals by a small strength of it. What
-recalibration of the model's own parameters can absorb is taken out of it, so that only the rest
-counts. Sums over clusters may change their sign without changing their distribution where nothing
-is hidden. Each effect's statistic is compared with its own distribution under such flips, and the
-least of these p-values over all effects with the distribution of the least: a search over many
-intervals, whose largest statistic is large by chance, does not raise the bar for the others.
+The trace of an effect is the derivative of the residuals by its strength. It is projected
+orthogonally to the tangents of the model's parameters (efficient scores), because recalibration
+would absorb the rest. Under the null hypothesis, the scores of clusters are symmetric, so their
+signs can be flipped. The statistic of each effect is compared with its own distribution under
+flips, and the smallest of these p-values with the distribution of the smallest (min-p). So an
+effect with many intervals, whose maximum is large by chance, does not reduce the power for the
+other effects.
 
-Residuals are not free of systematic errors: measured positions are smoothed, people are simulated
-among the measured paths of others who have reacted to them. Where nothing is hidden that makes
-some effects a twentieth of their least usual size, which many data would tell from nothing. So what
-is tested is whether an effect exceeds a tenth of that size.
+Residuals have small systematic errors: measured positions are smoothed, and people are simulated
+among the measured paths of others who have reacted to them. Under the null hypothesis, these errors
+amount to a twentieth of the minimum size of some effects, which is significant in large data sets.
+Therefore the tests are of a minimal effect: whether it exceeds a tenth of the minimum size.
 
 Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Hemerik, Goeman & Finos 2020
 (of scores that are free of nuisance parameters); Westfall & Young 1993 (least p-value over
@@ -35,19 +36,19 @@ from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
 from nnode.discover.statistics.standard import cluster_variance_of, joint, standardised
 from nnode.model.effects import Effect, Probe
 
-#: Sign flips that a p-value comes from.
+#: Number of sign flips of a p-value.
 FLIPS = 1999
 
 
 @dataclass
 class Trace:
-    """What a weak effect does to the residuals.
+    """The linear response of the residuals to an effect.
 
     Attributes:
         effect: its class.
         probes: one; or the neighbouring cells of an effect on an interval.
         columns: ``(n, k)`` per unit of each strength of the probe, or per cell.
-        bias: ``(G, k)`` scores where there is no effect.
+        bias: ``(G, k)`` mean scores under the null hypothesis.
     """
 
     effect: type[Effect]
@@ -58,13 +59,13 @@ class Trace:
 
 @dataclass
 class Evidence:
-    """What the clusters tell of one direction.
+    """The scores of clusters in one direction.
 
     Attributes:
         options: of the probe.
-        size: of an effect with a memory, whose trace is that of a finite strength; otherwise 0.
+        size: the finite strength of the trace of an effect with memory; otherwise 0.
         parts, grams: ``(G,)`` scores and their information.
-        minimal: amount that is taken for none.
+        minimal: the largest negligible strength.
     """
 
     options: dict[str, Any]
@@ -76,17 +77,17 @@ class Evidence:
 
 @dataclass
 class Score:
-    """The best trace of an effect.
+    """The score test of an effect, for its best trace.
 
     Attributes:
         effect: its class.
-        options: where a calibration with this effect should start.
-        statistic: in units of a standard normal one.
-        p_value: of the maximum over all effects.
-        gain: share of the sum of squares that the trace explains beyond the model.
-        amount: strengths that explain most, less their neutral values.
+        options: start values for a calibration with this effect.
+        statistic: on the scale of a standard normal variable.
+        p_value: corrected for all effects (min-p).
+        gain: share of the sum of squares that the trace explains.
+        amount: estimated strengths minus their neutral values.
         error: standard errors of ``amount``.
-        evidence: of every strength; of an effect with a memory, or without a strength, of every
+        evidence: of every strength; for an effect with memory, or without a strength, of every
             probe.
     """
 
@@ -120,14 +121,14 @@ def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
 
 
 class Screen:
-    """All traces against the residuals of one fit.
+    """Score tests of effects against the residuals of one fit.
 
     Args:
         fit: the calibrated model.
         cluster: ``(n,)`` see :class:`~nnode.discover.residuals.engine.Engine`.
         seed: of the sign flips.
-        flips: their number at most; with few clusters, all there are.
-        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser.
+        flips: their largest number; with few clusters, all combinations are used.
+        levels: by an effect's name, the independent clusters ``(n,)`` of its test, if coarser.
     """
 
     def __init__(
@@ -143,24 +144,24 @@ class Screen:
         self.variance = fit.cost / len(fit.residual)
         self._basis = orthonormal(fit.tangents)
         self._rng = np.random.default_rng(seed)
-        #: ``(F, G)``, the data as they are first
+        #: ``(F, G)``; the first row is the data without flips
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
-        #: of each effect's name the largest statistic of its probes under each flip
+        #: by an effect's name, the largest statistic of its probes under each flip
         self._null_statistics: dict[str, np.ndarray] = {}
         self._least = np.ones(len(self._signs))
         self._adjusted_residuals: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def adjusted(self, columns: np.ndarray) -> np.ndarray:
-        """``columns`` without what the model's own parameters can do."""
+        """``columns`` projected orthogonally to the tangents of the model's parameters."""
         adjusted: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
         return adjusted
 
     def parts(self, z: np.ndarray, label: np.ndarray) -> np.ndarray:
-        """``(G, k)`` scores of directions that are free of the model's parameters.
+        """``(G, k)`` scores of directions that are orthogonal to the model's tangents.
 
-        What the parameters have taken out of the residuals makes the clusters' scores vary less
-        than the errors do; signs of those would promise too little chance. So each cluster's
-        residuals are blown up by its leverage, and the sum of the scores is kept.
+        Fitted residuals have smaller variances than the errors, so sign flips of their scores would
+        be anticonservative. Therefore each cluster's residuals are scaled up by its leverage, and
+        the sum of the scores is kept.
 
         Source: Bell & McCaffrey 2002 (CR2).
         """
@@ -177,16 +178,16 @@ class Screen:
         return balanced
 
     def flipped(self, parts: np.ndarray) -> np.ndarray:
-        """``(F, C)`` sums of the clusters ``(G, C)``, as they are and with every flip."""
+        """``(F, C)`` sums of the clusters ``(G, C)`` under every flip, the data first."""
         total: np.ndarray = self._signs @ parts
         return total
 
     def label(self, name: str) -> np.ndarray:
-        """``(n,)`` the clusters that tell of an effect."""
+        """``(n,)`` the independent clusters of an effect's test."""
         return self.levels.get(name, self.cluster)
 
     def scores(self, effect_traces: Iterable[Trace]) -> list[Score]:
-        """The best trace of each effect, the one that explains most first."""
+        """The score test of each effect, ordered by decreasing gain."""
         best: dict[str, Score] = {}
         largest: dict[str, float] = {}
         for trace in effect_traces:
@@ -204,7 +205,7 @@ class Screen:
         return sorted(best.values(), key=lambda score: -score.gain)
 
     def _judge(self, best: dict[str, Score], largest: dict[str, float]) -> None:
-        """P-values with regard to all effects."""
+        """Set the p-values, corrected for all effects."""
         # the data themselves are one of the flips
         statistics = np.stack(
             [np.append(largest[name], self._null_statistics[name][1:]) for name in best]
@@ -215,13 +216,12 @@ class Screen:
             score.p_value = float((self._least <= p_value + 1e-12).mean())
 
     def critical(self, name: str, alpha: float = 0.05) -> float:
-        """The statistic of an effect that it passes where the least p-value of all does so with
-        probability ``alpha`` by chance."""
+        """The critical value of an effect's statistic at familywise level ``alpha``."""
         share = float(np.quantile(self._least, alpha))
         return float(np.quantile(self._null_statistics[name], 1 - share))
 
     def statistic(self, evidence: Evidence, parts: np.ndarray) -> np.ndarray:
-        """``(R,)`` the statistic where the scores of a direction were ``parts`` ``(G, R)``."""
+        """``(R,)`` the statistic of a direction if its scores were ``parts`` ``(G, R)``."""
         cluster_variance = cluster_variance_of(
             evidence.parts[:, None], evidence.grams[:, None], self.variance
         )
@@ -231,15 +231,15 @@ class Screen:
         return standardised(parts, sizes, np.ones((1, len(parts))), cluster_variance)[0]
 
     def costs(self, name: str) -> np.ndarray:
-        """``(G,)`` sums of squared residuals of the clusters that tell of an effect."""
+        """``(G,)`` sums of squared residuals of the clusters of an effect's test."""
         return sums(self.residual**2, self.label(name))
 
     def _store_null(self, name: str, statistics: np.ndarray) -> None:
-        """Note an effect's statistics ``(F,)`` under the flips."""
+        """Update an effect's largest statistics ``(F,)`` under the flips."""
         self._null_statistics[name] = np.maximum(self._null_statistics.get(name, 0.0), statistics)
 
     def _flips(self, name: str) -> np.ndarray:
-        """``(F, G)`` signs of the clusters that tell of an effect, the data first."""
+        """``(F, G)`` signs of the clusters of an effect's test, the data first."""
         if name not in self.levels:
             return self._signs
         shape = len(self._signs), int(self.levels[name].max()) + 1
@@ -264,12 +264,12 @@ class Screen:
             options[name] = strength.at(value)
             amounts[name], errors[name] = float(value), float(width)
         if len(probe.steps) == 1 and value != 0:
-            # a strength that is not plausible speaks for something else
+            # an implausible strength indicates another effect
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
             if share < rules().forbidden:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._store_null(trace.effect.name, chance)
-        # of an effect with a memory the trace is that of a finite strength, where it has one
+        # the trace of an effect with memory is that of a finite strength
         size = max(map(abs, probe.steps.values()), default=0.0) if trace.effect.remembers() else 0.0
         evidence = [
             Evidence(probe.options, size, parts[:, i], grams[:, i, i], minimal[i])
@@ -350,20 +350,22 @@ class Screen:
 
 
 def negligible_strengths(effect: type[Effect], number: int) -> np.ndarray:
-    """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
-    not say what size is usual."""
-    found = [rules().minimal * (one.min_effect_size or 0.0) for one in effect.strengths.values()]
-    return np.array(found or [0.0] * number)[:number]
+    """``(k,)`` the largest negligible strengths of an effect; 0 if it declares no minimum size."""
+    negligible = [
+        rules().minimal * (strength.min_effect_size or 0.0)
+        for strength in effect.strengths.values()
+    ]
+    return np.array(negligible or [0.0] * number)[:number]
 
 
 def _negligible(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
-    """What is taken off amounts to bring them nearer to none."""
-    found: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
-    return found
+    """The part of estimated strengths that is negligible, to be subtracted from them."""
+    negligible: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
+    return negligible
 
 
 def at_least(values: np.ndarray) -> np.ndarray:
-    """``(F,)`` share of the values that are at least as large as each, but for rounding."""
+    """``(F,)`` share of the values that are at least as large as each, up to rounding."""
     order = np.sort(values)
     below = np.searchsorted(order, values * (1 - 1e-12), side="left")
     return 1 - below / len(values)

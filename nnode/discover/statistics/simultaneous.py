@@ -1,10 +1,10 @@
-"""Do agents behave alike who are there at one time but share nobody?
+"""Test whether simultaneous clusters without common agents are correlated.
 
-The mean residuals of two clusters of a site over the seconds that they have in common are
-multiplied. Where they have nothing to do with each other, the sum of these products is as large
-when each cluster is shifted along its own time, which keeps how long its residuals last. What all
-sequences have in common as functions of the time since their start is the model's and is taken out
-first; where all start at one time nothing can be told from it.
+The statistic is the sum of products of the mean residuals of two clusters of a site over their
+common seconds. Under independence, its distribution is invariant to circular shifts of each cluster
+along its own time, which preserve autocorrelation. The mean residual as a function of the time
+since the start is a misfit of the model and is subtracted first; if all sequences start at one
+time, the test has no power.
 
 Source: surrogates by circular shifts, as in Theiler et al. 1992 for other statistics.
 """
@@ -26,7 +26,7 @@ SHIFTS, ALPHA = 999, 0.05
 
 @dataclass(frozen=True)
 class Simultaneous:
-    """What the test said.
+    """The result of the test.
 
     Attributes:
         pairs: of clusters of a site that have at least two seconds in common.
@@ -40,7 +40,7 @@ class Simultaneous:
 
     @property
     def together(self) -> bool:
-        """Whether what is simultaneous is one cluster."""
+        """Whether simultaneous sequences are treated as one cluster."""
         return self.p_value <= ALPHA
 
     def plain(self) -> str:
@@ -83,7 +83,7 @@ _Member = tuple[int, np.ndarray]
 
 
 def _products(members: list[_Member]) -> float:
-    """Sum over all pairs of the products of what they have in common."""
+    """Sum over all pairs of the products of their residuals in common seconds."""
     start = min(first for first, _ in members)
     length = max(first + len(residuals) for first, residuals in members) - start
     total = np.zeros((length, members[0][1].shape[1]))
@@ -95,21 +95,16 @@ def _products(members: list[_Member]) -> float:
 
 
 def _pairs(members: list[_Member]) -> tuple[int, float]:
-    """How many pairs have two seconds in common, and the sum of their sizes there."""
+    """The number of pairs with at least two common seconds, and the sum of their norms there."""
     number, size = 0, 0.0
-    for i, (first_start, first_residuals) in enumerate(members):
-        for second_start, second_residuals in members[i + 1 :]:
-            start, end = (
-                max(first_start, second_start),
-                min(first_start + len(first_residuals), second_start + len(second_residuals)),
-            )
+    for i, (start_a, a) in enumerate(members):
+        for start_b, b in members[i + 1 :]:
+            start, end = max(start_a, start_b), min(start_a + len(a), start_b + len(b))
             if end - start >= 2:
-                a, b = (
-                    first_residuals[start - first_start : end - first_start],
-                    second_residuals[start - second_start : end - second_start],
-                )
+                overlap_a = a[start - start_a : end - start_a]
+                overlap_b = b[start - start_b : end - start_b]
                 number += 1
-                size += float(np.sqrt((a**2).sum() * (b**2).sum()))
+                size += float(np.sqrt((overlap_a**2).sum() * (overlap_b**2).sum()))
     return number, size
 
 

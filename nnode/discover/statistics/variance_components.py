@@ -1,4 +1,4 @@
-"""What numbers of agents, estimated in parts of their time, have in common at every lag.
+"""Variance components of agent-specific parameters, from their autocovariance over time.
 
 Source: Searle, Casella & McCulloch 1992 (variance components by products); Bell & McCaffrey 2002
 (the share that a mean takes along).
@@ -15,24 +15,24 @@ import numpy as np
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, grams, sums
 
-#: Parts of a sequence's time in which numbers are estimated.
+#: Number of parts of a sequence's time in which parameters are estimated.
 PARTS = 6
-#: Time constants that are tried, the longest of them this share of the longest lag.
+#: Number of time constants that are compared, and the longest as a share of the longest lag.
 TRIED, LONGEST = 30, 1 / 3
-#: Information below this share of the largest is none.
+#: Information below this share of the largest counts as zero.
 NONE = 1e-6
 
 
 @dataclass
 class PeriodEstimates:
-    """Numbers of agents in parts of their time: O of them.
+    """O estimates of agents' parameters in parts of their time.
 
     Attributes:
-        agent, sequence, cluster, recording: ``(O,)`` whose; agents are the same in all sequences
-            of a recording that name them.
+        agent, sequence, cluster, recording: ``(O,)`` labels; an agent with an identifier is the
+            same in all sequences of a recording.
         time: ``(O,)`` s.
         value: ``(O, D)`` per direction.
-        info: ``(O,)`` inverse variance that the residuals leave to a value.
+        info: ``(O,)`` inverse variances of the estimates.
     """
 
     agent: np.ndarray
@@ -45,7 +45,7 @@ class PeriodEstimates:
 
     @property
     def weight(self) -> np.ndarray:
-        """``(O,)`` with which products are known best."""
+        """``(O,)`` the weights that minimise the variance of products."""
         weight, noise = self.info, 1 / self.info
         square = (self.value**2).mean(1)
         for _ in range(3):
@@ -55,14 +55,13 @@ class PeriodEstimates:
 
 
 def period_estimates(engine: Engine, fit: Fit, z: np.ndarray) -> PeriodEstimates:
-    """The numbers of everybody in every part of his time."""
+    """The parameters of all agents in every part of their time."""
     number = len(engine.sequences)
     first, last = np.full(number, np.inf), np.full(number, -np.inf)
     np.minimum.at(first, engine.sequence, engine.clock)
     np.maximum.at(last, engine.sequence, engine.clock)
-    elapsed = (engine.clock - first[engine.sequence]) / np.maximum(last - first, 1e-9)[
-        engine.sequence
-    ]
+    duration = np.maximum(last - first, 1e-9)
+    elapsed = (engine.clock - first[engine.sequence]) / duration[engine.sequence]
     part = np.minimum((PARTS * elapsed).astype(int), PARTS - 1)
     present, label = np.unique(PARTS * engine.unit + part, return_inverse=True)
     gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
@@ -95,30 +94,24 @@ def period_estimates(engine: Engine, fit: Fit, z: np.ndarray) -> PeriodEstimates
     columns = list(zip(*rows, strict=True)) or [()] * 7
     agent, sequence, cluster_of, recording, when, values, info = (np.array(c) for c in columns)
     estimates = PeriodEstimates(agent, sequence, cluster_of, recording, when, values, info)
-    return (
-        estimates if single_agent else _without_place_means(estimates, np.array(places, dtype=int))
-    )
+    if single_agent:
+        return estimates
+    return _without_place_means(estimates, np.array(places, dtype=int))
 
 
 def _without_place_means(estimates: PeriodEstimates, place: np.ndarray) -> PeriodEstimates:
-    """Numbers beyond what all at a place of the platoon have in common.
+    """The estimates minus the mean of all at the same place of the platoon.
 
-    The mean of a place takes a part of every cluster's numbers along; the rest is enlarged by it
-    (as CR2 does, see :mod:`~nnode.discover.statistics.leverage`). Places that one cluster alone
-    tells of are left out.
+    The deviations are scaled up by the leverage of their cluster on this mean (as in CR2, see
+    :mod:`~nnode.discover.statistics.leverage`). Places that occur in only one cluster are left out.
     """
     value, identified = estimates.value.copy(), np.zeros(len(place), dtype=bool)
     weight = estimates.weight if len(place) else estimates.info
     for p in np.unique(place):
         members = np.flatnonzero(place == p)
-        share = (
-            np.bincount(estimates.cluster[members], weight[members])[estimates.cluster[members]]
-            / weight[members].sum()
-        )
-        centred = (
-            estimates.value[members]
-            - weight[members] @ estimates.value[members] / weight[members].sum()
-        )
+        cluster, w, v = estimates.cluster[members], weight[members], estimates.value[members]
+        share = np.bincount(cluster, w)[cluster] / w.sum()
+        centred = v - w @ v / w.sum()
         identified[members] = share < 1 - 1e-9
         value[members] = centred / np.sqrt(np.maximum(1 - share, 1e-9))[:, None]
     kept = np.flatnonzero(identified)
@@ -127,7 +120,7 @@ def _without_place_means(estimates: PeriodEstimates, place: np.ndarray) -> Perio
 
 
 class _Identity:
-    """Who is the same in several sequences."""
+    """Identifies agents across sequences."""
 
     def __init__(self, engine: Engine) -> None:
         self.sequences = engine.sequences
@@ -143,13 +136,12 @@ class _Identity:
 
 @dataclass
 class Curve:
-    """What parts have in common at every lag.
+    """The autocovariance of parameters at every lag.
 
     Attributes:
         lags: ``(L,)`` s.
-        same, between: ``(2, G, L)`` sums of weighted products and of weights: of one agent's
-            parts, and of different agents of a sequence.
-        clusters: whose G.
+        same, between: ``(2, G, L)`` sums of weighted products and of weights in the G clusters:
+            within agents, and between different agents of a sequence.
     """
 
     lags: np.ndarray
@@ -158,7 +150,7 @@ class Curve:
 
     @classmethod
     def of(cls, estimates: PeriodEstimates) -> Curve | None:
-        """None where there are fewer than three lags."""
+        """The autocovariance; None if there are fewer than three lags."""
         weight = estimates.weight
         value = weight[:, None] * estimates.value / np.sqrt(estimates.value.shape[1])
         steps = []
@@ -196,8 +188,8 @@ class Curve:
         return self.plateau(ratio(same) - ratio(between), same[1].sum(0))
 
     def plateau(self, common: np.ndarray, weight: np.ndarray) -> tuple[float, float, float]:
-        """The least squares of a constant and an exponential that falls with the lag; all 0 where
-        nothing is known of either."""
+        """Least squares fit of a constant plus an exponential decay over the lag; all 0 without
+        weights."""
         best = (np.inf, 0.0, 0.0, 0.0)
         if not weight.sum() > 0:
             return best[1:]
@@ -249,10 +241,10 @@ def _collected(
     first, second, at = first[inside], second[inside], at[inside]
     label = cluster[first] * most + at
     product = (value[first] * value[second]).sum(1)
-    sums_ = [
+    weighted_sums = [
         np.bincount(label, w, number * most) for w in (product, weight[first] * weight[second])
     ]
-    stacked: np.ndarray = np.stack(sums_).reshape(2, number, most)
+    stacked: np.ndarray = np.stack(weighted_sums).reshape(2, number, most)
     return stacked
 
 
@@ -264,18 +256,14 @@ def ratio(sums_of: np.ndarray) -> np.ndarray:
 def shares(
     estimates: PeriodEstimates, curve: Curve, agent_variance: float, transient_variance: float
 ) -> dict[str, float | None]:
-    """Variance by what a number belongs to, as shares of their sum; negative ones are none."""
+    """Variance components as shares of their sum; negative estimates count as 0."""
     shared, transient_common, _ = curve.plateau(ratio(curve.between), curve.between[1].sum(0))
     weight = estimates.weight
     total, size = 0.0, 0.0
     for r in np.unique(estimates.recording):
-        parts = [
-            (weight[own_part] @ estimates.value[own_part], weight[own_part].sum())
-            for c in np.unique(estimates.cluster[estimates.recording == r])
-            if len(
-                own_part := np.flatnonzero((estimates.recording == r) & (estimates.cluster == c))
-            )
-        ]
+        inside = estimates.recording == r
+        members = [inside & (estimates.cluster == c) for c in np.unique(estimates.cluster[inside])]
+        parts = [(weight[m] @ estimates.value[m], weight[m].sum()) for m in members]
         values, sizes = np.stack([v for v, _ in parts]), np.array([w for _, w in parts])
         total += float((values.sum(0) ** 2).sum() - (values**2).sum()) / values.shape[1]
         size += float(sizes.sum() ** 2 - (sizes**2).sum())

@@ -71,8 +71,12 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
     figure = new_figure(6.4, 0.75 * len(rows) + 0.35)
     axes = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for ax, (effect, name, c) in zip(axes, rows, strict=True):
-        known = CATALOGUE.effects.get(effect.name)
-        neutral = known.strengths[name].neutral if known and name in known.strengths else None
+        catalogued = CATALOGUE.effects.get(effect.name)
+        neutral = (
+            catalogued.strengths[name].neutral
+            if catalogued and name in catalogued.strengths
+            else None
+        )
         if neutral is not None:
             ax.axvline(neutral, color=GREY, linestyle=":", linewidth=1.4)
         ends = np.array([[c.value - c.low], [c.high - c.value]])
@@ -107,7 +111,9 @@ def sealed_costs(
         floor: of the measurement's noise, m².
     """
     order = np.argsort(before)[::-1]
-    b, a = (np.asarray(one, float)[order] for one in (before, before if after is None else after))
+    b, a = (
+        np.asarray(costs, float)[order] for costs in (before, before if after is None else after)
+    )
     place = np.arange(len(order))
     figure = new_figure(7.2, 3.2)
     ax = figure.subplots()
