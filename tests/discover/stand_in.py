@@ -180,8 +180,8 @@ def diagnose(
         base=base,
         extended=extended,
         searched=extended,
-        open=[i for i in range(len(sequences)) if i not in sealed],
-        sealed=sealed,
+        exploration=[i for i in range(len(sequences)) if i not in sealed],
+        confirmation=sealed,
         simulated=simulated,
     )
 

@@ -1,4 +1,4 @@
-"""What the parameters of a fit take out of the residuals of each cluster.
+"""Leverage adjustment of the residuals of clusters.
 
 Source: Bell & McCaffrey 2002 (CR2).
 """
@@ -11,8 +11,8 @@ from nnode.discover.residuals.fit import grams, members
 
 
 def leverage_adjusted(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """``(n,)`` residuals times (1 - H)^-1/2 of each cluster's part H of the projection onto an
-    orthonormal basis; what one cluster alone determines stays as it is."""
+    """``(n,)`` residuals times (1 - H)^-1/2, where H is each cluster's block of the projection onto
+    an orthonormal basis. Directions that one cluster alone determines are not adjusted."""
     adjusted = residual.copy()
     if not basis.shape[1]:
         return adjusted

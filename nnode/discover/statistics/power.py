@@ -1,10 +1,9 @@
-"""With what probability an effect of some size would be named: the whole way is simulated.
+"""Power of the whole decision procedure for an effect of a given size, by simulation.
 
-The residuals of the clusters, without what the effect explains of them, change their signs at
-random; the effect's trace is added in a given size; then comes what comes in a search: the score,
-the held-out improvement, the interval, and the sealed clusters, which are drawn from the same ones.
-All of it in the linear response: squared positions stand for whitened residuals, and two effects
-that compete are not simulated.
+The signs of the clusters' residual scores are flipped at random, and the effect's trace is added in
+a given size. Then all tests of the procedure are applied: the score test, the held-out improvement,
+the interval, and the confirmation clusters, which are resampled from the same clusters. Everything
+is linearised; competing effects are not simulated.
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ from nnode.data.clusters import every_sign
 from nnode.discover.rules import rules
 from nnode.discover.statistics.score import Evidence, Score, Screen
 
-#: Simulations; an error of 2 % at a power of 80 %.
+#: Number of simulations; the standard error is 2 % at a power of 80 %.
 RUNS = 400
-#: Sizes that are tried, relative to the one that is asked for.
+#: Sizes, relative to the expected one.
 SIZES = 2.0 ** np.linspace(-3, 3, 13)
 
 
 @dataclass(frozen=True)
 class PowerSimulation:
-    """What an effect must pass.
+    """Simulates the tests that an effect must pass.
 
     Attributes:
-        screen: that its score comes from.
-        alpha: level of the screen, over all effects.
+        screen: of the score tests.
+        alpha: familywise level of the screen.
         confirmation_clusters: number of confirmation clusters.
     """
 
@@ -39,7 +38,7 @@ class PowerSimulation:
     confirmation_clusters: int
 
     def power(self, score: Score, evidence: Evidence, size: float, seed: int = 0) -> float:
-        """Share of the simulations in which an effect of a size is found and confirmed."""
+        """Share of the simulations in which an effect of a size is selected and confirmed."""
         grams, information = evidence.grams[:, None], float(evidence.grams.sum())
         number = len(grams)
         if not information > 0 or number < 2:
@@ -76,7 +75,7 @@ class PowerSimulation:
         size: float,
         amount: np.ndarray,
     ) -> np.ndarray:
-        """``(R,)`` whether sealed clusters lean towards the effect and are predicted better."""
+        """``(R,)`` whether the effect passes the tests on confirmation clusters."""
         if rules().level * 2**self.confirmation_clusters < 1:
             return np.zeros(RUNS, dtype=bool)
         chosen = rng.integers(0, len(grams), (self.confirmation_clusters, RUNS))
@@ -95,7 +94,7 @@ class PowerSimulation:
         return likelier & passed
 
     def detectable(self, score: Score, evidence: Evidence, expected: float) -> float:
-        """The least size found with a probability of 80 %; infinite where none is."""
+        """The smallest size with a power of 80 %; infinite if there is none."""
         sizes = expected * SIZES
         powers = np.array([self.power(score, evidence, size) for size in sizes])
         sufficient = np.flatnonzero(powers >= rules().power)
@@ -111,7 +110,7 @@ class PowerSimulation:
 def _with_effect(
     costs: np.ndarray, parts: np.ndarray, grams: np.ndarray, size: float
 ) -> np.ndarray:
-    """Costs of clusters to whose residuals an effect of a size was added, with its scores."""
+    """Costs of clusters after an effect of a size was added to their residuals."""
     new_costs: np.ndarray = costs - 2 * size * parts - size**2 * grams
     return np.maximum(new_costs, 0.0)
 
@@ -119,7 +118,7 @@ def _with_effect(
 def _gain(
     amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
-    """Improvement of each cluster's cost by an amount, relative to the greater cost."""
+    """Improvement of each cluster's cost by an amount, relative to the larger cost."""
     gain = -(2 * amount * parts + amount**2 * grams)
     relative: np.ndarray = gain / _larger(amount, parts, grams, costs)
     return relative
@@ -128,7 +127,7 @@ def _gain(
 def _score_toward(
     amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
-    """How far each cluster leans towards an amount, relative to the greater cost."""
+    """The clusters' scores toward an amount, relative to the larger cost."""
     relative: np.ndarray = -2 * amount * parts / _larger(amount, parts, grams, costs)
     return relative
 
@@ -136,14 +135,14 @@ def _score_toward(
 def _larger(
     amount: np.ndarray, parts: np.ndarray, grams: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
-    """The greater one of a cluster's costs before and after."""
+    """The larger one of a cluster's costs before and after."""
     larger: np.ndarray = np.maximum(costs, costs + 2 * amount * parts + amount**2 * grams)
     return np.maximum(larger, 1e-300)
 
 
 def _t(gain: np.ndarray) -> np.ndarray:
     """Student's statistic of the mean over the first axis."""
-    # where an effect leaves a cluster no cost, its gain is beyond all numbers: nothing is passed
+    # if an effect reduces a cluster's cost to 0, its gain overflows, and the test is not passed
     with np.errstate(over="ignore", invalid="ignore"):
         error = gain.std(0, ddof=1) / np.sqrt(len(gain))
         statistic: np.ndarray = gain.mean(0) / np.maximum(error, 1e-300)

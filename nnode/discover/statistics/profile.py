@@ -1,4 +1,4 @@
-"""Edges of zones and periods: where else they could lie."""
+"""Profile likelihood of the edges of zones and periods."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from nnode.discover.residuals.fit import Fit, refine
 from nnode.model.effects import Effect
 from nnode.model.extend import place_of
 
-#: Places on either side of an edge, the nearest at this share of the whole extent.
+#: Number of places on either side of an edge, and the nearest as a share of the whole extent.
 PLACES, NEAREST = 16, 5e-4
-#: An edge is moved to another minimum at most so many times.
+#: Largest number of moves of an edge to another minimum.
 MOVES = 3
 
 
 @dataclass
 class Profile:
-    """What it costs to put an edge elsewhere, everything else calibrated to it linearly.
+    """The profile of the cost over the place of an edge; other parameters are refitted linearly.
 
     Attributes:
         index: of the edge in the row of parameters.
-        value: where it is.
+        value: the estimated place.
         at: ``(T,)`` other places, ascending.
-        rise: ``(T,)`` of the cost there.
+        rise: ``(T,)`` increase of the cost at these places.
         bounds: the extent of the data, within which an edge can lie.
     """
 
@@ -40,7 +40,7 @@ class Profile:
     bounds: tuple[float, float]
 
     def interval(self, most: float) -> tuple[float, float]:
-        """Ends of what can be reached from the edge at a rise of at most ``most``."""
+        """The interval around the edge in which the rise is at most ``most``."""
         ends = []
         for bound, (at, rise) in zip(self.bounds, self._sides(), strict=True):
             k = _crossing(rise, most)
@@ -54,7 +54,7 @@ class Profile:
         return ends[0], ends[1]
 
     def between(self, most: float) -> np.ndarray:
-        """Places between the last one below ``most`` and the first above it, on both sides."""
+        """Further places between those whose rises bracket ``most``, on both sides."""
         trial_places = [np.empty(0)]
         for at, rise in self._sides():
             k = _crossing(rise, most)
@@ -94,11 +94,11 @@ def profiles(engine: Engine, fit: Fit, name: str) -> dict[str, Profile]:
 
 
 def intervals(engine: Engine, fit: Fit, name: str) -> dict[str, tuple[float, float]]:
-    """Intervals of 95 % of both edges: where the likelihood ratio leaves them.
+    """95 % profile likelihood intervals of both edges.
 
-    Squares of residuals are taken to count as much less than independent ones as those do that
-    tell of the effect's strength. Unlike an edge's derivative, a profile knows of the gaps
-    between sequences: an edge may lie anywhere in one.
+    The likelihood ratio is scaled by the design effect of the strengths' intervals, because
+    residuals within clusters are dependent. Unlike the derivative by an edge, a profile accounts
+    for gaps between sequences: an edge may lie anywhere in a gap.
     """
     most = float(stats.chi2.ppf(0.95, 1)) * _unit(engine, fit, name)
     by_edge = {}
@@ -111,7 +111,7 @@ def intervals(engine: Engine, fit: Fit, name: str) -> dict[str, tuple[float, flo
 
 
 def refined_edges(engine: Engine, fit: Fit, name: str) -> Fit:
-    """The fit with edges in the best minimum that their profiles show."""
+    """The fit with edges moved to the best minimum of their profiles."""
     for _ in range(MOVES):
         candidates = [
             profile for profile in profiles(engine, fit, name).values() if len(profile.at)
@@ -132,7 +132,7 @@ def refined_edges(engine: Engine, fit: Fit, name: str) -> Fit:
 
 
 def _around(value: float, low: float, high: float, extent: float) -> np.ndarray:
-    """Places on both sides, closer to each other near the edge, up to the bounds."""
+    """Places on both sides up to the bounds, denser near the edge."""
     trial_places = []
     for sign, extent_left in ((-1.0, value - low), (1.0, high - value)):
         if extent_left > NEAREST * extent:
@@ -147,7 +147,7 @@ def _crossing(rise: np.ndarray, most: float) -> int | None:
 
 
 def _rises(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
-    """``(T,)`` changes of the cost when one parameter is at ``(T,)`` other places."""
+    """``(T,)`` changes of the cost with one parameter at ``(T,)`` other places."""
     rises = np.full(len(at), np.inf)
     if not len(at):
         return rises
@@ -165,8 +165,8 @@ def _rises(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
 
 
 def _unit(engine: Engine, fit: Fit, name: str) -> float:
-    """What a unit of the likelihood ratio is in this cost: the variance of the residuals, and how
-    much wider than by independent residuals the strengths' intervals are."""
+    """The unit of the likelihood ratio in this cost: the variance of the residuals, times the
+    design effect of the strengths (robust over naive variance)."""
     place, columns = place_of(fit.system, name), fit.tangents
     variance = fit.cost / max(len(fit.residual) - columns.shape[1], 1)
     plain = np.full(len(fit.row), np.nan)

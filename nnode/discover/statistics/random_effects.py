@@ -42,16 +42,17 @@ class Individuals:
     Attributes:
         effect: its class.
         options: its settings.
-        variance: of the agents' own numbers, per direction; negative by chance.
-        error: its standard error, by leaving out each cluster in turn.
-        p_value: one-sided, Student's t by cluster, corrected for the settings tried.
-        share: of the variance of numbers by what they belong to: ``recording`` (None where there
-            is one only), ``sequence``, ``agent`` and ``mood``.
-        lags: s; ``common``: what parts at that lag have in common, per lag.
-        lasts: s, the longest mood that can be told from a number of one's own.
+        variance: between agents, per direction; the estimate may be negative.
+        error: its standard error, by the jackknife over clusters.
+        p_value: one-sided, Student's t by cluster, corrected for the number of settings.
+        share: variance components as shares: ``recording`` (None if there is only one),
+            ``sequence``, ``agent`` and ``mood`` (the transient deviation).
+        lags: s; ``common``: the autocovariance at each lag.
+        lasts: s, the longest time constant of a transient deviation that is separable from a
+            constant difference.
         transient: variance of the transient deviation, and its time constant in s.
-        shared: variance of what the agents of a sequence have in common.
-        settings: intervals of 95 % of settings that were chosen among neighbouring ones.
+        shared: variance between sequences.
+        settings: 95 % intervals of settings that were interpolated between neighbouring ones.
     """
 
     effect: type[IndividualEffect]

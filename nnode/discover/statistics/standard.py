@@ -14,8 +14,8 @@ MEDIAN = 0.4549
 def cluster_variance_of(parts: np.ndarray, sizes: np.ndarray, variance: float) -> float:
     """Variance of a cluster's score in units of its information.
 
-    The residuals' own variance if they were independent; more where they last. The median
-    does not mind some clusters in which there is an effect.
+    It equals the residuals' variance if they are independent, and is larger if they are
+    autocorrelated. The median is robust to some clusters with an effect.
     """
     informative = sizes > 1e-9 * max(float(sizes.max()), 1e-300)
     if not informative.any():
@@ -29,14 +29,14 @@ def standardised(
 ) -> np.ndarray:
     """``(F, C)`` absolute sums on the scale of a standard normal variable.
 
-    What the effect itself explains is no part of the error; otherwise no statistic could
-    exceed the root of the number of clusters. Where few of them carry the information, the
-    error is drawn towards the usual one.
+    The error excludes the part that the effect itself explains; otherwise no statistic could
+    exceed the square root of the number of clusters. If few clusters carry the information, the
+    error is shrunk towards ``cluster_variance``.
 
     Args:
         parts, sizes: ``(G, C)`` scores and their information.
         signs: ``(F, G)``.
-        usual: see :func:`cluster_variance_of`.
+        cluster_variance: see :func:`cluster_variance_of`.
     """
     total, squares, size = signs @ parts, (parts**2).sum(0), sizes.sum(0)
     empty = ~(size > 0)
@@ -56,7 +56,7 @@ def standardised(
 
 
 def joint(parts: np.ndarray, grams: np.ndarray, signs: np.ndarray, variance: float) -> np.ndarray:
-    """``(F,)`` a statistic of the k sums ``(G, k)`` together under flips."""
+    """``(F,)`` the joint statistic of the k sums ``(G, k)`` under flips."""
     k = parts.shape[1]
     if k == 1:
         sizes = grams[:, :, 0]
