@@ -83,8 +83,8 @@ def peers_on_table(
     with TemporaryDirectory(prefix="nnode-peers-") as scratch:
         sequences = read_inputs(data, Path(scratch)).sequences
     division = divide(sequences, DiscoverOptions(seed=seed))
-    opened, sealed = division.exploration, division.confirmation
-    engine = windows_of(system, [sequences[i] for i in opened], division.label[opened])
+    exploration, confirmation = division.exploration, division.confirmation
+    engine = windows_of(system, [sequences[i] for i in exploration], division.label[exploration])
     fit = converged_fit(engine, copy.deepcopy(system).double())
     offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not e.individual]
     found = [trace for effect in offered for trace in traces(engine, fit, effect)]
@@ -92,10 +92,10 @@ def peers_on_table(
     values = np.concatenate([trace.columns for trace in found], axis=1)
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
-    whole = engine_of(system, [sequences[i] for i in sealed], whole=True)
+    whole = engine_of(system, [sequences[i] for i in confirmation], whole=True)
     whole.fit_whitening(fit.system, ParameterVector(fit.system).row)
     before, floor = square_of(whole, fit.system), whole.noise_floor()
-    split = {"sealed": [sequences[i].name for i in sealed]}
+    split = {"sealed": [sequences[i].name for i in confirmation]}
     reports = {}
     for name, choose in PEERS.items():
         theta = choose(library, seed)

@@ -110,7 +110,7 @@ def crowd_variables(state: State, start_of: dict[str, float]) -> list[Variable]:
 
     Args:
         state: many moments of the measured and smoothed paths.
-        first: clock time of the first sample of each sequence, s, by name.
+        start_of: clock time of the first sample of each sequence, s, by name.
     """
     agent = state.scene.agent
     x, y, ahead, left = "along x", "along y", "ahead", "to the left"

@@ -1,4 +1,4 @@
-"""Traffic: whole platoons are simulated behind their measured leader."""
+"""Engine of lanes: platoons are simulated behind their measured leader."""
 
 from __future__ import annotations
 
@@ -35,37 +35,37 @@ from nnode.simulation.rhs import RightHandSide, formula_of, rates_along
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.
 STEP = {1: 0.4, 2: 0.2}
-#: That of laws which say what holds one step later, s: SUMO's usual one.
+#: Longest step of laws that are maps from step to step, s: SUMO's default.
 MAPPED = 0.1
-#: Sequences are compared in windows of about this length, s, each simulated from so much
-#: before (at most a share of the sequence) that its start is forgotten.
+#: Length of the windows in which sequences are compared, s; the preceding time in which the
+#: influence of the start decays, s, and its largest share of the sequence.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
-#: Whitened residuals beyond this count less.
+#: Threshold of Huber's loss for whitened residuals.
 LARGE = 6.0
-#: Change of an agent's number by which derivatives are taken.
+#: Difference of an agent's parameter for derivatives.
 SMALL = 1e-4
-#: Numbers of sequences times changes whose response is computed at once: so many fit the cache.
+#: Number of sequences times changes whose response is computed at once; so many fit the cache.
 BLOCK = 4096
-#: Most past samples that a filter looks at.
+#: Largest order of the autoregressive filter.
 ORDER = 6
 
 
 class TrafficEngine:
     """Residuals of platoons; see :class:`~nnode.discover.residuals.engine.Engine`.
 
-    Only the leader's path and the starts are taken from the measurement, smoothed. Followers are
-    simulated behind each other, so that no follower's noise enters the right-hand side. A law of
-    following forgets its start within some seconds: windows keep the simulated paths near the
-    measured ones, also where the model is quite wrong, and lose little.
+    Only the leader's path and the starts are taken from the smoothed measurement. Followers are
+    simulated behind each other, so that no follower's noise enters the right-hand side. Because the
+    influence of the start decays within seconds, windows lose little information. They keep the
+    simulated paths near the measured ones, even if the model is very wrong.
 
     Args:
         sequences: at least one, of the same sampling interval.
         window: length of a window, s; infinite simulates whole sequences.
         clusters: ``(S,)`` of the sequences; None: each is one.
-        large: residuals beyond this count less.
+        large: threshold of Huber's loss.
 
     Attributes:
-        unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
+        unit: ``(n,)`` agents whose parameters are estimated jointly: those of a sequence.
         people: of each unit, per direction the sequence and the place of its agent.
     """
 
@@ -87,7 +87,7 @@ class TrafficEngine:
         index = torch.arange(self.batch.x.shape[2])
         follower = self.batch.agent & (index != leader[:, None])
         self.follows = self.batch.valid & follower
-        # the start is given, and tells of disturbances that still go on
+        # the start is given, and contains disturbances that continue
         n_skipped = [part[1] for each in parts for part in each]
         time = torch.arange(self.batch.n_samples)[:, None]
         self.compared = self.follows & (time > torch.tensor(n_skipped))[..., None]
@@ -105,7 +105,7 @@ class TrafficEngine:
         ]
 
     def noise_floor(self) -> float:
-        """Mean square error of positions that is noise of the measurement, m²."""
+        """Mean square error of positions due to measurement noise, m²."""
         variances = [noise_variance(s.x[:, :-1]) for s in self.sequences if s.n_samples > 4]
         weight = [s.n_samples * (s.n_agents - 1) for s in self.sequences if s.n_samples > 4]
         return float(np.average(variances, weights=weight)) if variances else float("nan")
@@ -141,7 +141,7 @@ class TrafficEngine:
         return torch.where(self.follows, difference, 0.0)
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` whitened residuals, the largest drawn in."""
+        """``(R, n)`` whitened residuals, with Huber's loss for large ones."""
         return huber_residuals(
             self.filter(self.deviations(system, rows))[:, self.compared], self.large
         )
@@ -200,7 +200,7 @@ class TrafficEngine:
         return torch.cat([speed.T for speed in columns], 1).T
 
     def linear(self, system: System, row: Tensor) -> LinearResponse:
-        """The linear response of a run, kept until another one is asked for."""
+        """The linear response of a run; the last one is cached."""
         cached = self._response
         if cached is not None and cached[0] is system and torch.equal(cached[1], row):
             return cached[2]
@@ -217,7 +217,7 @@ class TrafficEngine:
         return response
 
     def _columns(self, response: LinearResponse, displacement: Tensor) -> Tensor:
-        """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
+        """``(C, n)`` changes of the residuals by displacements ``(C, K, B, N)``."""
         difference = self.batch.x[..., 0] - response.states[..., 0]
         residual = self.filter(torch.where(self.follows, difference, 0.0))[self.compared]
         weight = weights_of(residual, self.large)
@@ -266,7 +266,7 @@ class TrafficEngine:
         return simulations
 
     def variables(self) -> list[Variable]:
-        """What deviations of vehicles may depend on."""
+        """The variables on which deviations of vehicles may depend."""
         return traffic_variables(self.smoothed)
 
     def individual(
@@ -293,13 +293,13 @@ class TrafficEngine:
         return self._columns(linear, linear.response(torch.stack(sources)))
 
     def of(self, sequences: list[Sequence]) -> TrafficEngine:
-        """An engine of other sequences, in the filter of this one."""
+        """An engine of other sequences, with the filter of this one."""
         engine = TrafficEngine(sequences, np.inf, None, np.inf)
         engine.filter = self.filter
         return engine
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
-        """Fit the filter to the residuals that a model leaves."""
+        """Fit the autoregressive filter to the residuals of a model."""
         shortest = int(self.batch.valid.any(-1).sum(0).min())
         order = min(ORDER, max(0, (shortest - 2) // 3))
         difference = self.deviations(system, row[None])[0]
@@ -307,8 +307,8 @@ class TrafficEngine:
 
 
 def huber_residuals(residual: Tensor, most: float = LARGE) -> Tensor:
-    """Residuals whose squares are Huber's loss: a vehicle that breaks down does not outweigh
-    all others.
+    """Residuals whose squares are Huber's loss, so that an outlying vehicle, such as one that breaks
+    down, does not dominate.
 
     Source: Huber 1964.
     """
@@ -346,7 +346,7 @@ def with_each_strength(
 
 
 def fastest(system: System, rows: Tensor) -> float:
-    """The shortest time constant of the states that terms own, s; infinite where none do."""
+    """The shortest time constant of the states of terms, s; infinite without such states."""
     factors = {
         f"terms.{i}.{name}": factor
         for i, term in enumerate(system.terms)
@@ -363,9 +363,9 @@ def fastest(system: System, rows: Tensor) -> float:
 def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:
     """Windows, and of each the number of samples after its start that are not compared.
 
-    What is compared are pieces of equal length that share their boundary sample; each is
-    preceded by the time in which a start is forgotten. Whole sequences are compared from their
-    start on.
+    The compared pieces have equal lengths and share their boundary samples. Each is preceded by
+    samples in which the influence of the start decays. Whole sequences are compared from their
+    start.
     """
     intervals = sequence.n_samples - 1
     if intervals < 1 or not math.isfinite(length):

@@ -1,13 +1,13 @@
-"""Traffic where drivers differ: every follower is simulated behind his own measured leader.
+"""Engine of lanes with random effects: followers are simulated behind their measured leaders.
 
-At the estimates of :mod:`nnode.population`, the deviations b of drivers and h of starts, a model f
-leaves of the measured positions y the residuals
+At the estimates of :mod:`nnode.population`, the deviations b of drivers and h of starts, the
+residuals of a model f for the measured positions y are
 
     V^(-1/2) (y - f(theta, b, h) + Z b + H h),    V = V0 + Z Omega Z' + H S H',
 
-V0 of pushes that last and of errors of measurement. Their sum of squares is that of generalised
-least squares. V, Z, H, b and h stay as they were estimated until the next estimate: all models of a
-diagnosis are compared in the same residuals.
+where V0 is the covariance of autocorrelated pushes and of measurement errors. Their sum of squares
+is that of generalised least squares. V, Z, H, b and h are fixed until the next estimate, so that
+all models of a diagnosis are compared with the same whitening.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from nnode.population.likelihood import Whitening, marginal
 from nnode.simulation.numpy import strides
 from nnode.simulation.rhs import side_by_side
 
-#: Change of a curve's scale by which derivatives are taken.
+#: Difference of a curve's scale for derivatives.
 SCALE = 1e-3
 
 
@@ -75,12 +75,12 @@ class FollowersEngine(TrafficEngine):
     Args:
         sequences: at least one, of the same sampling interval.
         clusters: ``(S,)`` of the sequences; None: each is one.
-        large: residuals beyond this count less.
-        like: an engine whose estimates hold here, whatever model is asked for; only deviations of
-            drivers and of starts are estimated.
+        large: threshold of Huber's loss.
+        like: an engine whose estimates are used for all models; only deviations of drivers and of
+            starts are estimated.
 
     Attributes:
-        population: what :meth:`fit_whitening` estimated last; None before.
+        population: the last estimate of :meth:`fit_whitening`; None before.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class FollowersEngine(TrafficEngine):
         self.unit = self.sequence
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` whitened residuals, the largest drawn in."""
+        """``(R, n)`` whitened residuals, with Huber's loss for large ones."""
         difference = self._away(system, rows)[0]
         return huber_residuals(self._whitened(difference.transpose(2, 1, 0)), self.large)
 
@@ -130,7 +130,7 @@ class FollowersEngine(TrafficEngine):
         return simulations
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
-        """``(K, n)`` derivatives of the residuals, by differences."""
+        """``(K, n)`` derivatives of the residuals, by finite differences."""
         _, curve = _parts(system)
         run = self._run_of(system, row)
         theta = run.model.at(row.numpy()[: len(run.model.names)])
@@ -183,7 +183,7 @@ class FollowersEngine(TrafficEngine):
         return self._moved(run, self._propagated(run, source))
 
     def of(self, sequences: list[Sequence]) -> FollowersEngine:
-        """An engine of other sequences, in which the estimates of this one hold."""
+        """An engine of other sequences, with the estimates of this one."""
         assert self.population is not None
         engine = FollowersEngine(sequences, large=np.inf, like=self)
         model = self.population.model
@@ -210,8 +210,9 @@ class FollowersEngine(TrafficEngine):
             self._take(fit_again(start, fixed, paths, fixed=self._like is not None))
 
     def fit_whitening_among(self, systems: list[System]) -> None:
-        """Estimate with each of some models, and keep what the best of them says, by Schwarz's
-        criterion: what a missing effect does would be taken for pushes that last, and hidden."""
+        """Estimate with each of some models, and keep the estimate with the best BIC. The variances
+        of a model that lacks an effect would attribute it to autocorrelated pushes, which would
+        hide it."""
         best, criterion = self, -np.inf
         for system in systems:
             trial = copy.copy(best)
@@ -225,8 +226,8 @@ class FollowersEngine(TrafficEngine):
         self._take(best.population)
 
     def drawn(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
-        """Engines of paths that a model would have had, with deviations of drivers, pushes and
-        errors of measurement as they were estimated under it: two draws of opposite signs."""
+        """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
+        errors as estimated under it: an antithetic pair of draws."""
         assert self.population is not None
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         paths = self._paths(self._longest(fixed, row[None]))
@@ -242,8 +243,8 @@ class FollowersEngine(TrafficEngine):
     # -- parts -----------------------------------------------------------------------------------
 
     def _paths(self, longest: float) -> Paths:
-        """The followers, for simulations of steps of at most so many s. Of a driver who belongs to
-        several clusters, nothing that they have in common is used: clusters are independent."""
+        """The followers, for simulations with steps of at most ``longest`` s. A driver in several
+        clusters counts as several drivers, because clusters must be independent."""
         key = strides(self.batch.dt, longest)
         if key not in self._paths_by_step:
             paths = paths_of(self.sequences, longest)
@@ -267,7 +268,7 @@ class FollowersEngine(TrafficEngine):
         population, start = self.population, np.zeros((len(model.paths.agent), model.starts))
         if population is None or len(population.model.random) != len(model.random):
             return np.zeros((0, 0)), start
-        # what other terms remember at the start is nothing to this model's
+        # initial memory states are not comparable between models with different terms
         same_starts = model.starts == population.model.starts
         shared = model.starts if same_starts else model.lane.order
         start[:, :shared] = population.estimate.start[:, :shared]
@@ -330,12 +331,12 @@ class FollowersEngine(TrafficEngine):
         return torch.from_numpy(white)[self._observed].T
 
     def _moved(self, run: _Run, columns: np.ndarray) -> Tensor:
-        """``(C, n)`` changes of the residuals by positions moved ``(F, K, C)``."""
+        """``(C, n)`` changes of the residuals by displacements ``(F, K, C)``."""
         white = self._whitened(-np.nan_to_num(columns).transpose(1, 0, 2))
         return torch.nan_to_num(white * run.weight)
 
     def _run_of(self, system: System, row: Tensor) -> _Run:
-        """A run, kept until another one is asked for."""
+        """A run of a model; the last one is cached."""
         cached = self._last_run
         if cached is not None and cached[0] is system and torch.equal(cached[1], row):
             return cached[2]
@@ -352,7 +353,7 @@ class FollowersEngine(TrafficEngine):
         return run
 
     def _propagated(self, run: _Run, source: np.ndarray) -> np.ndarray:
-        """``(F, K, C)`` positions moved by changes ``(W, K, C, F)`` of the first W rates."""
+        """``(F, K, C)`` displacements by changes ``(W, K, C, F)`` of the first W rates."""
         f, n_intervals, m, _ = run.after.shape
         source = source[:m]
         forcing = (source[:, 1:] + source[:, :-1]).transpose(1, 3, 0, 2)
@@ -379,7 +380,7 @@ class FollowersEngine(TrafficEngine):
         return model.system.scene(model.paths.batch)
 
     def _pushed(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
-        """What a curve adds to the highest rate in runs of it with several scales."""
+        """The push of a curve on the highest rate, in runs with several scales."""
         paths = model.paths
         scene = side_by_side(self._scene(model), len(scale))
 
@@ -413,7 +414,7 @@ def _state_of(
     ahead: np.ndarray,
     scene: Scene,
 ) -> State:
-    """What terms see of every follower and of the one or two vehicles ahead of him.
+    """The state of every follower with the one or two vehicles ahead, for terms.
 
     Args:
         time: s. x, speed: ``(L, F)`` of the followers, m and m/s. ahead: ``(L, 4, F)``.

@@ -21,7 +21,7 @@ from nnode.discover.report.figures.marks import (
     coefficient_intervals,
     flexible_curve,
     place_curves,
-    sealed_costs,
+    confirmation_costs,
 )
 from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.discover.report.files import amount, individual, interval
@@ -73,7 +73,7 @@ def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions)
             )
         )
     if d.sealed:
-        drawn.gap.append(_sealed(outcome))
+        drawn.gap.append(_confirmation_errors(outcome))
     if inputs.faulty:
         drawn.faults.append(_faults(inputs))
     drawn.places += _places(outcome)
@@ -113,21 +113,21 @@ def figure(
     return by_name[which]
 
 
-def _sealed(outcome: DiagnosisOutcome) -> FigureBlock:
+def _confirmation_errors(outcome: DiagnosisOutcome) -> FigureBlock:
     d = outcome.diagnosis
     columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
     names, before, after = columns
     if not d.effects:
         return FigureBlock(
             "sealed",
-            sealed_costs([str(n) for n in names], before, None, d.gap.noise_floor),
+            confirmation_costs([str(n) for n in names], before, None, d.gap.noise_floor),
             "Mean square error of every sealed sequence.",
             f"Marks of {len(names)} sequences, from the largest error to the smallest.",
         )
     better = sum(a < b for a, b in zip(after, before, strict=True))
     return FigureBlock(
         "sealed",
-        sealed_costs([str(n) for n in names], before, after, d.gap.noise_floor),
+        confirmation_costs([str(n) for n in names], before, after, d.gap.noise_floor),
         f"Mean square error of every sealed sequence. {better} of {len(names)} errors are smaller "
         "with effects.",
         f"Paired marks of {len(names)} sequences; {better} lie lower after than before.",

@@ -150,11 +150,11 @@ def _laws(d: Diagnosis) -> list[Block]:
 
 def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
     """The errors on sealed sequences: one definition for the whole page."""
-    sealed, opened = len(d.split.get("sealed", [])), len(d.split.get("open", []))
+    n_confirmation, n_exploration = len(d.split.get("sealed", [])), len(d.split.get("open", []))
     return [
         Heading("The error on sealed sequences"),
         Text(
-            f"{sealed} of {sealed + opened} sequences were sealed: they were held back, and "
+            f"{n_confirmation} of {n_confirmation + n_exploration} sequences were sealed: they were held back, and "
             f"neither calibration nor search used them. {d.gap.definition} {_gap_words(d)}".strip()
         ),
         tables.gap_table(d),
@@ -204,7 +204,7 @@ def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
         ]
     blocks += drawn.gap
     if d.sealed:
-        blocks.append(tables.sealed_table(d))
+        blocks.append(tables.confirmation_table(d))
     return [Heading("How it was decided"), *blocks] if blocks else []
 
 

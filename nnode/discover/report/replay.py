@@ -52,7 +52,7 @@ def scenes(outcome: DiagnosisOutcome) -> list[Scene]:
 
 def player(outcome: DiagnosisOutcome, replayed: list[Scene]) -> ReplayBlock:
     """The player of :func:`scenes`."""
-    sealed = len(outcome.confirmation)
+    n_confirmation = len(outcome.confirmation)
     shaded = zones(outcome.diagnosis)
     named = f" Shaded: {', '.join(zone.label for zone in shaded)}." if shaded else ""
     return ReplayBlock(
@@ -67,7 +67,7 @@ def player(outcome: DiagnosisOutcome, replayed: list[Scene]) -> ReplayBlock:
         f"Player of {len(replayed)} sealed sequences: agents as measured, and as simulated by "
         f"{len(replayed[0].simulated)} models.",
         shaded,
-        sealed,
+        n_confirmation,
     )
 
 

@@ -264,7 +264,7 @@ def gap_table(d: Diagnosis) -> TableBlock:
     )
 
 
-def sealed_table(d: Diagnosis) -> TableBlock:
+def confirmation_table(d: Diagnosis) -> TableBlock:
     """The errors of the single sealed sequences."""
     rows = [
         {

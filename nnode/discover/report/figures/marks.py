@@ -101,7 +101,7 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
     return figure
 
 
-def sealed_costs(
+def confirmation_costs(
     names: Sequence[str], before: Sequence[float], after: Sequence[float] | None, floor: float
 ) -> Figure:
     """Mean square error of every sealed sequence, before and after, m².
