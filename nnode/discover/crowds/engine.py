@@ -85,20 +85,20 @@ class CrowdEngine:
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)``: whitened differences, measured minus simulated, of R runs of one model."""
         differences = self._differences(system, rows)
-        self._settled(system, rows[0])
+        self._fitted_whitening(system, rows[0])
         flat = differences.reshape(len(rows), *self._matrix.shape[::2], 1)
         return (self._matrix @ flat).reshape(len(rows), -1)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions, without what start states explain."""
         window = self.windows.person[:, 0]
-        squares = (self._away(system, row) ** 2).sum(-1)
+        squares = (self._projected_errors(system, row) ** 2).sum(-1)
         n_samples = squares.shape[1]
         return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """Windows one after the other, each from the start state that suits the model best."""
-        difference, length = self._away(system, row), self.windows.length
+        difference, length = self._projected_errors(system, row), self.windows.length
         simulations: list[Simulation | None] = [None] * len(self.sequences)
         for i in self.windows.used:
             s, first, stride = self.sequences[i], *self.windows.compared[i]
@@ -120,9 +120,9 @@ class CrowdEngine:
             simulations[i] = Simulation(part, x, restart=length)
         return simulations
 
-    def _away(self, system: System, row: Tensor) -> np.ndarray:
+    def _projected_errors(self, system: System, row: Tensor) -> np.ndarray:
         """``(P, L, 2)`` m: measured minus simulated positions, without what starts explain."""
-        whitening = self._settled(system, row)
+        whitening = self._fitted_whitening(system, row)
         projected: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
         return projected.reshape(len(projected), -1, 2)
 
@@ -170,7 +170,7 @@ class CrowdEngine:
 
     def linearised(self, system: System, row: Tensor) -> RunAlone:
         """A model along its own paths; the response is that of the model it was settled at."""
-        self._settled(system, row)
+        self._fitted_whitening(system, row)
         if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
             self._run = self._simulated(system, row)
         return self._run[-1]
@@ -239,7 +239,7 @@ class CrowdEngine:
 
     # -- parts -----------------------------------------------------------------------------
 
-    def _settled(self, system: System, row: Tensor) -> Whitening:
+    def _fitted_whitening(self, system: System, row: Tensor) -> Whitening:
         if self._whitening is None:
             self.fit_whitening(system, row)
         assert self._whitening is not None

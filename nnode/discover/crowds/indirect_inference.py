@@ -1,10 +1,9 @@
-"""What a crowd's calibration is off by, as simulations of the calibrated crowd show it.
+"""Bias correction of a crowd's calibration by indirect inference.
 
-People are simulated among the measured paths of the others. But the others have reacted to what
-a person really did, disturbances included, and a window's start is known by smoothing alone:
-coefficients come out a little too large or too small. How much is seen where the truth is known:
-the calibrated crowd is simulated, everybody reacting to everybody, disturbed as the measured
-people were, measured as they were, and calibrated again.
+People are simulated among the measured paths of the others. But the others have reacted to the
+person's actual path, including disturbances, and the starts of windows are smoothed. Both bias the
+coefficients slightly. The bias is estimated by simulation: the calibrated crowd is simulated with
+all interactions, with the disturbances and measurement errors of the data, and calibrated again.
 
 Source: Gouriéroux, Monfort & Renault 1993 (indirect inference); Wu 1986 (signs of residuals).
 """
@@ -30,16 +29,15 @@ from nnode.simulation.numpy import simulated
 
 log = logging.getLogger(__name__)
 
-#: Crowds that are simulated, and steps of the simulation in a sampling interval.
+#: Number of simulated crowds, and simulation steps per sampling interval.
 CROWDS, STEPS = 3, 2
 
 
 def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
-    """A calibrated model without what simulations of it are off by; with what is uncertain in
-    that.
+    """A calibrated model, corrected for its bias, with the standard errors of the correction.
 
-    Only as many simulations count as come to an end; with fewer than two the fit is returned as
-    it is. Residuals and derivatives remain those of the calibration.
+    Simulations that diverge are ignored; with fewer than two others, the fit is returned unchanged.
+    Residuals and derivatives remain those of the calibration.
 
     Args:
         fit: in the residuals of a :class:`CrowdEngine` of the sequences.
@@ -92,7 +90,7 @@ def _disturbances(system: System, batch: Batch, paths: list[Path]) -> list[np.nd
 
 @torch.no_grad()
 def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np.ndarray]:
-    """``(K, N, 2)`` positions of each sequence's people, all reacting to each other, m."""
+    """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
     interacting = _with(system, "simulated")
     scene, y = interacting.scene(batch), interacting.initial(batch)
     push = torch.zeros(batch.n_samples, *y.shape, dtype=torch.float64)

@@ -1,5 +1,4 @@
-"""What follows from a search: coefficients, what is absent, what could not be tested, what is
-left."""
+"""Conclusions of a selection: coefficients, bounds of absent effects, unexplained structure."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
     """An accepted effect with its coefficients in a fit.
 
     Args:
-        confirmed: p-value of the sealed clusters.
+        confirmed: p-value of the confirmation clusters.
     """
     effect = step.chosen.score.effect
     coefficients = _coefficients(engine, fit, step)
@@ -78,7 +77,7 @@ def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profil
 
 
 def named_agents(estimate: Individuals, confirmed: float, order: int) -> NamedEffect:
-    """An individual effect that was confirmed, in a law of an order."""
+    """A confirmed individual effect, in a law of an order."""
     effect = estimate.effect
     coefficients = {}
     for name, strength in effect.strengths.items():
@@ -133,8 +132,7 @@ def _where(
 
 
 def absences(search: Search, power: PowerSimulation) -> list[Absence]:
-    """What the final screening says of the effects that were not found, by the power of the whole
-    way."""
+    """Bounds of the effects that were not selected, by the power of the whole procedure."""
     return [_absence(score, power) for score in search.scores]
 
 
@@ -142,14 +140,14 @@ def _absence(score: Score, power: PowerSimulation) -> Absence:
     effect = score.effect
     if not effect.strengths:
         return _without_strength(score, power)
-    # the strength that is known best in units of what is plausible
+    # the strength with the smallest error relative to its expected size
     name = min(effect.strengths, key=lambda n: _relative(effect, n, score.error.get(n, 0.0)))
     strength, k = effect.strengths[name], list(effect.strengths).index(name)
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
     estimable = error > 0 and math.isfinite(error) and bool(score.evidence)
     expected, detectable, smallest_tested = strength.expected, math.inf, 0.0
     if estimable and effect.remembers():
-        # what was tried at a size says nothing of smaller ones
+        # a trace of finite strength does not apply to smaller strengths
         detectable_sizes = [
             max(evidence.size, power.detectable(score, evidence, max(evidence.size, expected)))
             for evidence in score.evidence
@@ -181,7 +179,7 @@ def _absence(score: Score, power: PowerSimulation) -> Absence:
 
 
 def _without_strength(score: Score, power: PowerSimulation) -> Absence:
-    """Of an effect that is there or not: the weakest of its settings that would be named."""
+    """The bound of an effect without a strength: the weakest setting that would be named."""
     effect = score.effect
     name, setting = next(iter(effect.settings.items()))
     detectable_settings = [
@@ -207,7 +205,7 @@ def _information(evidence: Evidence) -> float:
 
 
 def agents_absent(estimate: Individuals, alpha: float, enough_clusters: bool) -> Absence:
-    """What the open clusters say of numbers that nobody was found to have of his own."""
+    """The bound of differences between agents that were not significant."""
     (name,) = estimate.effect.strengths
     strength = estimate.effect.strengths[name]
     detectable, (_, high) = estimate.detectable(alpha), estimate.interval()
@@ -233,11 +231,11 @@ def _relative(effect: type[Effect], name: str, error: float) -> float:
 
 
 def places(curves: list[Curves], excess: float) -> list[Place]:
-    """Where each curve is largest of where it stands out, the one that explains most first.
+    """The interval of each significant curve around its largest height, in the curves' order.
 
     Args:
-        found: with what they remove.
-        excess: share of the squared errors that is not noise of the measurement.
+        curves: with the shares that they remove.
+        excess: share of the squared errors that is not measurement noise.
     """
     result = []
     number = sum(len(curve.heights) for curve in curves)
@@ -279,7 +277,7 @@ def places(curves: list[Curves], excess: float) -> list[Place]:
 
 
 def structure(curves: list[Curves]) -> Structure:
-    """What is left, by the curves that are significant."""
+    """Unexplained structure, described by the significant curves."""
     best = curves[0]
     knots = np.array(best.variable.knots)
     return Structure(

@@ -159,7 +159,7 @@ class TrafficEngine:
         response; the change by the effect as a whole where it has no strength."""
         response = self.linear(system, row)
         if effect.remembers():
-            return self._whole(response, effect, probe)
+            return self._finite_change(response, effect, probe)
         base = response.rates(response.system)
         sources = [
             (response.rates(changed) - base) / step
@@ -167,9 +167,11 @@ class TrafficEngine:
         ]
         return self._columns(response, response.response(torch.stack(sources)))
 
-    def _whole(self, response: LinearResponse, effect: type[Effect], probe: Probe) -> Tensor:
-        """``(1, n)`` change of the residuals by an effect of finite strength; zero where vehicles
-        would be moved by more than all the road that was seen: that is no small change."""
+    def _finite_change(
+        self, response: LinearResponse, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(1, n)`` change of the residuals by an effect of finite strength; zero if it moves
+        vehicles by more than the observed road, because it is then not small."""
         changed, amount = with_all_strengths(response.system, effect, probe)
         with torch.no_grad():
             x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
@@ -226,12 +228,12 @@ class TrafficEngine:
         )[self.compared]
         return torch.nan_to_num(white_columns.mul_(weight[:, None])).T
 
-    def near(self, system: System) -> System:
-        """A copy whose law is fitted to the smoothed rates: simulations started from there do
-        not end in a far minimum. The regression itself is biased by noise, as a start it may."""
+    def regression_start(self, system: System) -> System:
+        """A copy whose law is fitted to the smoothed rates by regression. The regression is biased
+        by noise, but calibrations that start there avoid distant local minima."""
         fitted, batch = copy.deepcopy(system), self.smoothed
         if fitted.memory:
-            return fitted  # speeds alone do not tell of states that nobody measures
+            return fitted  # memory states are not measured
         vector = ParameterVector(fitted)
         low, high = vector.bounds
         states, measured_rates = batch.x, batch.v[..., 0]
@@ -307,7 +309,7 @@ class TrafficEngine:
 
 
 def huber_residuals(residual: Tensor, most: float = LARGE) -> Tensor:
-    """Residuals whose squares are Huber's loss, so that an outlying vehicle, such as one that breaks
+    """Residuals whose squares are Huber's loss, so that an outlier, such as a vehicle that breaks
     down, does not dominate.
 
     Source: Huber 1964.
@@ -326,8 +328,8 @@ def weights_of(residual: Tensor, most: float) -> Tensor:
 
 
 def with_all_strengths(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
-    """A model with an effect whose strengths are all varied by a probe's steps, and by how much;
-    by 1 where it varies none."""
+    """A model with an effect whose strengths are all changed by a probe's steps, and the size of
+    the step; 1 if the probe changes none."""
     values, amount = dict(probe.options), 1.0
     for name, step in probe.steps.items():
         values[name], amount = effect.strengths[name].neutral + step, step
@@ -337,8 +339,8 @@ def with_all_strengths(system: System, effect: type[Effect], probe: Probe) -> tu
 def with_each_strength(
     system: System, effect: type[Effect], probe: Probe
 ) -> list[tuple[System, float]]:
-    """A model with an effect of which one strength at a time is varied by a probe's step, and by
-    how much; as it is, by 1, where the probe varies none."""
+    """Models with an effect of which one strength at a time is changed by a probe's step, with the
+    size of the step. If the probe changes none: the effect itself, and 1."""
     if not probe.steps:
         return [with_all_strengths(system, effect, probe)]
     probes = [replace(probe, steps={name: step}) for name, step in probe.steps.items()]

@@ -108,7 +108,7 @@ class FollowersEngine(TrafficEngine):
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` whitened residuals, with Huber's loss for large ones."""
-        difference = self._away(system, rows)[0]
+        difference = self._pseudo_residuals(system, rows)[0]
         return huber_residuals(self._whitened(difference.transpose(2, 1, 0)), self.large)
 
     def squares(self, system: System, row: Tensor) -> Squares:
@@ -116,11 +116,11 @@ class FollowersEngine(TrafficEngine):
         of drivers and starts that are most likely under this model."""
         compared = self._observed.numpy() & (np.arange(self._observed.shape[1]) > 0)
         sequence = np.repeat(self._paths(STEP[2]).sequence, compared.sum(1))
-        return Squares(self._left(system, row)[compared] ** 2, sequence)
+        return Squares(self._position_errors(system, row)[compared] ** 2, sequence)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """The followers of each sequence, with these deviations."""
-        errors, paths = self._left(system, row), self._paths(STEP[2])
+        """The simulated followers of each sequence, with the deviations of :meth:`squares`."""
+        errors, paths = self._position_errors(system, row), self._paths(STEP[2])
         simulations: list[Simulation | None] = []
         for b, s in enumerate(self.sequences):
             x = np.full_like(s.x[..., 0], np.nan)
@@ -145,7 +145,7 @@ class FollowersEngine(TrafficEngine):
             higher, lower = self._simulated(system, sides)[1][:, 0].transpose(1, 2, 0)
             scale = ((higher - lower) / (2 * SCALE))[..., None]
             columns = np.concatenate([columns, scale], -1)
-        return self._moved(run, columns)
+        return self._residual_changes(run, columns)
 
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
@@ -155,13 +155,13 @@ class FollowersEngine(TrafficEngine):
         run, changes = self._run_of(system, row), []
         if effect.remembers():
             changed, amount = with_all_strengths(run.system, effect, probe)
-            return self._moved(run, self._finite(run, changed)[..., None] / amount)
+            return self._residual_changes(run, self._displacement(run, changed)[..., None] / amount)
         base = run.model.rates(run.parameters, run.states)
         for changed, size in with_each_strength(run.system, effect, probe):
             model = self._model(changed, ParameterVector(changed).row)
             parameters = model.spread(model.start, self._deviations(model)[0])
             changes.append((model.rates(parameters, run.states) - base) / size)
-        return self._moved(run, self._propagated(run, np.stack(changes, 2)))
+        return self._residual_changes(run, self._propagate(run, np.stack(changes, 2)))
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
@@ -180,7 +180,7 @@ class FollowersEngine(TrafficEngine):
         speeds = [rate[:, 0, 0].reshape(k, f).numpy() for rate in rates(state)]
         source = np.zeros((run.model.lane.order, k, len(speeds), f))
         source[-1] = np.stack(speeds, 1)
-        return self._moved(run, self._propagated(run, source))
+        return self._residual_changes(run, self._propagate(run, source))
 
     def of(self, sequences: list[Sequence]) -> FollowersEngine:
         """An engine of other sequences, with the estimates of this one."""
@@ -205,9 +205,9 @@ class FollowersEngine(TrafficEngine):
         if start is None and self._like is not None:
             start = self._like.population
         if start is None:
-            self._take(fit_drivers(fixed, paths, pairs=0))
+            self._set_population(fit_drivers(fixed, paths, pairs=0))
         else:
-            self._take(fit_again(start, fixed, paths, fixed=self._like is not None))
+            self._set_population(fit_again(start, fixed, paths, fixed=self._like is not None))
 
     def fit_whitening_among(self, systems: list[System]) -> None:
         """Estimate with each of some models, and keep the estimate with the best BIC. The variances
@@ -223,7 +223,7 @@ class FollowersEngine(TrafficEngine):
             if (likelihood := trial.population.marginal.loglik - penalty) > criterion:
                 best, criterion = trial, likelihood
         assert best.population is not None
-        self._take(best.population)
+        self._set_population(best.population)
 
     def drawn(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
@@ -236,7 +236,7 @@ class FollowersEngine(TrafficEngine):
             engine = copy.copy(self)
             paths = refitted.model.drawn(refitted.estimate, draw)
             engine._paths_by_step = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
-            engine._take(fit_again(refitted, fixed, paths, fixed=True))
+            engine._set_population(fit_again(refitted, fixed, paths, fixed=True))
             engines.append(engine)
         return engines
 
@@ -281,10 +281,12 @@ class FollowersEngine(TrafficEngine):
         agents, start = self._deviations(model)
         number, initial = len(model.names), start.T
         theta = [model.spread(model.at(row.numpy()[:number]), agents) for row in rows]
-        pushed = None if curve is None else self._pushed(model, curve, rows[:, -1])
+        pushed = None if curve is None else self._curve_push(model, curve, rows[:, -1])
         return model, model.simulate(np.stack(theta), np.stack([initial] * len(rows)), pushed)
 
-    def _away(self, system: System, rows: Tensor) -> tuple[np.ndarray, Followers, np.ndarray]:
+    def _pseudo_residuals(
+        self, system: System, rows: Tensor
+    ) -> tuple[np.ndarray, Followers, np.ndarray]:
         """``(R, F, K)`` y - f + Z b + H h; the model, and its states ``(K, M, R, F)``."""
         model, states = self._simulated(system, rows)
         difference = model.paths.x - states[:, 0].transpose(1, 2, 0)
@@ -301,7 +303,7 @@ class FollowersEngine(TrafficEngine):
                 )
         return difference, model, states
 
-    def _take(self, population: Population) -> None:
+    def _set_population(self, population: Population) -> None:
         estimate, variances = population.estimate, population.estimate.variances
         self.population = population
         self._whitening = Whitening(
@@ -309,9 +311,9 @@ class FollowersEngine(TrafficEngine):
         )
         self._last_run = None
 
-    def _left(self, system: System, row: Tensor) -> np.ndarray:
+    def _position_errors(self, system: System, row: Tensor) -> np.ndarray:
         """``(F, K)`` errors of positions, m, with deviations by generalised least squares."""
-        difference, model, _ = self._away(system, row[None])
+        difference, model, _ = self._pseudo_residuals(system, row[None])
         errors: np.ndarray = difference[0]
         if self._whitening is None or self.population is None:
             return errors
@@ -330,7 +332,7 @@ class FollowersEngine(TrafficEngine):
         white = columns if self._whitening is None else self._whitening(columns)
         return torch.from_numpy(white)[self._observed].T
 
-    def _moved(self, run: _Run, columns: np.ndarray) -> Tensor:
+    def _residual_changes(self, run: _Run, columns: np.ndarray) -> Tensor:
         """``(C, n)`` changes of the residuals by displacements ``(F, K, C)``."""
         white = self._whitened(-np.nan_to_num(columns).transpose(1, 0, 2))
         return torch.nan_to_num(white * run.weight)
@@ -340,7 +342,7 @@ class FollowersEngine(TrafficEngine):
         cached = self._last_run
         if cached is not None and cached[0] is system and torch.equal(cached[1], row):
             return cached[2]
-        difference, model, states = self._away(system, row[None])
+        difference, model, states = self._pseudo_residuals(system, row[None])
         plain, _ = _parts(system)
         fixed = ParameterVector(copy.deepcopy(plain)).fill_(row[: len(model.names)])
         parameters = model.spread(
@@ -352,7 +354,7 @@ class FollowersEngine(TrafficEngine):
         self._last_run = system, row.clone(), run
         return run
 
-    def _propagated(self, run: _Run, source: np.ndarray) -> np.ndarray:
+    def _propagate(self, run: _Run, source: np.ndarray) -> np.ndarray:
         """``(F, K, C)`` displacements by changes ``(W, K, C, F)`` of the first W rates."""
         f, n_intervals, m, _ = run.after.shape
         source = source[:m]
@@ -364,22 +366,21 @@ class FollowersEngine(TrafficEngine):
             positions[k + 1] = state[:, 0]
         return positions.transpose(1, 0, 2)
 
-    def _finite(self, run: _Run, changed: System) -> np.ndarray:
-        """``(F, K)`` by how much a changed model moves positions, m; zero where that is more than
-        all the road that was seen: that is no small change."""
+    def _displacement(self, run: _Run, changed: System) -> np.ndarray:
+        """``(F, K)`` displacements by a changed model, m; zero if they exceed the observed road,
+        because the change is then not small."""
         x = self._simulated(changed, ParameterVector(changed).row[None])[1][:, 0, 0]
         paths = run.model.paths
         displacement: np.ndarray = (x - run.states[:, 0]).T
-        if not float(np.abs(displacement[paths.observed]).max()) <= float(
-            np.ptp(paths.x[paths.observed])
-        ):
+        largest, road = np.abs(displacement[paths.observed]).max(), np.ptp(paths.x[paths.observed])
+        if not largest <= road:
             return np.zeros_like(displacement)
         return displacement
 
     def _scene(self, model: Followers) -> Scene:
         return model.system.scene(model.paths.batch)
 
-    def _pushed(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
+    def _curve_push(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
         """The push of a curve on the highest rate, in runs with several scales."""
         paths = model.paths
         scene = side_by_side(self._scene(model), len(scale))

@@ -1,4 +1,4 @@
-"""Residuals without memory: an autoregressive filter along time and along the platoon."""
+"""Whitening of platoons: an autoregressive filter along time and along the platoon."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from nnode.discover.rules import rules
 
 @dataclass
 class PlatoonFilter:
-    """What the past and the vehicle ahead tell of a residual, and how large the rest is.
+    """An autoregressive filter with the vehicle's own past and the vehicle ahead.
 
-    The rest is e_i(t) - sum_k own_k e_i(t - k) - sum_k ahead_k e_{i+1}(t - k), divided by its
-    standard deviation; samples before the first count as zero, and so do the leader's.
+    The innovation is e_i(t) - sum_k own_k e_i(t - k) - sum_k ahead_k e_{i+1}(t - k), divided by its
+    standard deviation. Samples before the first, and those of the leader, count as zero.
 
     Attributes:
-        own: ``(p,)`` weights of the vehicle's own p past samples.
+        own: ``(p,)`` weights of the vehicle's p past samples.
         ahead: ``(p + 1,)`` weights of the vehicle ahead, the present sample first.
-        scale: standard deviation of the rest, m.
+        scale: standard deviation of the innovations, m.
     """
 
     own: np.ndarray
@@ -35,10 +35,10 @@ class PlatoonFilter:
 
     @classmethod
     def fitted(cls, residual: Tensor, valid: Tensor, order: int) -> PlatoonFilter:
-        """The filter with the least mean square of the rest.
+        """The filter with the smallest mean square of the innovations.
 
-        What lasts is what is looked for: each vehicle's mean is taken out first, or the filter
-        would take it for noise with a long memory and take it out of the data.
+        The filter is fitted to residuals without each vehicle's mean. Otherwise it would absorb
+        constant offsets, which are what effects produce.
 
         Args:
             residual: ``(K, B, N)`` m; 0 where not valid.

@@ -1,4 +1,4 @@
-"""How much of a deviation depends on each variable: curves without a formula."""
+"""Nonparametric curves of the deviations over each variable."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from nnode.errors import SimulationError
 from nnode.model.system import System
 from nnode.model.term import State
 
-#: A curve may bend about so many times; several are tried.
+#: Approximate numbers of bends of a curve, which set the strengths of smoothing.
 BENDS = (2, 5, 12)
-#: Heights are drawn to zero by this share of their mean information.
+#: Ridge of the heights, as a share of their mean information.
 RIDGE = 1e-3
-#: Sign flips that p-values of curves come from: there are many curves.
+#: Number of sign flips of curves' p-values; it is large because there are many curves.
 FLIPS = 7999
-#: At most so many curves are calibrated with the model, those that predict best.
+#: Largest number of curves that are calibrated with the model, the best first.
 MOST = 6
-#: A share of the knowledge of a height that is none, but for rounding.
+#: Ridge against rounding, as a share of the total information.
 UNKNOWN = 1e-9
-#: Waves that are looked at together.
+#: Number of waves that are fitted at once.
 WAVES = 16
 
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
-    """``(n, M)`` changes of the residuals per unit of the curve's weights."""
+    """``(n, M)`` derivatives of the residuals by the curve's coefficients."""
 
     def rates(state: State) -> list[Tensor]:
         weights, direction = variable.weights(state), variable.direction(state)
@@ -49,9 +49,7 @@ def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
 
 
 def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -> list[Curves]:
-    """The best curve or wave of every variable, the one that explains most first.
-
-    They are kept with the fit, which is looked at more than once.
+    """The best curve or wave of every variable, ordered by decreasing gain; cached in the fit.
 
     Args:
         seed: of the sign flips, see :mod:`nnode.discover.statistics.score`.
@@ -91,11 +89,11 @@ class _CurveFits:
     """All curves of one variable.
 
     Args:
-        bias: ``(G, M)`` of the scores of a curve's weights.
+        bias: ``(G, M)`` bias of the scores of a curve's coefficients.
 
     Attributes:
-        squares: per kind of curve ``(F,)`` what it explains in the data and under sign flips:
-            of a curve one per strength of smoothing, of waves the largest of all.
+        squares: per kind of curve ``(F,)`` explained squares in the data and under sign flips: one
+            kind per strength of smoothing, or the best of all waves.
     """
 
     def __init__(
@@ -112,19 +110,19 @@ class _CurveFits:
             self._fit_waves()
         else:
             self._fit_smooth_curves()
-        # all variables' columns at once would fill the memory
+        # the columns of all variables would need too much memory
         self.grams = grams(self.z, engine.cluster)
         del self.z
 
     def _null_scores(self, variable: Variable) -> tuple[np.ndarray, np.ndarray]:
-        """Columns of a variable's weights, and their sums ``(F, M)`` under sign flips."""
+        """Columns of a variable's coefficients, and their scores ``(F, M)`` under sign flips."""
         columns = columns_of(self.engine, self.fit, variable)
         self.z = self.screen.adjusted(columns)
         parts = self.screen.parts(self.z, self.engine.cluster) - self.bias
         return columns, self.screen.flipped(parts)
 
     def _store_scores(self, columns: np.ndarray) -> None:
-        """Keep what is said of the weights with these columns."""
+        """Store the scores of the coefficients with these columns."""
         self.parts = sums(self.z, self.engine.cluster, self.fit.residual) - self.bias
         self.absorbed = np.linalg.lstsq(self.fit.jacobian, columns, rcond=1e-9)[0]
 
@@ -143,7 +141,7 @@ class _CurveFits:
             self.squares.append((total.T * solved).sum(0))
 
     def _fit_waves(self) -> None:
-        """Some at a time: there may be many, and only the best one is kept."""
+        """Fit waves in blocks, because there may be many, and keep the best one."""
         lengths, best = self.variable.lengths, 0
         largest, most = np.full(0, -np.inf), -np.inf
         for first in range(0, len(lengths), WAVES):
@@ -159,7 +157,7 @@ class _CurveFits:
         self.penalties = [np.zeros((2, 2))]
 
     def _squares(self, total: np.ndarray) -> np.ndarray:
-        """``(F, waves)`` what waves explain under sign flips, of their sums ``(F, 2 waves)``."""
+        """``(F, waves)`` explained squares under sign flips, from the scores ``(F, 2 waves)``."""
         sine, cosine = self.z[:, ::2], self.z[:, 1::2]
         a, b = (sine**2).sum(0), (sine * cosine).sum(0)
         c = (cosine**2).sum(0)
@@ -169,11 +167,11 @@ class _CurveFits:
         return explained
 
     def best(self, before: np.ndarray, p_value: float) -> Curves:
-        """With the smoothing that predicts best.
+        """The curve with the smoothing that predicts best.
 
         Args:
             before: ``(G,)`` held-out costs without a curve.
-            p_value: with regard to all variables.
+            p_value: corrected for all variables.
         """
         label = self.engine.cluster
         plain = sums(self.fit.residual**2, label)
@@ -182,7 +180,7 @@ class _CurveFits:
         whole, total = gram.sum(0), score.sum(0)
         change, penalty = np.full(count, np.inf), self.penalties[0]
         for penalised in self.penalties:
-            # what one cluster alone knows of cannot be predicted by the others
+            # a direction that only one cluster identifies cannot be predicted by the others
             penalised = penalised + UNKNOWN * np.trace(whole) * np.eye(number)
             heights = np.linalg.solve(whole - gram + penalised, (total - score)[..., None])[..., 0]
             new = np.einsum("sm,smn,sn->s", heights, gram, heights) - 2 * (heights * score).sum(1)
@@ -209,7 +207,7 @@ class _CurveFits:
 
 
 def with_curve(fit: Fit, curve: Curves) -> System:
-    """A model with a curve as one more term, its own parameters moved to make room for it."""
+    """A model with a curve as one more term, and its parameters changed accordingly."""
     extended = copy.deepcopy(fit.system)
     vector = ParameterVector(extended)
     vector.fill_(np.clip(fit.row + curve.shift, *vector.bounds))
@@ -220,10 +218,9 @@ def with_curve(fit: Fit, curve: Curves) -> System:
 def significant_curves(
     engine: Engine, fit: Fit, candidates: list[Curves], alpha: float
 ) -> list[Curves]:
-    """The curves that are no chance at probability ``alpha``, with what they remove.
+    """The curves that are significant at level ``alpha``, with the shares that they remove.
 
-    The linear response overshoots where a curve is strong: its scale is calibrated with the
-    model.
+    The linear response overshoots if a curve is strong, so its scale is calibrated with the model.
     """
     before = square_of(engine, fit.system)
     significant: list[Curves] = []

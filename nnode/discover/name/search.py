@@ -75,9 +75,9 @@ def initial_fit(engine: Engine, system: System) -> Fit | None:
     """A model calibrated to the engine's residuals with their present whitening, from the better of
     two starts: its own parameters, and a regression on the measured rates. None if the simulations
     of both diverge."""
-    near_rates = getattr(engine, "near", None)
+    regression = getattr(engine, "regression_start", None)
     fits = []
-    for start in (copy.deepcopy(system), *([] if near_rates is None else [near_rates(system)])):
+    for start in (copy.deepcopy(system), *([] if regression is None else [regression(system)])):
         try:
             fits.append(refine(engine, start, tolerance=ROUGH))
         except SimulationError:

@@ -19,9 +19,9 @@ from nnode.discover.report.figures.maps import (
 )
 from nnode.discover.report.figures.marks import (
     coefficient_intervals,
+    confirmation_costs,
     flexible_curve,
     place_curves,
-    confirmation_costs,
 )
 from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.discover.report.files import amount, individual, interval

@@ -154,8 +154,9 @@ def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
     return [
         Heading("The error on sealed sequences"),
         Text(
-            f"{n_confirmation} of {n_confirmation + n_exploration} sequences were sealed: they were held back, and "
-            f"neither calibration nor search used them. {d.gap.definition} {_gap_words(d)}".strip()
+            f"{n_confirmation} of {n_confirmation + n_exploration} sequences were sealed: they "
+            "were held back, and neither calibration nor search used them. "
+            f"{d.gap.definition} {_gap_words(d)}".strip()
         ),
         tables.gap_table(d),
     ]

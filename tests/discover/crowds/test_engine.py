@@ -165,7 +165,7 @@ def test_somebody_who_jumps_counts_little(plain: list[Sequence]) -> None:
     x[20:, 3] += 0.6
     found = CrowdEngine([replace(plain[0], x=x), *plain[1:]])
     found.fit_whitening(model(), ROW)
-    weight = found._settled(model(), ROW).weight
+    weight = found._fitted_whitening(model(), ROW).weight
     place = {(int(w), int(i)): k for k, (w, i) in enumerate(found.windows.person)}
     assert weight[place[1, 3]] < 0.1
     assert np.median(weight) > 0.8

@@ -166,5 +166,5 @@ def test_a_start_near_the_measured_accelerations() -> None:
     system = model("helly")
     engine = TrafficEngine(platoons(number=4, noise=0.01))
     before = engine.squares(system, ParameterVector(system).row).means().mean()
-    found = engine.near(system)
+    found = engine.regression_start(system)
     assert engine.squares(found, ParameterVector(found).row).means().mean() < before
