@@ -1,4 +1,4 @@
-"""The residuals of models of crowds, on short windows of every person's path."""
+"""Engine of crowds: residuals on short windows of every person's path."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from nnode.model.system import Crowd, System
 from nnode.model.term import State
 from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
 
-#: A simulated person is never further than this from the measured one, m: contacts may throw
-#: somebody far away, and the rest of the run still counts.
+#: Largest difference between simulated and measured positions, m. Differences are clipped because
+#: contact forces may throw a person far away.
 LIMIT = 3.0
-#: Pairs of people in the largest intermediate result.
+#: Number of pairs of people in the largest intermediate result.
 CHUNK = 100_000
 
 
 class CrowdEngine:
-    """Residuals on windows in which everyone is simulated alone among the others.
+    """Residuals on windows in which every person is simulated alone among the others.
 
-    In a crowd, errors of one person's simulated path would spread to all. So the sequences are
-    cut into windows, the others walk on their measured and smoothed paths, and what an unknown
-    start state of a person explains is projected out. The remaining differences of positions are
-    whitened, and windows in which a person does something quite unusual count less.
+    In a crowd, errors of one person's simulated path would propagate to all. Therefore the
+    sequences are cut into windows, the others follow their measured and smoothed paths, and the
+    part of the differences that an unknown start state explains is projected out. The remaining
+    differences of positions are whitened, and outlying windows have smaller weights.
 
     Args:
         sequences: of people, equally sampled.
@@ -50,7 +50,7 @@ class CrowdEngine:
     Attributes:
         batch: the sequences.
         sequence: ``(n,)`` position of each residual's sequence in the batch.
-        clock: ``(n,)`` s, when its window begins.
+        clock: ``(n,)`` start time of its window, s.
         unit: ``(n,)`` number of its person, counted through all sequences.
         people: of each unit the sequence and the place of the person.
 
@@ -67,10 +67,10 @@ class CrowdEngine:
         self.sequences, self.least = list(sequences), rules().least
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
-        which, who = self.windows.person.T
+        window_of, place_of = self.windows.person.T
         self._clusters = clusters
         pairs, unit = np.unique(
-            np.stack([self.windows.sequence[which], who], 1), axis=0, return_inverse=True
+            np.stack([self.windows.sequence[window_of], place_of], 1), axis=0, return_inverse=True
         )
         self._unit = unit.reshape(-1)
         self.people = [[(int(b), int(i))] for b, i in pairs]
@@ -80,7 +80,7 @@ class CrowdEngine:
         self._whitening: Whitening | None = None
         self._run: tuple[System, Tensor, RunAlone] | None = None
 
-    # -- what every engine has -------------------------------------------------------------
+    # -- the interface of engines ----------------------------------------------------------
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)``: whitened differences, measured minus simulated, of R runs of one model."""
@@ -90,14 +90,14 @@ class CrowdEngine:
         return (self._matrix @ flat).reshape(len(rows), -1)
 
     def squares(self, system: System, row: Tensor) -> Squares:
-        """Squared errors of positions, without what start states explain."""
+        """Squared errors of positions, after start states were projected out."""
         window = self.windows.person[:, 0]
         squares = (self._projected_errors(system, row) ** 2).sum(-1)
         n_samples = squares.shape[1]
         return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """Windows one after the other, each from the start state that suits the model best."""
+        """The windows in sequence, each from the best-fitting start state."""
         difference, length = self._projected_errors(system, row), self.windows.length
         simulations: list[Simulation | None] = [None] * len(self.sequences)
         for i in self.windows.used:
@@ -121,13 +121,13 @@ class CrowdEngine:
         return simulations
 
     def _projected_errors(self, system: System, row: Tensor) -> np.ndarray:
-        """``(P, L, 2)`` m: measured minus simulated positions, without what starts explain."""
+        """``(P, L, 2)`` m: measured minus simulated positions, start states projected out."""
         whitening = self._fitted_whitening(system, row)
         projected: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
         return projected.reshape(len(projected), -1, 2)
 
     def variables(self) -> list[Variable]:
-        """What deviations of people may depend on."""
+        """The variables on which deviations of people may depend."""
         windows, no_forces = self.windows, Crowd([])
         measured = torch.cat([windows.batch.x[::2], windows.batch.v[::2]], -1)
         run = RunAlone(windows.around(no_forces), no_forces, measured)
@@ -135,16 +135,16 @@ class CrowdEngine:
         return crowd_variables(run.state, start_of)
 
     def noise_floor(self) -> float:
-        """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed
-        over both coordinates."""
+        """Mean square error of positions due to measurement noise, summed over both coordinates,
+        m²."""
         length = self.windows.length
         return 2 * self.windows.variance * (1 - 2 / length)
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
-        """Take a model as the one around which residuals are whitened, weighted and linearised.
+        """Fit the whitening and the weights to the residuals of a model, and linearise around it.
 
-        Called after a fit was accepted; residuals from before cannot be compared with later ones,
-        and even their number may change.
+        It is called after a fit was accepted. Residuals before and after the call cannot be
+        compared; even their number may change.
         """
         self._run = self._simulated(system, row)
         start, forced = self._run[-1].unit_responses()
@@ -158,7 +158,7 @@ class CrowdEngine:
         self._label(self._matrix.shape[1])
 
     def _label(self, n_residuals: int) -> None:
-        """Say whose ``each`` residuals of every person's window are."""
+        """Label the ``n_residuals`` residuals of every person's window."""
         window = self.windows.person[:, 0]
         self.sequence = self.windows.sequence[window].repeat(n_residuals)
         self.cluster = of_residuals(self._clusters, self.sequence)
@@ -169,7 +169,7 @@ class CrowdEngine:
     # -- linear response ----------------------------------------------------------------------
 
     def linearised(self, system: System, row: Tensor) -> RunAlone:
-        """A model along its own paths; the response is that of the model it was settled at."""
+        """A model along its own paths; the response is that of the model of the whitening."""
         self._fitted_whitening(system, row)
         if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
             self._run = self._simulated(system, row)
@@ -183,10 +183,8 @@ class CrowdEngine:
         return system, row.clone(), run
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
-        """``(K, n)``: derivatives of the residuals with respect to the calibrated parameters.
-
-        By linear response; a simulation for each parameter gives nearly the same.
-        """
+        """``(K, n)``: derivatives of the residuals with respect to the calibrated parameters, by
+        linear response."""
         run = self.linearised(system, row)
         rates = run.parameters(_differences(system))
         return torch.stack([self._respond(rate, run) for rate in rates])
@@ -221,7 +219,7 @@ class CrowdEngine:
     def individual(
         self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
     ) -> Tensor:
-        """``(M, n)``: derivatives of everyone's residuals with respect to M amounts of his own,
+        """``(M, n)``: derivatives of every person's residuals by M agent-specific parameters,
         see :meth:`~nnode.model.effects.IndividualEffect.directions`.
 
         As people walk alone, the derivative with respect to one person's amount is the same
@@ -251,16 +249,16 @@ class CrowdEngine:
 
     def _differences(self, system: System, rows: Tensor) -> Tensor:
         """``(R, P, L, 2)`` m: measured minus simulated positions."""
-        which, who = self.windows.person.T
-        x = self._states(system, rows)[:: self.windows.sub, :, which, who, :2]
-        measured = torch.from_numpy(self.windows.measured[:, which, who])
+        window_of, place_of = self.windows.person.T
+        x = self._states(system, rows)[:: self.windows.sub, :, window_of, place_of, :2]
+        measured = torch.from_numpy(self.windows.measured[:, window_of, place_of])
         difference = (measured[:, None] - x).permute(1, 2, 0, 3)
         return difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
 
     def _states(self, system: System, rows: Tensor) -> Tensor:
         """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps."""
         windows = self.windows
-        # the systems of one diagnosis share walls, radii and masses: the first stands for all
+        # all systems of one diagnosis share walls, radii and masses
         if self._around is None:
             check_model(system)
             self._around = windows.around(system)
@@ -273,7 +271,7 @@ class CrowdEngine:
         return torch.cat(states, 1)
 
     def _turns(self) -> np.ndarray:
-        """``(P, 2, 2)``: rows along and across each person's way in his window."""
+        """``(P, 2, 2)``: unit vectors along and across each person's path in the window."""
         window, person = self.windows.person.T
         x = self.windows.batch.x[:, window, person].numpy()
         goal = self.windows.batch.destination[window, person].numpy()
@@ -285,7 +283,7 @@ class CrowdEngine:
 
 
 def _differences(system: System) -> list[float]:
-    """``(K,)``: differences of the parameters by which derivatives are taken."""
+    """``(K,)``: finite differences of the parameters."""
     differences = []
     for name, p in ParameterVector(system).parameters.items():
         _, place, key = name.split(".", 2)

@@ -1,4 +1,4 @@
-"""Smooth paths of people, and the noise of their measurement."""
+"""Smoothed paths of people, and the variance of the measurement noise."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from scipy.interpolate import make_interp_spline
 from nnode.data.sequence import Sequence
 from nnode.errors import DataError
 
-#: Strengths of the roughness penalty among which cross-validation chooses.
+#: Strengths of the roughness penalty for cross-validation.
 PENALTIES = np.logspace(-4, 5, 55)
-#: Longer sequences are smoothed in pieces of about this many samples, which meet in the middle
-#: of an overlap.
+#: Longer sequences are smoothed in pieces of about this many samples, with an overlap.
 PIECE, OVERLAP = 240, 24
-#: Fewer samples than this have no jerk.
+#: Smallest number of samples for a third difference.
 LEAST = 4
 
 
@@ -38,7 +37,7 @@ class Path:
 
 
 class Smoother:
-    """Paths with little jerk near the measured ones.
+    """Smooths measured paths with a penalty of the jerk.
 
     The smoothed positions minimise the squared distance to the measured ones plus a penalty times
     the squared third differences. The penalty is one for all people and coordinates, by
@@ -48,7 +47,7 @@ class Smoother:
         sequences: with ``(K, N, 2)`` positions, K >= 4.
 
     Attributes:
-        penalty: that was chosen.
+        penalty: the selected strength.
         variance: m², of the noise in one coordinate.
 
     Raises:
@@ -91,7 +90,7 @@ class Smoother:
         for part in _pieces(k):
             value, vector = _modes(part.stop - part.start)
             keep = 1 / (1 + self.penalty * value)
-            # the ends of a piece know only one side: they count less where pieces overlap
+            # estimates at the ends of a piece are less precise, so they have smaller weights
             taper = np.minimum(np.arange(1, len(value) + 1), np.arange(len(value), 0, -1))[:, None]
             smooth[part] += taper * (vector @ (keep[:, None] * (vector.T @ flat[part])))
             weight[part] += taper

@@ -1,4 +1,4 @@
-"""What a deviation of people may depend on."""
+"""Variables on which deviations of people may depend."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from nnode.model.term import State
 
 Of = Callable[[State], Tensor]
 
-#: Knots of a curve; of curves along the way, where short waves are possible.
+#: Number of knots of a curve; of curves over the position, which may have short waves.
 KNOTS, FINE = 9, 25
-#: The shortest and the longest waves that are looked for, along x in m and in time in s.
+#: The shortest and the longest waves, along x in m and in time in s.
 WAY, CLOCK = (1.5, 10.0), (1.5, 10.0)
 #: Width of the kernel of the local density, m.
 KERNEL = 1.0
-#: Distance of the nearest person where there is none, m.
+#: Distance of the nearest person if there is none, m.
 NOBODY = 100.0
-#: Distance at which an absent wall stands, m.
+#: Distance of an absent wall, m.
 FAR = 1e4
 
 
@@ -175,7 +175,7 @@ def right_of(direction: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """What person i (second axis) sees of person j (third axis).
+    """The state of person j (third axis) relative to person i (second axis).
 
     Attributes:
         d: ``(B, N, N)`` distance, m.

@@ -1,4 +1,4 @@
-"""What a deviation of vehicles may depend on."""
+"""Variables on which deviations of vehicles may depend."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from nnode.discover.residuals.variables import Variable, clock, knots_of, since_
 from nnode.model.effects.lane import gaps
 from nnode.model.term import State
 
-#: Knots of a curve.
+#: Number of knots of a curve.
 KNOTS = 33
-#: The shortest and the longest waves that are looked for, along the road in m and in time in s.
+#: The shortest and the longest waves, along the road in m and in time in s.
 ROAD, CLOCK = (30.0, 300.0), (5.0, 60.0)
 
 
@@ -29,7 +29,7 @@ def _gap(state: State) -> Tensor:
 def _next_gap(state: State) -> Tensor:
     gap = gaps(state.x)
     ahead = torch.cat([gap[:, 1:], gap[:, -1:]], 1)
-    # who follows the leader has no next gap
+    # the follower of the leader has no next gap
     return torch.where(ahead > PADDING_GAP / 2, gap, ahead)
 
 

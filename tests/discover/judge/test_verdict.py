@@ -91,7 +91,7 @@ def test_scores_are_on_the_scale_of_a_standard_normal_variable() -> None:
     signs = np.ones((1, 25))
 
     def standardised(factor: float) -> np.ndarray:
-        found = scaled(factor * parts, factor**2 * sizes, signs, usual=9.0)
+        found = scaled(factor * parts, factor**2 * sizes, signs, cluster_variance=9.0)
         return np.asarray(found[0])
 
     found = standardised(1.0)
