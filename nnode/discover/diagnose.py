@@ -193,18 +193,18 @@ def _diagnosed(
         # an unconfirmed effect that was removed could otherwise show as a difference of agents
         refitted = [individuals(engine, selection.fit, kind) for kind in kinds]
         pairs = [(a, b) for a, b in zip(individual_estimates, refitted, strict=True) if a and b]
-        individual_estimates = [max(pair, key=lambda item: item.p_value) for pair in pairs]
-    estimates = _bonferroni([item for item in individual_estimates if item is not None])
+        individual_estimates = [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
+    estimates = _bonferroni([estimate for estimate in individual_estimates if estimate is not None])
     agents = [
-        confirmation.agents(item, corrected.system, options.alpha, bool(unexplained), testable)
-        for item in estimates
+        confirmation.agents(estimate, corrected.system, options.alpha, bool(unexplained), testable)
+        for estimate in estimates
     ]
     tested = list(zip(estimates, agents, strict=True))
-    named_individuals = [item for item, test in tested if test.named]
+    named_individuals = [estimate for estimate, agent in tested if agent.named]
     absent_effects += [
-        agents_absent(item, options.alpha / len(estimates), testable)
-        for item, test in tested
-        if not test.found
+        agents_absent(estimate, options.alpha / len(estimates), testable)
+        for estimate, agent in tested
+        if not agent.found
     ]
     extended = base_system
     if selection.steps or named_individuals:
@@ -215,15 +215,19 @@ def _diagnosed(
     tests = confirmation.tests
     effects_named = [
         *(named(engine, corrected, s, tests[s.chosen.name].p_value) for s in selection.steps),
-        *(named_agents(item, test.confirmed, system.order) for item, test in tested if test.named),
+        *(
+            named_agents(estimate, agent.confirmed, system.order)
+            for estimate, agent in tested
+            if agent.named
+        ),
     ]
     hypotheses = [
         *unconfirmed,
         *imitations,
         *(
-            named_agents(item, test.confirmed, system.order)
-            for item, test in tested
-            if test.found and not test.named
+            named_agents(estimate, agent.confirmed, system.order)
+            for estimate, agent in tested
+            if agent.found and not agent.named
         ),
     ]
     diagnosis = Diagnosis(
@@ -284,7 +288,9 @@ def _unexplained(exploration: _Exploration, selection: Search) -> list[Curves]:
 def _bonferroni(estimates: list[Individuals]) -> list[Individuals]:
     """The estimates with p-values that are corrected for their number."""
     number = len(estimates)
-    return [replace(item, p_value=min(1.0, item.p_value * number)) for item in estimates]
+    return [
+        replace(estimate, p_value=min(1.0, estimate.p_value * number)) for estimate in estimates
+    ]
 
 
 def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:

@@ -1,4 +1,4 @@
-"""The sequences that a diagnosis works on, and the faults that it leaves out and reports."""
+"""The sequences of a diagnosis, and the faulty ones that are left out and reported."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.discover.result import DataFault
 from nnode.errors import DataError
 
-#: Fewer sequences can be neither resampled nor divided.
+#: Smallest number of sequences that can be resampled and divided.
 LEAST = 3
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a diagnosis is given.
+    """The input data of a diagnosis.
 
     Attributes:
         domain: of the data.
@@ -33,7 +33,7 @@ class Inputs:
         data_faults: the same for the report, agents by identifier or, where there are none, by
             their number in the sequence.
         manifest: where the data come from.
-        measured: sentences about the noise of the measurement and about samples that were filled.
+        measured: sentences about the measurement noise and about filled samples.
     """
 
     domain: Domain
@@ -46,11 +46,11 @@ class Inputs:
 
 
 def read_inputs(options: DataOptions, folder: Path) -> Inputs:
-    """Read data and part what is sound from what is faulty.
+    """Read data and separate faulty sequences.
 
     Args:
         options: with ``faults=error`` faults are refused; otherwise faulty sequences are left
-            out of the diagnosis, whatever becomes of them in training.
+            out of the diagnosis, independently of their treatment in training.
         folder: where data are prepared.
 
     Raises:
@@ -61,14 +61,14 @@ def read_inputs(options: DataOptions, folder: Path) -> Inputs:
 
 
 def with_faulty(options: DataOptions) -> DataOptions:
-    """Options that read faulty sequences as well, which the report tells of."""
+    """Options that also read faulty sequences, which the report lists."""
     if options.prepared is None and options.faults is Faults.drop:
         return replace(options, faults=Faults.keep)
     return options
 
 
 def inputs_of(store: Source, options: DataOptions) -> Inputs:
-    """Part what is sound from what is faulty.
+    """Separate faulty sequences.
 
     Args:
         store: what was read, on the disk or in memory.
@@ -86,7 +86,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
         faults.setdefault(fault.sequence, []).append(fault)
         who = entry.get("names") or [str(i) for i in fault.agents]
         reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
-    # in one order, whatever that of a list: divisions into folds go by it
+    # a fixed order, because divisions into folds depend on it
     everything = sorted(store, key=lambda s: natural(s.name))
     sound = [s for s in everything if s.name not in faults]
     read = store.manifest.get("counts", {}).get("read", len(everything))
@@ -103,7 +103,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
 
 
 def _measured(store: Source) -> list[str]:
-    """What is known of the measurement, for the report's notes."""
+    """Notes on the measurement for the report."""
     noise, filled = noise_of(store), store.manifest.get("filled", [])
     text = f"The {noise}."
     if noise.beyond:

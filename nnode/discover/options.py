@@ -1,4 +1,4 @@
-"""Options of the diagnosis, as a dataclass that the configuration is checked against."""
+"""Options of the diagnosis: the dataclass that validates the configuration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nnode.model.effects.own import VARIABLE
 
 @dataclass
 class DiscoverOptions:
-    """What is looked for, how carefully, and what is made of it."""
+    """Options of the diagnosis."""
 
     sealed: float = 0.3  # share of the clusters that nothing looks at before the last step
     gap: float = 5.0  # s; sequences without identifiers that are closer in time are one cluster
@@ -38,7 +38,7 @@ class DiscoverOptions:
 
 
 def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> list[str]:
-    """Refuse what no diagnosis can work with.
+    """Refuse invalid options.
 
     Args:
         order: of the law.

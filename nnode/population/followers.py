@@ -422,7 +422,7 @@ class Followers:
         """``(M, K, F)`` rates along a run.
 
         Args:
-            own: ``(P, F)`` parameters of each follower. states: ``(K, M, F)`` of the run.
+            parameters: ``(P, F)`` parameters of each follower. states: ``(K, M, F)`` of the run.
         """
         with np.errstate(all="ignore"):
             rates = self._rates(self._along(parameters, states))
@@ -443,7 +443,7 @@ class Followers:
         of memory.
 
         Args:
-            own, states: as of :meth:`rates`.
+            parameters, states: as of :meth:`rates`.
 
         Returns:
             Two arrays ``(F, K - 1, M, M)``: the states after a sampling interval by those before,

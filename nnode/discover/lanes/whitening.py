@@ -15,16 +15,16 @@ from nnode.discover.rules import rules
 class PlatoonFilter:
     """An autoregressive filter with the vehicle's own past and the vehicle ahead.
 
-    The innovation is e_i(t) - sum_k own_k e_i(t - k) - sum_k ahead_k e_{i+1}(t - k), divided by its
-    standard deviation. Samples before the first, and those of the leader, count as zero.
+    The innovation is e_i(t) - sum_k past_k e_i(t - k) - sum_k ahead_k e_{i+1}(t - k), divided by
+    its standard deviation. Samples before the first, and those of the leader, count as zero.
 
     Attributes:
-        own: ``(p,)`` weights of the vehicle's p past samples.
+        past: ``(p,)`` weights of the vehicle's p past samples.
         ahead: ``(p + 1,)`` weights of the vehicle ahead, the present sample first.
         scale: standard deviation of the innovations, m.
     """
 
-    own: np.ndarray
+    past: np.ndarray
     ahead: np.ndarray
     scale: float
 
@@ -59,7 +59,7 @@ class PlatoonFilter:
     def __call__(self, residual: Tensor) -> Tensor:
         """``(..., K, B, N)`` whitened residuals of ``(..., K, B, N)``."""
         whitened, k = residual / self.scale, residual.shape[-3]
-        for lag, weight in enumerate([0.0, *self.own]):
+        for lag, weight in enumerate([0.0, *self.past]):
             if weight and lag < k:
                 share = -float(weight) / self.scale
                 whitened[..., lag:, :, :].add_(residual[..., : k - lag, :, :], alpha=share)

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis' page, with captions and words for those who cannot see them."""
+"""Figures of a diagnosis' page, with captions and alternative texts."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from nnode.pages.replay import ReplayBlock
 from nnode.pages.tables import markdown
 from nnode.plots.quality import faults_figure
 
-#: Faulty sequences and variables that are drawn.
+#: Largest numbers of faulty sequences and of variables that are drawn.
 FAULTY, PLACES = 10, 9
 
-#: Of maps of deviations.
+#: Units of maps of deviations.
 UNITS = {"traffic": "m/s", "crowd": "m/s²"}
 
 
 @dataclass
 class Figures:
-    """What a page shows, by the section it belongs to."""
+    """The figures of a page, by section."""
 
     map: list[FigureBlock] = field(default_factory=list)
     effects: list[FigureBlock] = field(default_factory=list)
@@ -54,12 +54,12 @@ class Figures:
 
 
 def unit_of(system: System) -> str:
-    """Of what a law says: a speed, or an acceleration."""
+    """The unit of a law's rate: a speed, or an acceleration."""
     return "m/s" if system.order == 1 else "m/s²"
 
 
 def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions) -> Figures:
-    """Draw everything that the diagnosis gives occasion to."""
+    """Draw all figures of a diagnosis."""
     drawn = Figures()
     d = outcome.diagnosis
     if d.effects:
@@ -169,7 +169,7 @@ def _places(outcome: DiagnosisOutcome) -> list[FigureBlock]:
 def _map_figures(
     inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions
 ) -> list[FigureBlock]:
-    """Maps of deviations by place, and by the nearest agent; none where nothing was simulated."""
+    """Maps of deviations by place, and by the nearest agent; none if nothing was simulated."""
     maps, unit = _maps(inputs, outcome, options), UNITS[inputs.domain]
     if not len(next(iter(maps.values())).time):
         return []

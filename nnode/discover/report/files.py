@@ -27,11 +27,11 @@ REPORT = "report.json"
 MODEL = "model.yaml"
 CHECKPOINT = Path("checkpoints", "best.pt")
 
-#: Of ``report.json``, raised when a key changes its name or meaning. 2: the base model's parameters
-#: are told by term and name, ``lin.v0``.
+#: Version of ``report.json``, raised when a key changes its name or meaning. 2: the base model's
+#: parameters are named by term and name, ``lin.v0``.
 SCHEMA = 2
 
-#: The counters of a training that has not begun.
+#: The counters of a training that has not started.
 UNTRAINED: dict[str, float] = {
     "epoch": 0,
     "batch": 0,
@@ -46,7 +46,7 @@ UNTRAINED: dict[str, float] = {
 
 
 def plain_report(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The content of ``report.json``: plain types, None for what is no number."""
+    """The content of ``report.json``: plain types, None for NaN and infinity."""
     content = _finite(diagnosis.plain())
     assert isinstance(content, dict)
     return {"schema": SCHEMA, **content}
@@ -65,12 +65,12 @@ def _finite(value: Any) -> Any:
 
 
 def write_report(report: dict[str, Any], path: Path) -> Path:
-    """Write a report as JSON that any reader takes."""
+    """Write a report as strict JSON."""
     return write_text(path, json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def amount(value: float | None, digits: int = 3) -> str:
-    """A number in words: few digits, a true minus, a dash for what is missing."""
+    """A number as text: few digits, a minus sign, a dash for missing values."""
     if value is None or math.isnan(value):
         return "–"
     short = float(f"{value:.{digits}g}")
@@ -78,7 +78,7 @@ def amount(value: float | None, digits: int = 3) -> str:
 
 
 def estimate(coefficient: Coefficient) -> tuple[str, str, str]:
-    """A coefficient and the ends of its interval, with the digits that the interval leaves."""
+    """A coefficient and the ends of its interval, with the significant digits."""
     c = coefficient
     width = max(c.high - c.value, c.value - c.low)
     if not (math.isfinite(width) and width > 0):
@@ -89,7 +89,7 @@ def estimate(coefficient: Coefficient) -> tuple[str, str, str]:
 
 
 def in_unit(unit: str) -> str:
-    """A unit as it follows a number: nothing for pure numbers."""
+    """A unit after a number; empty for dimensionless numbers."""
     return "" if unit in ("", "1") else f" {unit}"
 
 
@@ -103,7 +103,7 @@ def interval(effect: NamedEffect) -> str:
 
 
 def ranked(laws: Laws) -> str:
-    """The best laws in one line, and by how much they are behind."""
+    """The best laws in one line, with their excess costs."""
     return ", ".join(
         law.name + (f" (+{100 * law.behind:.3g} %)" if law.behind > 0 else "")
         for law in laws.ranking[:5]
@@ -111,13 +111,13 @@ def ranked(laws: Laws) -> str:
 
 
 def sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one sentence, one for a law that comes nearer, and one for the faults of the
+    """The verdict in one sentence, one for a better-fitting law, and one for the faults of the
     measurement."""
     return " ".join([verdict(diagnosis), *remarks(diagnosis)])
 
 
 def remarks(diagnosis: Diagnosis) -> list[str]:
-    """What must be known beside the verdict: a law that comes nearer, faults of the measurement."""
+    """Remarks on the verdict: a better-fitting law, faults of the measurement."""
     sentences, laws = [], diagnosis.laws_again or diagnosis.laws
     if laws is not None and laws.best not in ("", diagnosis.model):
         qualifier = f" with {_listed(laws.effects)}" if laws.effects else ""
@@ -212,7 +212,7 @@ def _listed(names: list[str], last: str = "and") -> str:
 def extended_options(options: Mapping[str, Any], system: System) -> dict[str, Any]:
     """The options of a model that give ``system``: effects, and parameters as start values.
 
-    Weights of networks are no options; only a checkpoint holds them.
+    Weights of networks are not options; only a checkpoint contains them.
 
     Args:
         options: what the model was built from before it was calibrated and extended.
@@ -234,18 +234,18 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
 
 
 def individual(system: System) -> list[str]:
-    """The effects of a model that have a number for every agent."""
+    """The effects of a model with agent-specific parameters."""
     return [effect.name for effect in effects_of(system) if effect.individual]
 
 
 def has_network(system: System) -> bool:
-    """Whether a network is among what a model sums."""
+    """Whether a model contains a network."""
     return any(isinstance(module, FeedForward) for module in system.modules())
 
 
 def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
     """A model's options as a file for ``conf/model``."""
-    # in a comment: a line break would end it
+    # the name appears in a comment, which a line break would end
     name, option = " ".join(str(options["name"]).split()), "" if scripts() else "--config-dir conf "
     lines = [
         f"# Made by {typed('python scripts/discover.py')}. "
@@ -279,7 +279,8 @@ def checkpoint_of(
     manifest: dict[str, Any],
     optimizer: Any,
 ) -> Checkpoint:
-    """The extended model as a checkpoint: trained on the open, tested on the sealed sequences.
+    """The extended model as a checkpoint: the exploration sequences are its training set, the
+    confirmation sequences its test set.
 
     Args:
         config: a training's composed configuration in plain types, ``model`` that of the

@@ -102,7 +102,7 @@ def page_blocks(
 
 
 def _first(d: Diagnosis) -> list[Block]:
-    """What a reader must know beside the verdict."""
+    """Remarks on the verdict."""
     words = remarks(d)
     return [Text(" ".join(words))] if words else []
 
@@ -114,7 +114,7 @@ def _map(drawn: Figures) -> list[Block]:
 
 
 def _laws(d: Diagnosis) -> list[Block]:
-    """Which base law comes nearest, before anything is said to be missing."""
+    """The comparison of base laws."""
     if d.laws is None or not d.laws.ranking:
         return []
     compared = [d.laws] if d.laws_again is None else [d.laws, d.laws_again]
@@ -149,7 +149,7 @@ def _laws(d: Diagnosis) -> list[Block]:
 
 
 def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
-    """The errors on sealed sequences: one definition for the whole page."""
+    """The errors on the confirmation sequences, with the definition for the whole page."""
     n_confirmation, n_exploration = len(d.split.get("sealed", [])), len(d.split.get("open", []))
     return [
         Heading("The error on sealed sequences"),
@@ -186,7 +186,7 @@ def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> li
 
 
 def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
-    """What the verdict rests on."""
+    """The tests behind the verdict."""
     blocks: list[Block] = []
     if d.notes:
         blocks.append(Text("\n".join(f"- {markdown(note)}" for note in d.notes)))
@@ -223,7 +223,7 @@ def _clusters(d: Diagnosis) -> list[Block]:
 
 
 def _agents(d: Diagnosis) -> list[Block]:
-    """Whether agents differ, beside the effects of the population."""
+    """The differences between agents, in addition to population effects."""
     if d.drivers:
         return [Heading("Do drivers differ?"), tables.drivers_table(d)]
     if not d.agents:

@@ -1,4 +1,4 @@
-"""Sealed sequences in a player, with the place that was named shaded."""
+"""Confirmation sequences in a player, with the named place shaded."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from nnode.discover.report.files import amount
 from nnode.discover.result import Diagnosis, NamedEffect
 from nnode.pages.replay import ReplayBlock, Scene, Zone
 
-#: Sealed sequences in the player.
+#: Largest number of confirmation sequences in the player.
 SCENES = 16
-#: What the two models are called, here and in the figures.
+#: Names of the two models, also in the figures.
 BEFORE, AFTER = "without effects", "with effects"
 
 
@@ -31,8 +31,8 @@ def telling(outcome: DiagnosisOutcome) -> list[int]:
 
 
 def scenes(outcome: DiagnosisOutcome) -> list[Scene]:
-    """Sealed sequences and the simulations that their errors were computed from, without and with
-    effects, in the order of :func:`telling`.
+    """Confirmation sequences with the simulations of their errors, without and with effects, in the
+    order of :func:`telling`.
 
     The still figure has the first one; a crowd's player begins with the one with most people.
     """
@@ -72,7 +72,7 @@ def player(outcome: DiagnosisOutcome, replayed: list[Scene]) -> ReplayBlock:
 
 
 def _restart_note(replayed: list[Scene]) -> str:
-    """What must be said of simulations that start again."""
+    """A note on simulations that restart."""
     scene = replayed[0]
     if scene.restart is None:
         return ""
@@ -81,7 +81,7 @@ def _restart_note(replayed: list[Scene]) -> str:
 
 
 def zones(d: Diagnosis) -> list[Zone]:
-    """Places and times of the effects that were named; without any, where the model parts most."""
+    """Places and times of the named effects; without any, the largest deviation."""
     effect_zones = [zone for effect in d.effects if (zone := _zone(effect)) is not None]
     if effect_zones:
         return effect_zones

@@ -13,7 +13,7 @@ from nnode.discover.result import Alternative, Diagnosis, Laws, NamedEffect
 from nnode.model.term import short_names
 from nnode.pages.page import TableBlock
 
-#: Faults that the page lists; its CSV has all.
+#: Largest number of faults on the page; the CSV file contains all.
 LISTED = 30
 
 
@@ -77,7 +77,7 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
 
 
 def clusters_table(d: Diagnosis) -> TableBlock:
-    """How many clusters there are, and how many it takes."""
+    """The numbers of clusters, and the numbers that are needed."""
     c = d.clusters
     rows = [
         {"clusters": "open", "there are": c.open, "it takes": c.least, "to": "name any effect"},
@@ -87,7 +87,7 @@ def clusters_table(d: Diagnosis) -> TableBlock:
 
 
 def screen_table(d: Diagnosis) -> TableBlock:
-    """What explains most in the open sequences."""
+    """The effects that explain most in the exploration sequences."""
     rows = [
         {
             "effect": score["name"],
@@ -111,7 +111,7 @@ def screen_table(d: Diagnosis) -> TableBlock:
 
 
 def agents_table(d: Diagnosis) -> TableBlock:
-    """Numbers of agents, and what their variance belongs to."""
+    """Agent-specific parameters and their variance components."""
     rows = [
         {
             "effect": a.name,
@@ -133,7 +133,7 @@ def agents_table(d: Diagnosis) -> TableBlock:
 
 
 def drivers_table(d: Diagnosis) -> TableBlock:
-    """What differs between drivers and over time."""
+    """Variances between drivers and over time."""
     labels = {
         "push": "pushes",
         "push_time": "time that pushes last",
@@ -162,7 +162,7 @@ def drivers_table(d: Diagnosis) -> TableBlock:
 
 
 def later_table(d: Diagnosis) -> TableBlock:
-    """Who predicts the last part of sealed sequences."""
+    """Errors in the last part of the confirmation sequences, by model."""
     rows = [
         {
             "effect": estimate.name,
@@ -204,7 +204,7 @@ def effects_table(d: Diagnosis) -> TableBlock:
 
 
 def alternatives_table(d: Diagnosis) -> TableBlock:
-    """What could stand in the place of an effect."""
+    """The alternatives to the named effects."""
     rows = [
         {
             "chosen": effect.name,
@@ -244,7 +244,7 @@ def _apart(other: Alternative) -> str:
 
 
 def gap_table(d: Diagnosis) -> TableBlock:
-    """The error on the sealed sequences."""
+    """The error on the confirmation sequences."""
     rows = [
         {"": what, "mean square error (m²)": amount(value)}
         for what, value in (
@@ -265,7 +265,7 @@ def gap_table(d: Diagnosis) -> TableBlock:
 
 
 def confirmation_table(d: Diagnosis) -> TableBlock:
-    """The errors of the single sealed sequences."""
+    """The errors of the individual confirmation sequences."""
     rows = [
         {
             "sequence": row["name"],
@@ -286,7 +286,7 @@ def confirmation_table(d: Diagnosis) -> TableBlock:
 
 
 def base_table(d: Diagnosis) -> TableBlock:
-    """How the model's own parameters move when effects join them."""
+    """The change of the model's parameters when effects are added."""
     short = short_names(d.base)
     rows = [
         {
@@ -329,7 +329,7 @@ def faults_table(d: Diagnosis) -> TableBlock:
 
 
 def places_table(d: Diagnosis, unit: str) -> TableBlock:
-    """Where simulation and measurement part."""
+    """Where the model deviates from the data."""
     rows = [
         {
             "variable": place.variable,
@@ -353,7 +353,7 @@ def places_table(d: Diagnosis, unit: str) -> TableBlock:
 
 
 def absent_table(d: Diagnosis) -> TableBlock:
-    """Effects that the data speak against."""
+    """Effects that are absent, with bounds."""
     rows = [
         {
             "effect": absence.name,
@@ -378,7 +378,7 @@ def absent_table(d: Diagnosis) -> TableBlock:
 
 
 def not_testable_table(d: Diagnosis) -> TableBlock:
-    """Effects about which the data say nothing."""
+    """Effects that are not testable with these data."""
     by_name = {absence.name: absence for absence in d.absences if not absence.testable}
     names = list(dict.fromkeys([*by_name, *d.not_testable]))
     rows = []

@@ -32,7 +32,7 @@ from nnode.model.extend import effects_of, extended, without
 from nnode.model.system import System
 
 #: Number of relinearisations of the parameters, and the largest change in each.
-SHARPER, LEAP = 3, 0.1
+RELINEARISATIONS, LARGEST_CHANGE = 3, 0.1
 
 
 @dataclass
@@ -124,7 +124,7 @@ def numbers(
     effect = next(t for t in system.terms if isinstance(t, estimate.effect))
     label = engine.sequence if common else engine.unit
     amounts: np.ndarray | None = None
-    for _ in range(SHARPER if len(engine.people[0]) > 1 else 1):
+    for _ in range(RELINEARISATIONS if len(engine.people[0]) > 1 else 1):
         fit = evaluated(engine, system)
         if not np.isfinite(fit.residual).all():
             break
@@ -138,7 +138,9 @@ def numbers(
         ridge = np.eye(z.shape[1]) / max(estimate.shared if common else estimate.variance, 1e-12)
         start = np.zeros(score.shape) if amounts is None else amounts
         change = np.linalg.solve(gram + ridge, (score - start @ ridge)[..., None])[..., 0]
-        amounts = change if amounts is None else start + np.clip(change, -LEAP, LEAP)
+        amounts = (
+            change if amounts is None else start + np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+        )
         effect.people = _people(engine, estimate, amounts, common)
     return effect.people
 

@@ -126,12 +126,12 @@ class _Identity:
         self.sequences = engine.sequences
         names = [s.recording for s in engine.sequences]
         self.recording = np.unique(names, return_inverse=True)[1].reshape(-1)
-        self._known: dict[tuple[Any, ...], int] = {}
+        self._numbers: dict[tuple[Any, ...], int] = {}
 
     def agent(self, b: int, n: int) -> int:
         sequence = self.sequences[b]
         key = (sequence.recording, sequence.agents[n]) if sequence.agents else (b, n, None)
-        return self._known.setdefault(key, len(self._known))
+        return self._numbers.setdefault(key, len(self._numbers))
 
 
 @dataclass

@@ -127,12 +127,12 @@ def _handles(simulated: list[Simulated], lines: bool) -> list[Line2D]:
 
 
 def _view(s: Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of what a plane shows: where people walk, and walls not far from there."""
+    """Corners of the view: where people walk, and nearby walls."""
     low, high = s.x.min((0, 1)) - 0.5, s.x.max((0, 1)) + 0.5
     if s.walls is not None and len(s.walls):
         ends = s.walls.reshape(-1, 2)
         near = ((ends > low - 1.5) & (ends < high + 1.5)).all(1)
-        # a long wall beside the way has its ends far off, but its place across is near
+        # a long wall along the path has distant ends, but a small distance across
         for axis in (0, 1):
             flat = np.abs(s.walls[:, axis] - s.walls[:, axis + 2]) < 1e-9
             at = s.walls[flat, axis]
@@ -162,7 +162,7 @@ def _planes(
 def _moment(ax: Axes, s: Sequence, simulation: Simulated, k: int) -> None:
     """Measured and simulated agents at sample k, joined by lines."""
     if s.x.shape[2] == 1:
-        # cars are shown from a car that drives along in their midst, the scale that of all moments
+        # cars are shown relative to their mean position, with one scale for all moments
         frame = s.x.mean((1, 2))
         half = max(np.nanmax(np.abs(x[..., 0] - frame[:, None])) for x in (s.x, simulation.x))
         ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
