@@ -30,7 +30,7 @@ from nnode.discover.judge.verdict import (
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves, significant_curves
 from nnode.discover.name.search import (
-    Search,
+    Selection,
     converged_fit,
     initial_fit,
     most_likely_extension,
@@ -53,7 +53,7 @@ from nnode.discover.result import (
 )
 from nnode.discover.rules import applied, rules
 from nnode.discover.statistics.power import PowerSimulation
-from nnode.discover.statistics.random_effects import Individuals, individuals
+from nnode.discover.statistics.random_effects import IndividualEstimate, estimate_individual
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
@@ -107,7 +107,7 @@ class _Exploration:
     variables: list[Variable]
     base_curves: list[Curves]
     located: list[Place]
-    selection: Search
+    selection: Selection
     simultaneity: Simultaneous
 
 
@@ -181,7 +181,7 @@ def _diagnosed(
         options.seed,
     )
     kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
-    individual_estimates = [individuals(engine, selection.fit, kind) for kind in kinds]
+    individual_estimates = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
     selection, unconfirmed = confirmation.confirmed(engine, selection)
     unexplained = _unexplained(exploration, selection)
     assert selection.screen is not None
@@ -191,7 +191,7 @@ def _diagnosed(
     corrected = confirmation.corrected(selection)
     if unconfirmed:
         # an unconfirmed effect that was removed could otherwise show as a difference of agents
-        refitted = [individuals(engine, selection.fit, kind) for kind in kinds]
+        refitted = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
         pairs = [(a, b) for a, b in zip(individual_estimates, refitted, strict=True) if a and b]
         individual_estimates = [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
     estimates = _bonferroni([estimate for estimate in individual_estimates if estimate is not None])
@@ -208,7 +208,7 @@ def _diagnosed(
     ]
     extended = base_system
     if selection.steps or named_individuals:
-        extended = confirmation.with_numbers(engine, corrected, named_individuals)
+        extended = confirmation.with_agents(engine, corrected, named_individuals)
     gap, errors, simulations = confirmation.gap(extended, named_individuals)
     clock.lap("sealed")
     removed_share = 1 - square_of(engine, selection.fit.system) / square_of(engine, base_system)
@@ -276,7 +276,7 @@ def _diagnosed(
     )
 
 
-def _unexplained(exploration: _Exploration, selection: Search) -> list[Curves]:
+def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves]:
     """The curves that remain significant in the residuals of a selected model."""
     engine, remaining = exploration.engine, exploration.base_curves
     if selection.fit is not exploration.base:
@@ -285,7 +285,7 @@ def _unexplained(exploration: _Exploration, selection: Search) -> list[Curves]:
     return [curve for curve in remaining if curve.removed > rules().least]
 
 
-def _bonferroni(estimates: list[Individuals]) -> list[Individuals]:
+def _bonferroni(estimates: list[IndividualEstimate]) -> list[IndividualEstimate]:
     """The estimates with p-values that are corrected for their number."""
     number = len(estimates)
     return [
@@ -316,7 +316,7 @@ def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
 
 def _without_imitations(
     exploration: _Exploration, nearer: BetterLaw, notes: list[str]
-) -> tuple[Search, list[NamedEffect]]:
+) -> tuple[Selection, list[NamedEffect]]:
     """Remove effects that a better-fitting law does not need; they become hypotheses.
 
     Args:
@@ -444,7 +444,7 @@ def _levels(engine: Engine, effects: list[type[Effect]]) -> dict[str, np.ndarray
     return levels
 
 
-def _first_screen(selection: Search, numbers: Clusters) -> FirstScreen:
+def _first_screen(selection: Selection, numbers: Clusters) -> FirstScreen:
     """The scores of all effects against the calibrated model."""
     best = min(selection.first, key=lambda score: score.p_value, default=None)
     strongest = [
@@ -464,7 +464,7 @@ def _excess(engine: Engine, fit: Fit) -> float:
 
 
 def _verdict(
-    selection: Search,
+    selection: Selection,
     unexplained: list[Curves],
     removed: float,
     individuals_named: bool,

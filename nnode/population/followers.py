@@ -312,9 +312,9 @@ class Followers:
 
     def behind(self, paths: Paths) -> Followers:
         """The same model with other paths of the same followers."""
-        other = copy.copy(self)
-        other.paths = paths
-        return other
+        model = copy.copy(self)
+        model.paths = paths
+        return model
 
     def at(self, row: np.ndarray) -> np.ndarray:
         """Parameters in the scales in which they are varied."""

@@ -17,7 +17,7 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import converged_fit
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.residuals.fit import evaluated
-from nnode.discover.statistics.random_effects import individuals
+from nnode.discover.statistics.random_effects import estimate_individual
 from nnode.discover.statistics.score import traces
 from nnode.errors import ConfigError
 from nnode.model import Crowd, System, Traffic, make_law
@@ -206,7 +206,7 @@ def test_a_law_of_another_kind_is_diagnosed_in_a_lane() -> None:
     found = []
     for effect in CATALOGUE.of("traffic"):
         if issubclass(effect, IndividualEffect):
-            found.append(individuals(engine, fit, effect) is not None)
+            found.append(estimate_individual(engine, fit, effect) is not None)
         else:
             found.append(bool(traces(engine, fit, effect)))
     looked_for = [e.name for e, there in zip(CATALOGUE.of("traffic"), found, strict=True) if there]

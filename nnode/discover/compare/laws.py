@@ -21,7 +21,7 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.discover.division import divide
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.model_comparison import engine_of, windows_of
-from nnode.discover.name.search import Search, Step, initial_fit
+from nnode.discover.name.search import Selection, Step, initial_fit
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
@@ -121,7 +121,7 @@ class BetterLaw:
 
 
 def explained_by_law(
-    engine: Engine, selection: Search, label: np.ndarray, nearer: BetterLaw
+    engine: Engine, selection: Selection, label: np.ndarray, nearer: BetterLaw
 ) -> tuple[list[Step], float]:
     """Selected effects that a better-fitting law does not need: they imitate that law.
 

@@ -15,14 +15,18 @@ from nnode.discover.crowds.indirect_inference import unbiased
 from nnode.discover.judge.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.discover.judge.model_comparison import ModelComparison, engine_of, too_few
 from nnode.discover.judge.verdict import named
-from nnode.discover.name.search import Search, Step, without_steps
+from nnode.discover.name.search import Selection, Step, without_steps
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import gains
-from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
+from nnode.discover.statistics.random_effects import (
+    IndividualEstimate,
+    agent_parameters,
+    with_agent_parameters,
+)
 from nnode.errors import SimulationError
 from nnode.model.extend import without
 from nnode.model.system import System
@@ -138,7 +142,9 @@ class ConfirmationSet:
         self._corrected_fit: Fit | None = None
         self._held_out: dict[str, HeldOutErrors] = {}
 
-    def confirmed(self, engine: Engine, selection: Search) -> tuple[Search, list[NamedEffect]]:
+    def confirmed(
+        self, engine: Engine, selection: Selection
+    ) -> tuple[Selection, list[NamedEffect]]:
         """The selection with the confirmed effects only, and the unconfirmed effects as they are
         in the model with all selected effects."""
         if not selection.steps:
@@ -167,7 +173,7 @@ class ConfirmationSet:
         return remaining, hypotheses
 
     def _closed_tests(
-        self, engine: Engine, selection: Search, full_fit: Fit
+        self, engine: Engine, selection: Selection, full_fit: Fit
     ) -> dict[str, _ModelTest]:
         """For every effect, the comparison with the weakest evidence for it, over all subsets of
         effects that contain it: the full model against the model without the subset."""
@@ -206,7 +212,7 @@ class ConfirmationSet:
     def _unbiased(self, fit: Fit) -> Fit:
         return unbiased(fit, self.exploration, self.seed) if self.domain == "crowd" else fit
 
-    def corrected(self, selection: Search) -> Fit:
+    def corrected(self, selection: Selection) -> Fit:
         """The fit with the confirmed effects, corrected for its bias by simulation."""
         if self._corrected_fit is None or not selection.steps:
             return selection.fit
@@ -225,7 +231,12 @@ class ConfirmationSet:
         return Confirmation(p_value, self.clusters, confirmed, reason)
 
     def agents(
-        self, estimate: Individuals, system: System, alpha: float, structure: bool, enough: bool
+        self,
+        estimate: IndividualEstimate,
+        system: System,
+        alpha: float,
+        structure: bool,
+        enough: bool,
     ) -> Agents:
         """Test whether agent-specific parameters predict the last part of the confirmation
         sequences.
@@ -270,11 +281,13 @@ class ConfirmationSet:
             reason=reason,
         )
 
-    def with_numbers(self, engine: Engine, fit: Fit, confirmed: list[Individuals]) -> System:
+    def with_agents(self, engine: Engine, fit: Fit, confirmed: list[IndividualEstimate]) -> System:
         """The model with the agents' parameters in the exploration sequences, recalibrated."""
         system = fit.system
         for estimate in confirmed:
-            system = with_people(system, estimate, numbers(engine, system, estimate))
+            system = with_agent_parameters(
+                system, estimate, agent_parameters(engine, system, estimate)
+            )
         if not confirmed:
             return system
         try:
@@ -283,7 +296,7 @@ class ConfirmationSet:
             return fit.system
 
     def gap(
-        self, extended: System, individual: list[Individuals]
+        self, extended: System, individual: list[IndividualEstimate]
     ) -> tuple[Gap, list[dict[str, Any]], list[SimulationPair]]:
         """The mean errors before and after, the errors of each sequence, and their simulations."""
         if individual:
@@ -329,7 +342,9 @@ class ConfirmationSet:
         return float(np.nanmean(self.comparing.squares(calibrated)))
 
 
-def _rejection_reason(estimate: Individuals, alpha: float, structure: bool, enough: bool) -> str:
+def _rejection_reason(
+    estimate: IndividualEstimate, alpha: float, structure: bool, enough: bool
+) -> str:
     """Why the exploration clusters do not support agent-specific parameters; empty if they do."""
     if not enough:
         return "there are too few clusters to test it"

@@ -16,7 +16,11 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.judge.model_comparison import ModelComparison, windows_of
 from nnode.discover.outcome import Simulation
-from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
+from nnode.discover.statistics.random_effects import (
+    IndividualEstimate,
+    agent_parameters,
+    with_agent_parameters,
+)
 from nnode.errors import DataError, SimulationError
 from nnode.model.system import Crowd, System
 
@@ -55,7 +59,7 @@ def held_out_errors(
     domain: str,
     base: System,
     system: System,
-    estimate: Individuals,
+    estimate: IndividualEstimate,
     sequences: list[Sequence],
     label: np.ndarray,
 ) -> HeldOutErrors | None:
@@ -73,14 +77,16 @@ def held_out_errors(
         engine = windows_of(system, early_pieces)
         engine.fit_whitening(system, ParameterVector(system).row)
         people, shared = (
-            _carried(early_pieces, late_pieces, numbers(engine, system, estimate, common=common))
+            _carried(
+                early_pieces, late_pieces, agent_parameters(engine, system, estimate, common=common)
+            )
             for common in (False, True)
         )
         comparison = ModelComparison(windows_of(system, late_pieces, label[used]), system)
         models = {
             MODELS[0]: system,
-            MODELS[1]: with_people(system, estimate, people),
-            MODELS[2]: with_people(system, estimate, shared),
+            MODELS[1]: with_agent_parameters(system, estimate, people),
+            MODELS[2]: with_agent_parameters(system, estimate, shared),
         }
         costs = {name: comparison.squares(model) for name, model in models.items()}
         score_toward = {

@@ -13,7 +13,7 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import tail
 from nnode.discover.locate.symbolic import symbolic
 from nnode.discover.name.candidate import Candidate
-from nnode.discover.name.search import Search, Step, apart_at
+from nnode.discover.name.search import Selection, Step, apart_at
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Curves
@@ -30,7 +30,7 @@ from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import clusters_to_tell
 from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.profile import intervals as edge_intervals
-from nnode.discover.statistics.random_effects import Individuals
+from nnode.discover.statistics.random_effects import IndividualEstimate
 from nnode.discover.statistics.score import Evidence, Score
 from nnode.model.effects import Effect
 from nnode.model.extend import place_of
@@ -76,7 +76,7 @@ def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profil
     return best_profile(engine, fit.system, rival.fit.system, level)
 
 
-def named_agents(estimate: Individuals, confirmed: float, order: int) -> NamedEffect:
+def named_agents(estimate: IndividualEstimate, confirmed: float, order: int) -> NamedEffect:
     """A confirmed individual effect, in a law of an order."""
     effect = estimate.effect
     coefficients = {}
@@ -131,7 +131,7 @@ def _where(
     return "everybody, everywhere"
 
 
-def absences(search: Search, power: PowerSimulation) -> list[Absence]:
+def absences(search: Selection, power: PowerSimulation) -> list[Absence]:
     """Bounds of the effects that were not selected, by the power of the whole procedure."""
     return [_absence(score, power) for score in search.scores]
 
@@ -204,7 +204,7 @@ def _information(evidence: Evidence) -> float:
     return float(evidence.grams.sum())
 
 
-def agents_absent(estimate: Individuals, alpha: float, enough_clusters: bool) -> Absence:
+def agents_absent(estimate: IndividualEstimate, alpha: float, enough_clusters: bool) -> Absence:
     """The bound of differences between agents that were not significant."""
     (name,) = estimate.effect.strengths
     strength = estimate.effect.strengths[name]

@@ -38,8 +38,8 @@ def symbolic(name: str, at: np.ndarray, heights: np.ndarray, errors: np.ndarray)
         if design.shape[1] >= len(u):
             continue
         weights, *_ = np.linalg.lstsq(design, heights / errors, rcond=None)
-        left = heights / errors - design @ weights
-        value = float(left @ left) + design.shape[1] * np.log(len(u))
+        residuals = heights / errors - design @ weights
+        value = float(residuals @ residuals) + design.shape[1] * np.log(len(u))
         if best is None or value < best[0]:
             best = value, form, weights
     assert best is not None

@@ -50,7 +50,7 @@ class Step:
 
 
 @dataclass
-class Search:
+class Selection:
     """The state of a selection of effects.
 
     Attributes:
@@ -118,7 +118,7 @@ def search(
     levels: dict[str, np.ndarray] | None = None,
     within: Callable[[float], None] = lambda part: None,
     hints: list[System] | None = None,
-) -> Search:
+) -> Selection:
     """Add effects until none passes, then eliminate those that are not needed.
 
     If a free curve predicts better than an effect, the effect is kept only if a second effect is
@@ -139,8 +139,10 @@ def search(
         within: called with the share of the search that is done.
         hints: calibrated models with effects; the calibrations of these effects also start there.
     """
-    selection, levels = Search(fit), levels or {}
-    doubtful: Search | None = None  # the state before an effect that a curve predicts better than
+    selection, levels = Selection(fit), levels or {}
+    doubtful: Selection | None = (
+        None  # the state before an effect that a curve predicts better than
+    )
     while True:
         screen = _screened(engine, selection, effects, seed, levels, within, alpha)
         selection.first = selection.first or selection.scores
@@ -173,7 +175,7 @@ def search(
 
 def _screened(
     engine: Engine,
-    selection: Search,
+    selection: Selection,
     effects: list[type[Effect]],
     seed: int,
     levels: dict[str, np.ndarray],
@@ -224,7 +226,7 @@ def _columns(columns: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
     return columns[id(fit)]
 
 
-def _round(engine: Engine, selection: Search, alpha: float, hints: list[System]) -> Step | None:
+def _round(engine: Engine, selection: Selection, alpha: float, hints: list[System]) -> Step | None:
     scores, screen = selection.scores, selection.screen
     assert screen is not None
     if not scores:
@@ -254,12 +256,16 @@ def _round(engine: Engine, selection: Search, alpha: float, hints: list[System])
     best = _simplest(passing, screen)
     if best.score.p_value > alpha:
         best.score = replace(best.score, p_value=best.presence_pvalue * len(scores))
-    tests = [(other, _j_test(other, best, screen)) for other in candidates if other is not best]
-    return Step(best, [(other, test) for other, test in tests if _is_rival(best, other, test)])
+    tests = [(rival, _j_test(rival, best, screen)) for rival in candidates if rival is not best]
+    return Step(best, [(rival, test) for rival, test in tests if _is_rival(best, rival, test)])
 
 
 def _ranked(
-    engine: Engine, selection: Search, ranked: list[Score], hints: list[System], significant: bool
+    engine: Engine,
+    selection: Selection,
+    ranked: list[Score],
+    hints: list[System],
+    significant: bool,
 ) -> list[Candidate]:
     """The candidates calibrated with the model, the best first; none if the model fits exactly.
 
@@ -292,7 +298,7 @@ def _ranked(
 
 
 def _with_refitted_variances(
-    engine: FollowersEngine, candidates: list[Candidate], selection: Search
+    engine: FollowersEngine, candidates: list[Candidate], selection: Selection
 ) -> list[Candidate]:
     """The candidates with variances refitted under the most likely of them. The variances of the
     model without a strong effect would attribute it to autocorrelated pushes."""
@@ -357,7 +363,7 @@ def _j_test(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
     return j_test(first.fit, second.fit, label)
 
 
-def _refined(engine: Engine, candidates: list[Candidate], selection: Search) -> list[Candidate]:
+def _refined(engine: Engine, candidates: list[Candidate], selection: Selection) -> list[Candidate]:
     """The candidates with converged calibrations, the best first. Similar effects differ by less
     than the tolerance of the rough calibration."""
     assert selection.screen is not None
@@ -403,7 +409,9 @@ def _contains(wider: Candidate, narrower: Candidate) -> bool:
     return narrower.name in wider.score.effect.contains
 
 
-def without_steps(engine: Engine, selection: Search, steps: list[Step], base: System) -> Search:
+def without_steps(
+    engine: Engine, selection: Selection, steps: list[Step], base: System
+) -> Selection:
     """A selection without some of its effects, recalibrated.
 
     Args:
@@ -417,7 +425,7 @@ def without_steps(engine: Engine, selection: Search, steps: list[Step], base: Sy
     return replace(selection, fit=converged_fit(engine, start, rounds=1), steps=kept)
 
 
-def _pruned(engine: Engine, selection: Search) -> Search:
+def _pruned(engine: Engine, selection: Selection) -> Selection:
     """Backward elimination: remove effects that are no longer needed, and rivals that can be
     distinguished given the other effects. Effects are ordered by their held-out gain, so that
     weaker ones are tested given stronger ones."""
@@ -448,7 +456,7 @@ def _pruned(engine: Engine, selection: Search) -> Search:
 
 
 def _rivals_given_others(
-    engine: Engine, selection: Search, step: Step, before: Fit
+    engine: Engine, selection: Selection, step: Step, before: Fit
 ) -> list[tuple[Candidate, Comparison]]:
     """The rivals of an effect that cannot be distinguished from it given the other effects.
 

@@ -144,7 +144,7 @@ def verdict(d: Diagnosis) -> str:
         gain += (
             ", in the last part of each sequence, each agent's number being taken from the first"
         )
-    unconfirmed = f" {_listed([one.name for one in d.leads])} was found too, but not confirmed."
+    unconfirmed = f" {_listed([e.name for e in d.leads])} was found too, but not confirmed."
     match d.verdict:
         case "named":
             pronoun = "it" if len(d.effects) == 1 else "them"
@@ -154,15 +154,15 @@ def verdict(d: Diagnosis) -> str:
             )
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
-            beside = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
+            rivals = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
             return (
                 f"The model {d.model} lacks something, and these data cannot tell whether it is "
-                f"{names} or rather {beside}: with {names}, {gain}."
+                f"{names} or rather {rivals}: with {names}, {gain}."
             )
         case "unconfirmed":
             return (
                 f"Not confirmed: in the open data the model {d.model} seems to lack "
-                f"{_listed([one.name for one in d.leads])}, but {d.confirmation.reason}. It is not "
+                f"{_listed([e.name for e in d.leads])}, but {d.confirmation.reason}. It is not "
                 "added to the model."
             )
         case "not_testable":

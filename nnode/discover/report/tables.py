@@ -64,13 +64,13 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
         }
         for law in laws.ranking
     ]
-    beside = ""
+    restriction = ""
     if laws.effects:
-        beside = f", those that have a place for it with {', '.join(laws.effects)}"
+        restriction = f", those that have a place for it with {', '.join(laws.effects)}"
     return _table(
         name,
         rows,
-        f"Base laws on the open sequences{beside}. *held-out cost*: of whitened "
+        f"Base laws on the open sequences{restriction}. *held-out cost*: of whitened "
         "residuals, mean of logarithms over clusters; *p*: one-sided, that the law is as good as "
         f"the first. {_ERRORS[domain]}",
     )
@@ -208,14 +208,16 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
     rows = [
         {
             "chosen": effect.name,
-            "as good": other.name,
-            "loss relative to the chosen": amount(other.loss, 4),
-            "p": amount(other.p_value, 2),
-            "what would tell them apart": _apart(other),
-            "or so many open clusters": "–" if other.clusters is None else other.clusters,
+            "as good": alternative.name,
+            "loss relative to the chosen": amount(alternative.loss, 4),
+            "p": amount(alternative.p_value, 2),
+            "what would tell them apart": _apart(alternative),
+            "or so many open clusters": "–"
+            if alternative.clusters is None
+            else alternative.clusters,
         }
         for effect in d.effects
-        for other in effect.alternatives
+        for alternative in effect.alternatives
     ]
     return _table(
         "alternatives",
@@ -229,8 +231,8 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
     )
 
 
-def _apart(other: Alternative) -> str:
-    profile = other.profile
+def _apart(alternative: Alternative) -> str:
+    profile = alternative.profile
     leader = (
         ""
         if profile is None
@@ -240,7 +242,7 @@ def _apart(other: Alternative) -> str:
             f"back every {profile.period:g} s"
         )
     )
-    return "; ".join(part for part in (other.separated_by, leader) if part) or "–"
+    return "; ".join(part for part in (alternative.separated_by, leader) if part) or "–"
 
 
 def gap_table(d: Diagnosis) -> TableBlock:

@@ -36,7 +36,7 @@ RELINEARISATIONS, LARGEST_CHANGE = 3, 0.1
 
 
 @dataclass
-class Individuals:
+class IndividualEstimate:
     """An individual effect in the residuals of a calibrated model.
 
     Attributes:
@@ -91,7 +91,9 @@ class Individuals:
         return self.effect.spread(float(np.sqrt(self.error * quantiles.sum())))
 
 
-def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Individuals | None:
+def estimate_individual(
+    engine: Engine, fit: Fit, effect: type[IndividualEffect]
+) -> IndividualEstimate | None:
     """The best setting of an individual effect; None if no agent is observed long enough."""
     probes = effect.probes(engine.batch, fit.system)
     fits = [_at(engine, fit, effect, probe.options) for probe in probes]
@@ -105,8 +107,8 @@ def individuals(engine: Engine, fit: Fit, effect: type[IndividualEffect]) -> Ind
     return best
 
 
-def numbers(
-    engine: Engine, system: System, estimate: Individuals, *, common: bool = False
+def agent_parameters(
+    engine: Engine, system: System, estimate: IndividualEstimate, *, common: bool = False
 ) -> dict[str, list[float]]:
     """The agents' parameters by sequence name, from all data of the engine.
 
@@ -120,7 +122,7 @@ def numbers(
         estimate: provides the variances and settings.
         common: one parameter for all agents of a sequence.
     """
-    system = with_people(system, estimate, {})
+    system = with_agent_parameters(system, estimate, {})
     effect = next(t for t in system.terms if isinstance(t, estimate.effect))
     label = engine.sequence if common else engine.unit
     amounts: np.ndarray | None = None
@@ -145,7 +147,7 @@ def numbers(
     return effect.people
 
 
-def _mean_transient_variance(engine: Engine, estimate: Individuals) -> float:
+def _mean_transient_variance(engine: Engine, estimate: IndividualEstimate) -> float:
     """Variance of the transient deviation averaged over the duration of sequences."""
     height, tau = estimate.transient
     last = np.array([s.time[-1] - s.time[0] for s in engine.sequences]).mean()
@@ -167,7 +169,9 @@ def _with_transient_variance(
     return shrink @ information, np.einsum("uij,uj->ui", shrink, score)
 
 
-def with_people(system: System, estimate: Individuals, people: dict[str, list[float]]) -> System:
+def with_agent_parameters(
+    system: System, estimate: IndividualEstimate, people: dict[str, list[float]]
+) -> System:
     """A copy of a model with an individual effect and its agents' parameters."""
     if any(isinstance(effect, estimate.effect) for effect in effects_of(system)):
         system = without(system, estimate.effect.name)
@@ -182,7 +186,7 @@ def with_people(system: System, estimate: Individuals, people: dict[str, list[fl
 
 def _at(
     engine: Engine, fit: Fit, effect: type[IndividualEffect], options: dict[str, Any]
-) -> Individuals | None:
+) -> IndividualEstimate | None:
     estimates = period_estimates(engine, fit, _directions(engine, fit, effect, options))
     if len(estimates.agent) < 2:
         return None
@@ -201,7 +205,7 @@ def _at(
     if count < 3:  # as for all jackknife intervals
         error = float("nan")
     p_value = float(stats.t.sf(constant / error, count - 1)) if error > 0 else 1.0
-    return Individuals(
+    return IndividualEstimate(
         effect=effect,
         options=options,
         variance=constant,
@@ -226,7 +230,7 @@ def _directions(
     return directions
 
 
-def _with_interval(estimates: list[Individuals], best: Individuals) -> None:
+def _with_interval(estimates: list[IndividualEstimate], best: IndividualEstimate) -> None:
     """Interpolate the setting with the largest variance by a parabola through its neighbours, with
     a jackknife interval."""
     (name,) = best.options
@@ -257,7 +261,7 @@ def _vertex(at: np.ndarray, gain: np.ndarray) -> np.ndarray:
 
 
 def _people(
-    engine: Engine, estimate: Individuals, amounts: np.ndarray, common: bool
+    engine: Engine, estimate: IndividualEstimate, amounts: np.ndarray, common: bool
 ) -> dict[str, list[float]]:
     names, size = [s.name for s in engine.sequences], engine.batch.agent.shape[1]
     people_numbers = {name: [0.0] * size for name in names}

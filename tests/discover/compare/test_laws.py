@@ -17,7 +17,7 @@ from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
 from nnode.discover.compare.laws import BetterLaw, compare_laws, explained_by_law, with_effects
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import Search, Step, converged_fit, initial_fit, without_steps
+from nnode.discover.name.search import Selection, Step, converged_fit, initial_fit, without_steps
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.fit import refine
 from nnode.errors import ConfigError
@@ -115,11 +115,11 @@ def test_what_a_nearer_law_does_without_is_no_finding(tmp_path: Path) -> None:
     engine = TrafficEngine(sequences, clusters=label)
     base = converged_fit(engine, initial_fit(engine, law("lin").double()).system)
 
-    def added(name: str) -> Search:
+    def added(name: str) -> Selection:
         kind = CATALOGUE.effects[name]
         fit = refine(engine, extended(base.system, kind())[0])
         chosen = SimpleNamespace(name=name, score=SimpleNamespace(effect=kind))
-        return Search(fit, [Step(chosen, [])])
+        return Selection(fit, [Step(chosen, [])])
 
     other = initial_fit(engine, law("ovm").double())
     nearer = BetterLaw("ovm", other.system)

@@ -15,7 +15,11 @@ from nnode.discover.judge.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import Fit
-from nnode.discover.statistics.random_effects import Individuals, individuals, numbers
+from nnode.discover.statistics.random_effects import (
+    IndividualEstimate,
+    agent_parameters,
+    estimate_individual,
+)
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.extend import extended
 from tests.discover.lanes.test_engine import model
@@ -31,11 +35,11 @@ def paced(own: np.ndarray) -> list[Sequence]:
     return made
 
 
-def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, Individuals]:
+def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, IndividualEstimate]:
     """What is found of different drivers."""
     engine = TrafficEngine(sequences, clusters=clusters(index_of(sequences)))
     fit = converged_fit(engine, model(), rounds=1)
-    found = individuals(engine, fit, DriverHeterogeneity)
+    found = estimate_individual(engine, fit, DriverHeterogeneity)
     assert found is not None
     return engine, fit, found
 
@@ -46,11 +50,11 @@ def test_drivers_who_differ_are_recognised() -> None:
     assert found.p_value < 0.01
     low, high = found.interval()
     assert 0.04 < low < 0.1 < high
-    own = numbers(engine, fit.system, found)
+    own = agent_parameters(engine, fit.system, found)
     got = np.array([own[f"r/{s}"][:4] for s in range(12)])
     assert np.corrcoef(got.ravel(), pace.ravel())[0, 1] > 0.95
     # one number for all of a sequence is the mean of theirs
-    shared = numbers(engine, fit.system, found, common=True)
+    shared = agent_parameters(engine, fit.system, found, common=True)
     assert all(len(set(shared[f"r/{s}"][:4])) == 1 for s in range(12))
 
 
