@@ -55,7 +55,7 @@ def planned(
     given = options.drivers
     if given == NONE:
         return NONE
-    from nnode.population.drivers import known_names, obstacle  # compiled code takes a second
+    from nnode.population.drivers import full_names, obstacle  # compiled code takes a second
     from nnode.population.followers import drivers_differ
 
     if given is None:
@@ -80,7 +80,7 @@ def planned(
     if given == AUTO:
         return AUTO
     law = cast(Term, model.terms[0])
-    known_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
+    full_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
     return list(given)
 
 

@@ -122,13 +122,17 @@ def fit_drivers(
     starts = [plain.start] if first is None else [plain.start, plain.at(np.array(alternative))]
     law = plain.may_differ
     if drivers == "auto":
-        population = _differing(_best(plain, noise, starts))
+        population = _with_random_effects(_most_likely(plain, noise, starts))
     else:
-        names = [] if drivers == "none" else known_names(drivers, law)
+        names = [] if drivers == "none" else full_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
-        population = _best(model, noise, starts)
+        population = _most_likely(model, noise, starts)
     correctable = pairs > 0 and population.estimate.converged
-    return _corrected(population, np.random.default_rng(seed), pairs) if correctable else population
+    return (
+        _bias_corrected(population, np.random.default_rng(seed), pairs)
+        if correctable
+        else population
+    )
 
 
 def obstacle(system: System, sequences: list[Sequence]) -> str | None:
@@ -156,7 +160,7 @@ def obstacle(system: System, sequences: list[Sequence]) -> str | None:
     return None
 
 
-def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) -> Population:
+def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> Population:
     """Calibrate another model of the same law, starting from an earlier estimate.
 
     Args:
@@ -165,12 +169,12 @@ def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) 
         fixed: only estimate deviations, with the system's parameters and the earlier variances.
     """
     model, previous = Followers(system, paths, before.random), before.estimate
-    variances = _started(previous.variances, model)
+    variances = _with_starts(previous.variances, model)
     same_followers = before.model.paths.names == paths.names
     same_followers &= previous.start.shape == (len(paths.agent), model.starts)
     modes = (previous.agents, previous.start) if same_followers else (None, None)
     if not fixed:
-        return _differing(_estimated(model, before.noise, model.start, variances, *modes))
+        return _with_random_effects(_estimated(model, before.noise, model.start, variances, *modes))
     agents, start = modes
     deviations = fit_deviations(
         model, before.noise, model.start, variances, agents=agents, start=start
@@ -178,7 +182,7 @@ def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) 
     return replace(before, model=model, estimate=deviations, bias=np.zeros(len(model.start)))
 
 
-def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
+def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     """Full names of a law's parameters, from their short names.
 
     Args:
@@ -197,7 +201,7 @@ def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
-def _corrected(population: Population, rng: np.random.Generator, pairs: int) -> Population:
+def _bias_corrected(population: Population, rng: np.random.Generator, pairs: int) -> Population:
     """Correct the parameters for their bias in simulations of the estimated model.
 
     The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
@@ -243,13 +247,13 @@ def _estimated(
     return Population(model=model, noise=noise, estimate=result, bias=np.zeros(len(result.theta)))
 
 
-def _best(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
+def _most_likely(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
     """The estimate with the largest likelihood from several starts."""
     fits = [_estimated(model, noise, theta, _variances(model)) for theta in starts]
     return max(fits, key=lambda fit: fit.marginal.loglik)
 
 
-def _differing(best: Population) -> Population:
+def _with_random_effects(best: Population) -> Population:
     """Forward selection of random effects.
 
     Random effects are added while twice the log marginal likelihood rises by more than the
@@ -258,24 +262,24 @@ def _differing(best: Population) -> Population:
     are estimated.
     """
     price = math.log(max(len(best.model.paths.names), 2)) / 2
-    while (better := _better(best, price)) is not None:
+    while (better := _next_random_effect(best, price)) is not None:
         best = better
     return best
 
 
-def _better(best: Population, price: float) -> Population | None:
+def _next_random_effect(best: Population, price: float) -> Population | None:
     """The estimate with one more random effect; None if none raises the likelihood enough."""
     limit = best.marginal.loglik + price
     remaining = [name for name in best.model.may_differ if name not in best.random]
-    ranked = [(_linearised(best, name), name) for name in remaining]
+    ranked = [(_linearised_loglik(best, name), name) for name in remaining]
     candidates = [name for value, name in sorted(ranked, reverse=True) if value > limit]
     improved: list[Population] = []
     for name in candidates:
         system, paths = best.model.system, best.model.paths
         model, before = Followers(system, paths, [*best.random, name]), best.estimate
-        variances = _widened(before.variances)
+        variances = _with_random_effect(before.variances)
         fit = _estimated(model, best.noise, before.theta, variances, steps=RANKING_STEPS)
-        if _differs(fit.estimate) and fit.marginal.loglik > limit:
+        if _identified(fit.estimate) and fit.marginal.loglik > limit:
             improved.append(fit)
         if len(improved) == RANKED:
             break
@@ -287,17 +291,19 @@ def _better(best: Population, price: float) -> Population | None:
     return _estimated(chosen.model, best.noise, partial.theta, partial.variances, *modes)
 
 
-def _linearised(best: Population, name: str) -> float:
+def _linearised_loglik(best: Population, name: str) -> float:
     """The log marginal likelihood with one more random effect, at the present linearisation."""
     model, previous = best.model, best.estimate
     random = [*model.random, model.names.index(name)]
     data = replace(previous.data, random=previous.data.fixed[..., random])
-    variances = fit_variances(data, best.noise, _widened(previous.variances), tolerance=TOLERANCE)
+    variances = fit_variances(
+        data, best.noise, _with_random_effect(previous.variances), tolerance=TOLERANCE
+    )
     products = best.noise.products(data, variances.noise)
     return marginal(data, products, variances.spread, variances.start).loglik
 
 
-def _differs(fit: Estimate) -> bool:
+def _identified(fit: Estimate) -> bool:
     """Whether the data identify the variances of all random effects."""
     informative = np.median(fit.marginal.shrinkage, 0) < SHRINKAGE
     return bool((informative & (fit.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
@@ -322,7 +328,7 @@ def _variances(model: Followers) -> Variances:
     )
 
 
-def _started(variances: Variances, model: Followers) -> Variances:
+def _with_starts(variances: Variances, model: Followers) -> Variances:
     """Variances with as many standard deviations of starts as a model needs."""
     n_starts, defaults = len(variances.start), _variances(model)
     if n_starts == model.starts:
@@ -335,7 +341,7 @@ def _started(variances: Variances, model: Followers) -> Variances:
     return replace(variances, start=start, low=low, high=high)
 
 
-def _widened(variances: Variances) -> Variances:
+def _with_random_effect(variances: Variances) -> Variances:
     """Variances with one more random effect. If the correlation time of the pushes is at its bound,
     it stood in for this effect, and the search restarts with a shorter one."""
     at = len(variances.noise) + len(variances.spread)

@@ -160,11 +160,11 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
         start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
-        batch=collate(_with_those_ahead(sequences[b], i) for b, i in which),
+        batch=collate(_with_vehicles_ahead(sequences[b], i) for b, i in which),
     )
 
 
-def _with_those_ahead(s: Sequence, place: int) -> Sequence:
+def _with_vehicles_ahead(s: Sequence, place: int) -> Sequence:
     """The sequence of a follower and of the one or two vehicles ahead of him."""
     index = np.arange(s.n_agents)
     return s.select((index >= place) & (index <= place + 2))
@@ -202,13 +202,13 @@ def _ahead(
     return ahead_paths
 
 
-def _named(ahead: np.ndarray) -> dict[str, np.ndarray]:
+def _ahead_symbols(ahead: np.ndarray) -> dict[str, np.ndarray]:
     """The formulas' names of the states ``(4, ..., F)`` of the vehicles ahead."""
     x1, v1, x2, v2 = ahead
     return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
-def behind_leaders(system: System) -> LaneDynamics | None:
+def follower_formula(system: System) -> LaneDynamics | None:
     """The formula of a model that only reads the positions and speeds of the vehicles ahead; None
     for other models."""
     lane = formula_of(system)
@@ -221,23 +221,23 @@ def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
     """Whether differences between drivers are estimated by default: if the model is a formula of
     the positions and speeds of a driver and of the vehicles ahead, and the measurement errors are
     in the range :data:`NOISE`."""
-    if behind_leaders(system) is None:
+    if follower_formula(system) is None:
         return False
     return NOISE[0] < measured_noise(sequences).position < NOISE[1]
 
 
-def _followed(lane: LaneDynamics) -> int:
+def _n_disturbed(lane: LaneDynamics) -> int:
     """The number of states through which disturbances act, also at the start."""
     number = len(lane.rates)
     return number if number <= lane.order + STATES else lane.order
 
 
 @cache
-def _slopes(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
+def _jacobian(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
     """Derivatives of the rates by the states through which disturbances act: their places in the
     Jacobian, and a function that computes them."""
     states = list(lane.rates)
-    number = _followed(lane)
+    number = _n_disturbed(lane)
     slopes = [
         ((p, states.index(name)), slope)
         for p, state in enumerate(states[:number])
@@ -268,13 +268,13 @@ class Followers:
 
     def __init__(self, system: System, paths: Paths, random: list[str] | None = None) -> None:
         self.system, self.paths = system, paths
-        terms, lane = cast(list[Term], list(system.terms)), behind_leaders(system)
+        terms, lane = cast(list[Term], list(system.terms)), follower_formula(system)
         if lane is None:
             raise ConfigError(
                 "drivers who differ need a model of a lane whose law and effects are formulas of "
                 "the positions and speeds of the vehicles ahead; take drivers=none"
             )
-        self.lane, self.starts = lane, _followed(lane)
+        self.lane, self.starts = lane, _n_disturbed(lane)
         self.vector = ParameterVector(system)
         symbols = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
         self._symbols = [symbols[place] for place in self.vector.places]
@@ -310,7 +310,7 @@ class Followers:
         flags = zip(self.names, self.logs & self.law, strict=True)
         return [name for name, differs in flags if differs]
 
-    def behind(self, paths: Paths) -> Followers:
+    def with_paths(self, paths: Paths) -> Followers:
         """The same model with other paths of the same followers."""
         model = copy.copy(self)
         model.paths = paths
@@ -336,13 +336,13 @@ class Followers:
             pushed: the push on the highest rate.
         """
         paths, order = self.paths, self.lane.order
-        fixed = self._given(theta)
+        fixed = self._constants(theta)
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
             initial_values = round(t / paths.half)
             values = {**fixed, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
             rate_values = np.empty_like(y)
-            rates = self._rates({**values, **_named(paths.ahead[initial_values])})
+            rates = self._rates({**values, **_ahead_symbols(paths.ahead[initial_values])})
             for target, part in zip(rate_values, rates, strict=True):
                 target[...] = part
             if pushed is not None:
@@ -358,7 +358,7 @@ class Followers:
                 "x": initial[0],
                 "v": initial[-1],
                 "t": 0.0,
-                **_named(paths.ahead[0]),
+                **_ahead_symbols(paths.ahead[0]),
             }
             if order == 1:
                 initial_values["v"] = np.broadcast_to(paths.start[1], shape)
@@ -368,7 +368,7 @@ class Followers:
         with np.errstate(all="ignore"):
             return simulated(rate, initial, paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9)
 
-    def _given(self, theta: np.ndarray) -> dict[str, Any]:
+    def _constants(self, theta: np.ndarray) -> dict[str, Any]:
         """The constants of runs with parameters ``(R, P, F)``."""
         natural = self.natural(theta.transpose(0, 2, 1)).transpose(2, 0, 1)
         return {**self._fixed, **dict(zip(self._symbols, natural, strict=True))}
@@ -425,17 +425,17 @@ class Followers:
             parameters: ``(P, F)`` parameters of each follower. states: ``(K, M, F)`` of the run.
         """
         with np.errstate(all="ignore"):
-            rates = self._rates(self._along(parameters, states))
+            rates = self._rates(self._symbols_along(parameters, states))
         return np.stack([np.broadcast_to(rate, states[:, 0].shape) for rate in rates])
 
-    def _along(self, parameters: np.ndarray, states: np.ndarray) -> dict[str, Any]:
+    def _symbols_along(self, parameters: np.ndarray, states: np.ndarray) -> dict[str, Any]:
         """The formulas' symbols along a run."""
         times = self.paths.dt * np.arange(len(states))
         return {
-            **self._given(parameters[None]),
+            **self._constants(parameters[None]),
             **dict(zip(self.lane.rates, states.transpose(1, 0, 2), strict=True)),
             "t": times[:, None],
-            **_named(self.paths.ahead_at_samples.swapaxes(0, 1)),
+            **_ahead_symbols(self.paths.ahead_at_samples.swapaxes(0, 1)),
         }
 
     def linear(self, parameters: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -450,11 +450,13 @@ class Followers:
             and by the sum of the changes of their rates at both ends.
         """
         paths, lane = self.paths, self.lane
-        entries, slopes = _slopes(lane)
+        entries, slopes = _jacobian(lane)
         size = max([lane.order, *(max(place) + 1 for place in entries)])
         matrix = np.zeros((len(states), len(paths.agent), size, size))
         with np.errstate(all="ignore"):
-            for (p, q), value in zip(entries, slopes(self._along(parameters, states)), strict=True):
+            for (p, q), value in zip(
+                entries, slopes(self._symbols_along(parameters, states)), strict=True
+            ):
                 matrix[..., p, q] = np.broadcast_to(value, matrix.shape[:2])
         # the linearisation is only valid while it does not diverge
         matrix = np.clip(np.nan_to_num(matrix), -1 / paths.dt, 1 / paths.dt)
@@ -463,7 +465,7 @@ class Followers:
         )
         return np.ascontiguousarray(step), np.ascontiguousarray(paths.dt / 2 * by_forcing)
 
-    def drawn(self, estimate: Estimate, draw: Draw) -> Paths:
+    def simulated_paths(self, estimate: Estimate, draw: Draw) -> Paths:
         """Simulated measurements of the estimated model (parametric bootstrap).
 
         Args:
@@ -506,8 +508,10 @@ def score_bias(
     changes = []
     for _ in range(pairs):
         for draw in antithetic_draws(int(rng.integers(2**63))):
-            paths = model.drawn(estimate, draw)
-            modes = fit_deviations(model.behind(paths), noise, estimate.theta, estimate.variances)
+            paths = model.simulated_paths(estimate, draw)
+            modes = fit_deviations(
+                model.with_paths(paths), noise, estimate.theta, estimate.variances
+            )
             changes.append(modes.marginal.change)
     return np.asarray(np.mean(changes, 0))
 

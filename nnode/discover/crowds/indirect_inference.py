@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 CROWDS, STEPS = 3, 2
 
 
-def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
+def bias_corrected(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
     """A calibrated model, corrected for its bias, with the standard errors of the correction.
 
     Simulations that diverge are ignored; with fewer than two others, the fit is returned unchanged.

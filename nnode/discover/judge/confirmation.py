@@ -11,7 +11,7 @@ import numpy as np
 
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
-from nnode.discover.crowds.indirect_inference import unbiased
+from nnode.discover.crowds.indirect_inference import bias_corrected
 from nnode.discover.judge.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.discover.judge.model_comparison import ModelComparison, engine_of, too_few
 from nnode.discover.judge.verdict import named
@@ -210,7 +210,7 @@ class ConfirmationSet:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
 
     def _unbiased(self, fit: Fit) -> Fit:
-        return unbiased(fit, self.exploration, self.seed) if self.domain == "crowd" else fit
+        return bias_corrected(fit, self.exploration, self.seed) if self.domain == "crowd" else fit
 
     def corrected(self, selection: Selection) -> Fit:
         """The fit with the confirmed effects, corrected for its bias by simulation."""

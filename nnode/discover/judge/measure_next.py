@@ -103,7 +103,7 @@ def distance(
     start = np.concatenate([-np.cumsum(gaps[::-1])[::-1], [0.0]])
     paths = _driven(truth, _platoon(template, time, place[:, None] + start))
     kept = time >= LASTS - dt / 2
-    platoon_engine = engine.of([_platoon(template, time[kept], paths[kept])])
+    platoon_engine = engine.on_sequences([_platoon(template, time[kept], paths[kept])])
     row = ParameterVector(wrong).row
     residual = platoon_engine.residuals(wrong, row[None])[0].numpy()
     columns = platoon_engine.tangents(wrong, row).numpy().T

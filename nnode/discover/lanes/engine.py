@@ -294,7 +294,7 @@ class TrafficEngine:
         sources = [(rates(place) - base) / SMALL for place in range(size)]
         return self._columns(linear, linear.response(torch.stack(sources)))
 
-    def of(self, sequences: list[Sequence]) -> TrafficEngine:
+    def on_sequences(self, sequences: list[Sequence]) -> TrafficEngine:
         """An engine of other sequences, with the filter of this one."""
         engine = TrafficEngine(sequences, np.inf, None, np.inf)
         engine.filter = self.filter

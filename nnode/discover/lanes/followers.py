@@ -38,7 +38,7 @@ from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
-from nnode.population.drivers import Population, fit_again, fit_drivers
+from nnode.population.drivers import Population, fit_drivers, refit
 from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
 from nnode.population.likelihood import Whitening, marginal
 from nnode.simulation.numpy import strides
@@ -182,7 +182,7 @@ class FollowersEngine(TrafficEngine):
         source[-1] = np.stack(speeds, 1)
         return self._residual_changes(run, self._propagate(run, source))
 
-    def of(self, sequences: list[Sequence]) -> FollowersEngine:
+    def on_sequences(self, sequences: list[Sequence]) -> FollowersEngine:
         """An engine of other sequences, with the estimates of this one."""
         assert self.population is not None
         engine = FollowersEngine(sequences, large=np.inf, like=self)
@@ -207,7 +207,7 @@ class FollowersEngine(TrafficEngine):
         if start is None:
             self._set_population(fit_drivers(fixed, paths, pairs=0))
         else:
-            self._set_population(fit_again(start, fixed, paths, fixed=self._like is not None))
+            self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
 
     def fit_whitening_among(self, systems: list[System]) -> None:
         """Estimate with each of some models, and keep the estimate with the best BIC. The variances
@@ -225,18 +225,18 @@ class FollowersEngine(TrafficEngine):
         assert best.population is not None
         self._set_population(best.population)
 
-    def drawn(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
+    def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
         errors as estimated under it: an antithetic pair of draws."""
         assert self.population is not None
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         paths = self._paths(self._longest(fixed, row[None]))
-        refitted, engines = fit_again(self.population, fixed, paths, fixed=True), []
+        refitted, engines = refit(self.population, fixed, paths, fixed=True), []
         for draw in antithetic_draws(seed):
             engine = copy.copy(self)
-            paths = refitted.model.drawn(refitted.estimate, draw)
+            paths = refitted.model.simulated_paths(refitted.estimate, draw)
             engine._paths_by_step = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
-            engine._set_population(fit_again(refitted, fixed, paths, fixed=True))
+            engine._set_population(refit(refitted, fixed, paths, fixed=True))
             engines.append(engine)
         return engines
 

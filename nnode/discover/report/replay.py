@@ -17,7 +17,7 @@ SCENES = 16
 BEFORE, AFTER = "without effects", "with effects"
 
 
-def telling(outcome: DiagnosisOutcome) -> list[int]:
+def by_improvement(outcome: DiagnosisOutcome) -> list[int]:
     """Rows of ``diagnosis.sealed``, first the one whose error falls most, or without effects the
     one with the largest error. Rows without two finite errors are left out."""
     rows = outcome.diagnosis.sealed
@@ -32,12 +32,12 @@ def telling(outcome: DiagnosisOutcome) -> list[int]:
 
 def scenes(outcome: DiagnosisOutcome) -> list[Scene]:
     """Confirmation sequences with the simulations of their errors, without and with effects, in the
-    order of :func:`telling`.
+    order of :func:`by_improvement`.
 
     The still figure has the first one; a crowd's player begins with the one with most people.
     """
     replayed = []
-    for i in telling(outcome)[:SCENES]:
+    for i in by_improvement(outcome)[:SCENES]:
         before, after = outcome.simulated[i]
         if before is None or after is None:
             continue

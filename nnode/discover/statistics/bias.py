@@ -34,7 +34,7 @@ def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
     if not isinstance(engine, FollowersEngine):
         return []
     try:
-        engines = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
+        engines = engine.simulated_engines(fit.system, torch.from_numpy(fit.row), seed)
     except SimulationError:
         return []
     fits: SimulatedFits = [(simulated, evaluated(simulated, fit.system)) for simulated in engines]
