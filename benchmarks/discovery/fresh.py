@@ -52,10 +52,10 @@ def on_fresh(
         )
         sequences = read_inputs(data, Path(folder)).sequences
     base = _base(report, names)
-    comparing = ModelComparison(windows_of(base, sequences), base)
-    before = float(np.nanmean(comparing.squares(base)))
-    after = float(np.nanmean(comparing.squares(report.model)))
-    gap = {"before": before, "after": after, "noise_floor": comparing.floor}
+    comparison = ModelComparison(windows_of(base, sequences), base)
+    before = float(np.nanmean(comparison.squares(base)))
+    after = float(np.nanmean(comparison.squares(report.model)))
+    gap = {"before": before, "after": after, "noise_floor": comparison.floor}
     split = {"sealed": [one.name for one in sequences]}
     return {
         "fresh_before": before,

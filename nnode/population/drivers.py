@@ -347,10 +347,7 @@ def _with_random_effect(variances: Variances) -> Variances:
     at = len(variances.noise) + len(variances.spread)
     push, push_time = variances.noise
     if push_time >= (1 - NEAR) * variances.high[1]:
-        push, push_time = (
-            push / 2,
-            np.clip(LASTING, *np.stack([variances.low, variances.high])[:, 1]),
-        )
+        push, push_time = push / 2, np.clip(LASTING, variances.low[1], variances.high[1])
     return replace(
         variances,
         noise=np.array([push, push_time]),

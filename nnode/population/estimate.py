@@ -31,7 +31,7 @@ HALVINGS = 6
 MODES = 0.02
 #: Largest number of linearisations of a search.
 STEPS = 40
-#: The smallest damping of steps that reverse the previous one.
+#: The smallest relaxation factor of steps that reverse the previous one.
 LEAST = 0.2
 
 
@@ -141,7 +141,7 @@ def estimate(
     converged, n_linearisations, n_agents = False, 1, int(data.agent.max()) + 1
     agents = np.zeros((n_agents, data.random.shape[-1])) if agents is None else agents
     start = np.zeros(data.start.shape[::2]) if start is None else start
-    damping, previous_change = 1.0, np.zeros(len(theta))
+    relaxation, previous_change = 1.0, np.zeros(len(theta))
     for _ in range(steps):
         before = variances
         variances = fit_variances(
@@ -153,11 +153,9 @@ def estimate(
         change = np.clip(change, low - theta, high - theta)
         misfit = _misfit(data, products, variances, agents, start)
         reversed_step = previous_change @ current.information @ change < 0
-        damping, previous_change = (
-            max(damping / 2, LEAST) if reversed_step else min(1.25 * damping, 1.0),
-            change,
-        )
-        share, shares, accepted, linearised = damping, np.full((n_agents, 1), damping), None, data
+        relaxation = max(relaxation / 2, LEAST) if reversed_step else min(1.25 * relaxation, 1.0)
+        previous_change, accepted, linearised = change, None, data
+        share, shares = relaxation, np.full((n_agents, 1), relaxation)
         for _ in range(HALVINGS):
             trial = (
                 theta + share * change,
@@ -166,23 +164,20 @@ def estimate(
             )
             linearised, n_linearisations = response(*trial), n_linearisations + 1
             fixed = replace(linearised, step=data.step, forced=data.forced)
-            trial_misfit = _misfit(
-                fixed, noise.products(fixed, variances.noise), variances, *trial[1:]
-            )
+            trial_products = noise.products(fixed, variances.noise)
+            trial_misfit = _misfit(fixed, trial_products, variances, *trial[1:])
             if trial_misfit.sum() <= misfit.sum():
                 accepted = trial
                 break
-            share, shares = (
-                share / 2,
-                np.where((trial_misfit > misfit)[:, None], shares / 2, shares),
-            )
+            rises = (trial_misfit > misfit)[:, None]
+            share, shares = share / 2, np.where(rises, shares / 2, shares)
         scale = np.sqrt(np.maximum(np.diag(current.information), 1e-300))
-        largest_change = np.max(np.abs(change) * scale, initial=0.0)
-        largest_change = max(
-            largest_change, np.max(np.abs(np.log(variances.row / before.row)), initial=0.0)
+        changes = (
+            np.abs(change) * scale,
+            np.abs(np.log(variances.row / before.row)),
+            np.abs(current.deviations - agents) / variances.spread,
         )
-        mode_change = np.abs(current.deviations - agents) / variances.spread
-        largest_change = max(largest_change, np.max(mode_change, initial=0.0))
+        largest_change = max(np.max(values, initial=0.0) for values in changes)
         if accepted is not None:
             (theta, agents, start), data = accepted, linearised
         if largest_change < tolerance or accepted is None:

@@ -136,8 +136,8 @@ class ConfirmationSet:
         self.domain = str(base.domain)
         self.base, self.exploration, self.sequences = base, exploration, confirmation
         self.label, self.clusters, self.seed = label, clusters, seed
-        self.comparing = ModelComparison(engine_of(base, confirmation, label, like=engine), base)
-        self.before = self.comparing.squares(base)
+        self.comparison = ModelComparison(engine_of(base, confirmation, label, like=engine), base)
+        self.before = self.comparison.squares(base)
         self.tests: dict[str, _ModelTest] = {}
         self._corrected_fit: Fit | None = None
         self._held_out: dict[str, HeldOutErrors] = {}
@@ -149,7 +149,7 @@ class ConfirmationSet:
         in the model with all selected effects."""
         if not selection.steps:
             return selection, []
-        full_fit = self._corrected_fit = self._unbiased(selection.fit)
+        full_fit = self._corrected_fit = self._bias_corrected(selection.fit)
         self.tests = self._closed_tests(engine, selection, full_fit)
         unconfirmed = [
             step for step in selection.steps if not self.tests[step.chosen.name].confirmed
@@ -158,7 +158,7 @@ class ConfirmationSet:
             return selection, []
         reduced = None
         if len(unconfirmed) < len(selection.steps):
-            reduced = self._unbiased(self._without(engine, selection.fit, unconfirmed))
+            reduced = self._bias_corrected(self._without(engine, selection.fit, unconfirmed))
             test = self._compared(self.base, reduced.system)
             if not test.confirmed:
                 reduced, unconfirmed = None, selection.steps
@@ -185,7 +185,9 @@ class ConfirmationSet:
                 continue
             reduced = self.base
             if len(subset) < len(selection.steps):
-                reduced = self._unbiased(self._without(engine, selection.fit, list(subset))).system
+                reduced = self._bias_corrected(
+                    self._without(engine, selection.fit, list(subset))
+                ).system
             test = self._compared(reduced, full_fit.system)
             for name in names:
                 weakest[name] = max(weakest.get(name, test), test, key=_ModelTest.weakness)
@@ -193,23 +195,23 @@ class ConfirmationSet:
 
     def _compared(self, before: System, after: System) -> _ModelTest:
         """The tests of two models on the confirmation clusters."""
-        scores, squares = self.comparing.scores, self.comparing.squares
+        scores, squares = self.comparison.scores, self.comparison.squares
         p_value = 1.0
         if not too_few(self.clusters):
-            p_value = better(self.comparing.score_toward(before, after))
+            p_value = better(self.comparison.score_toward(before, after))
         likelihood_rises = bool(gains(scores(before), scores(after)).mean() > 0)
         error_before, error_after = (
             float(np.nanmean(squares(system))) for system in (before, after)
         )
         errors_fall = (
-            error_after < error_before or before is not self.base or self.comparing.drivers
+            error_after < error_before or before is not self.base or self.comparison.drivers
         )
         return _ModelTest(p_value, likelihood_rises, errors_fall, error_before, error_after)
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
 
-    def _unbiased(self, fit: Fit) -> Fit:
+    def _bias_corrected(self, fit: Fit) -> Fit:
         return bias_corrected(fit, self.exploration, self.seed) if self.domain == "crowd" else fit
 
     def corrected(self, selection: Selection) -> Fit:
@@ -305,12 +307,12 @@ class ConfirmationSet:
             before, after = held_out.costs["base"], held_out.costs[MODELS[1]]
             simulated_before, simulated_after = held_out.simulated
         else:
-            used, floor = list(range(len(self.sequences))), self.comparing.floor
-            before, simulated_before = self.before, self.comparing.simulated(self.base)
+            used, floor = list(range(len(self.sequences))), self.comparison.floor
+            before, simulated_before = self.before, self.comparison.simulated(self.base)
             after, simulated_after = before, simulated_before
             if extended is not self.base:
-                after = self.comparing.squares(extended)
-                simulated_after = self.comparing.simulated(extended)
+                after = self.comparison.squares(extended)
+                simulated_after = self.comparison.simulated(extended)
         mean_before, mean_after = float(np.nanmean(before)), float(np.nanmean(after))
         closed = float("nan")
         if mean_before > floor:
@@ -319,7 +321,7 @@ class ConfirmationSet:
             {"name": self.sequences[i].name, "before": float(a), "after": float(b)}
             for i, a, b in zip(used, before, after, strict=True)
         ]
-        compared = "drivers" if self.comparing.drivers else self.domain
+        compared = "drivers" if self.comparison.drivers else self.domain
         gap = Gap(
             mean_before, mean_after, floor, closed, definition=defined(compared, bool(individual))
         )
@@ -339,7 +341,7 @@ class ConfirmationSet:
             calibrated = refine(engine, copy.deepcopy(system)).system
         except SimulationError:
             return float("nan")
-        return float(np.nanmean(self.comparing.squares(calibrated)))
+        return float(np.nanmean(self.comparison.squares(calibrated)))
 
 
 def _rejection_reason(

@@ -137,11 +137,9 @@ def _leaders(engine: TrafficEngine) -> np.ndarray:
 def _excess(engine: TrafficEngine, first: System, second: System) -> float:
     """The overdispersion of the clusters' scores, relative to independent residuals."""
     rows = {s: ParameterVector(s).row[None] for s in (first, second)}
-    residuals_first, residuals_second = (
-        engine.residuals(s, row)[0].numpy() for s, row in rows.items()
-    )
-    scores = sums(residuals_first * (residuals_first - residuals_second), engine.cluster)
-    expected = float(((residuals_first - residuals_second) ** 2).sum())
+    r_first, r_second = (engine.residuals(s, row)[0].numpy() for s, row in rows.items())
+    scores = sums(r_first * (r_first - r_second), engine.cluster)
+    expected = float(((r_first - r_second) ** 2).sum())
     if len(scores) < 2 or not expected > 0:
         return 1.0
     return max(1.0, len(scores) * float(scores.var(ddof=1)) / expected)

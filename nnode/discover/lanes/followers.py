@@ -194,11 +194,8 @@ class FollowersEngine(TrafficEngine):
         """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
         if self._like is not None and self._like.population is not None:
             population = self._like.population
-            system, values = (
-                population.model.system,
-                population.model.natural(population.estimate.theta),
-            )
-            row = torch.from_numpy(values)
+            system = population.model.system
+            row = torch.from_numpy(population.model.natural(population.estimate.theta))
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         paths, previous = self._paths(self._longest(fixed, row[None])), self.population
         start = previous

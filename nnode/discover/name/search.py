@@ -140,15 +140,14 @@ def search(
         hints: calibrated models with effects; the calibrations of these effects also start there.
     """
     selection, levels = Selection(fit), levels or {}
-    doubtful: Selection | None = (
-        None  # the state before an effect that a curve predicts better than
-    )
+    # the state before an effect was added that predicts worse than a curve
+    doubtful: Selection | None = None
     while True:
         screen = _screened(engine, selection, effects, seed, levels, within, alpha)
         selection.first = selection.first or selection.scores
         if len(selection.steps) >= most:
             break
-        step = _round(engine, selection, alpha, hints or [])
+        step = _next_step(engine, selection, alpha, hints or [])
         if step is None:
             break
         if _curve_predicts_better(engine, selection.fit, step.chosen, variables or []):
@@ -170,7 +169,7 @@ def search(
     if doubtful is not None:  # the whitening was fitted with more effects
         selection = replace(doubtful, fit=converged_fit(engine, doubtful.fit.system, rounds=1))
         _screened(engine, selection, effects, seed, levels, within, alpha)
-    return _pruned(engine, selection)
+    return _eliminated(engine, selection)
 
 
 def _screened(
@@ -197,28 +196,24 @@ def _screened(
     if significant and (simulated := simulated_fits(engine, selection.fit, seed)):
         for effect in candidates:
             if effect.name in significant:
-                _unbiased(effect_traces, effect, simulated, selection.screen)
-        corrected = Screen(selection.fit, engine.cluster, seed + n_steps, levels=levels).scores(
-            effect_traces
-        )
-        corrected_p_values = {score.effect.name: score.p_value for score in corrected}
+                _set_bias(effect_traces, effect, simulated, selection.screen)
+        screen = Screen(selection.fit, engine.cluster, seed + n_steps, levels=levels)
+        corrected = {s.effect.name: s.p_value for s in screen.scores(effect_traces)}
         selection.scores = [
-            replace(
-                score, p_value=max(score.p_value, corrected_p_values.get(score.effect.name, 1.0))
-            )
+            replace(score, p_value=max(score.p_value, corrected.get(score.effect.name, 1.0)))
             for score in selection.scores
         ]
     return selection.screen
 
 
-def _unbiased(
+def _set_bias(
     effect_traces: list[Trace], effect: type[Effect], simulated: SimulatedFits, screen: Screen
 ) -> None:
     """Set the bias of an effect's traces: their mean scores in paths simulated by the model."""
     label = screen.label(effect.name)
     simulated_traces = {id(fit): traces(engine, fit, effect) for engine, fit in simulated}
     for k, trace in enumerate(t for t in effect_traces if t.effect is effect):
-        columns = {key: pair[k].columns for key, pair in simulated_traces.items()}
+        columns = {key: sample[k].columns for key, sample in simulated_traces.items()}
         trace.bias = mean_scores(simulated, partial(_columns, columns), label)
 
 
@@ -226,7 +221,10 @@ def _columns(columns: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
     return columns[id(fit)]
 
 
-def _round(engine: Engine, selection: Selection, alpha: float, hints: list[System]) -> Step | None:
+def _next_step(
+    engine: Engine, selection: Selection, alpha: float, hints: list[System]
+) -> Step | None:
+    """The best effect that passes all tests, with its rivals; None if no effect passes."""
     scores, screen = selection.scores, selection.screen
     assert screen is not None
     if not scores:
@@ -425,7 +423,7 @@ def without_steps(
     return replace(selection, fit=converged_fit(engine, start, rounds=1), steps=kept)
 
 
-def _pruned(engine: Engine, selection: Selection) -> Selection:
+def _eliminated(engine: Engine, selection: Selection) -> Selection:
     """Backward elimination: remove effects that are no longer needed, and rivals that can be
     distinguished given the other effects. Effects are ordered by their held-out gain, so that
     weaker ones are tested given stronger ones."""

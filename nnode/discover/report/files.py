@@ -267,8 +267,8 @@ def rebuilt(options: Mapping[str, Any], system: System) -> System:
     model_terms, system_terms = (
         [term for term in s.terms if term not in effects_of(s)] for s in (model, system)
     )
-    for mine, source in zip(model_terms, system_terms, strict=True):
-        mine.load_state_dict(source.state_dict())
+    for term, source in zip(model_terms, system_terms, strict=True):
+        term.load_state_dict(source.state_dict())
     return model
 
 
