@@ -383,7 +383,7 @@ def _explore(
         base,
         effects,
         alpha=options.alpha,
-        most=options.max_effects if testable else 0,
+        max_effects=options.max_effects if testable else 0,
         seed=options.seed,
         variables=variables,
         levels=_levels(engine, effects),

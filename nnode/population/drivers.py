@@ -316,15 +316,15 @@ def _variances(model: Followers) -> Variances:
     short, long = SHORT * paths.dt, max(LONG * length, 2 * SHORT * paths.dt)
     position = START_POSITION * paths.error
     low_speed, high_speed, speed = START_SPEED
-    starts, least, most = [position], [position], [position]
+    starts, lowest, highest = [position], [position], [position]
     for _ in range(model.starts - 1):  # of speeds, and of what terms remember
-        starts, least, most = [*starts, speed], [*least, low_speed], [*most, high_speed]
+        starts, lowest, highest = [*starts, speed], [*lowest, low_speed], [*highest, high_speed]
     return Variances(
         noise=np.array([push, np.clip(LASTING, short, long)]),
         spread=np.full(number, SPREAD),
         start=np.array(starts),
-        low=np.array([low_push, short, *[LEAST_SPREAD] * number, *least]),
-        high=np.array([high_push, long, *[MOST_SPREAD] * number, *most]),
+        low=np.array([low_push, short, *[LEAST_SPREAD] * number, *lowest]),
+        high=np.array([high_push, long, *[MOST_SPREAD] * number, *highest]),
     )
 
 

@@ -141,9 +141,9 @@ def _near(scene: Scene, x: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor
     radius = torch.linalg.vector_norm(x - middle, dim=-1).amax(0)
     d = torch.linalg.vector_norm(middle[:, :, None] - scene.wall[:, None], dim=-1)
     real = (d < reach + radius[..., None]) & scene.wall_point[:, None]
-    most = max(int(real.sum(-1).max()), 1)
+    n_points = max(int(real.sum(-1).max()), 1)
     # real points first; the mask excludes the others
-    index = torch.argsort((~real).to(torch.int8), dim=-1, stable=True)[..., :most]
+    index = torch.argsort((~real).to(torch.int8), dim=-1, stable=True)[..., :n_points]
     places = index[..., None].expand(*index.shape, 2)
     shape = (*real.shape, 2)
     wall = scene.wall[:, None].expand(shape).gather(2, places)

@@ -308,23 +308,23 @@ class TrafficEngine:
         self.filter = PlatoonFilter.fitted(difference, self.compared, order)
 
 
-def huber_residuals(residual: Tensor, most: float = LARGE) -> Tensor:
+def huber_residuals(residual: Tensor, threshold: float = LARGE) -> Tensor:
     """Residuals whose squares are Huber's loss, so that an outlier, such as a vehicle that breaks
     down, does not dominate.
 
     Source: Huber 1964.
     """
     size = residual.abs()
-    if math.isinf(most):
+    if math.isinf(threshold):
         return residual
-    large = torch.sqrt((2 * most * size - most**2).clamp(min=0)).copysign(residual)
-    return torch.where(size <= most, residual, large)
+    large = torch.sqrt((2 * threshold * size - threshold**2).clamp(min=0)).copysign(residual)
+    return torch.where(size <= threshold, residual, large)
 
 
-def weights_of(residual: Tensor, most: float) -> Tensor:
+def weights_of(residual: Tensor, threshold: float) -> Tensor:
     """Derivatives of :func:`huber_residuals`: less than 1 for large residuals."""
-    size = huber_residuals(residual, most).abs()
-    return torch.where(residual.abs() <= most, 1.0, most / size)
+    size = huber_residuals(residual, threshold).abs()
+    return torch.where(residual.abs() <= threshold, 1.0, threshold / size)
 
 
 def with_all_strengths(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:

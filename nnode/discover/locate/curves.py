@@ -143,12 +143,12 @@ class _CurveFits:
     def _fit_waves(self) -> None:
         """Fit waves in blocks, because there may be many, and keep the best one."""
         lengths, best = self.variable.lengths, 0
-        largest, most = np.full(0, -np.inf), -np.inf
+        largest, best_square = np.full(0, -np.inf), -np.inf
         for first in range(0, len(lengths), WAVES):
             block = replace(self.variable, lengths=lengths[first : first + WAVES])
             squares = self._squares(self._null_scores(block)[1])
-            if squares[0].max() > most:
-                best, most = first + int(np.argmax(squares[0])), squares[0].max()
+            if squares[0].max() > best_square:
+                best, best_square = first + int(np.argmax(squares[0])), squares[0].max()
             squares_max = squares.max(1)
             largest = np.maximum(largest, squares_max) if len(largest) else squares_max
         self.squares.append(largest)

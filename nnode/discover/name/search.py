@@ -112,7 +112,7 @@ def search(
     effects: list[type[Effect]],
     *,
     alpha: float = 0.05,
-    most: int = 4,
+    max_effects: int = 4,
     seed: int = 0,
     variables: list[Variable] | None = None,
     levels: dict[str, np.ndarray] | None = None,
@@ -130,7 +130,7 @@ def search(
         fit: the calibrated model, with the engine's whitening fitted to its residuals.
         effects: the candidates.
         alpha: familywise error rate of the score tests.
-        most: the largest number of effects that are added.
+        max_effects: the largest number of effects that are added.
         seed: of the sign flips.
         variables: no effect is accepted if a curve of one of these predicts better, because then
             the catalogue lacks the true effect.
@@ -145,7 +145,7 @@ def search(
     while True:
         screen = _screened(engine, selection, effects, seed, levels, within, alpha)
         selection.first = selection.first or selection.scores
-        if len(selection.steps) >= most:
+        if len(selection.steps) >= max_effects:
             break
         step = _next_step(engine, selection, alpha, hints or [])
         if step is None:

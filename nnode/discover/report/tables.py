@@ -17,8 +17,8 @@ from nnode.pages.page import TableBlock
 LISTED = 30
 
 
-def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> TableBlock:
-    return TableBlock(name, pd.DataFrame(rows), caption, **more)
+def _table(name: str, rows: list[dict[str, Any]], caption: str, **options: Any) -> TableBlock:
+    return TableBlock(name, pd.DataFrame(rows), caption, **options)
 
 
 def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -> TableBlock:

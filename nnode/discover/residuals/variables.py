@@ -108,9 +108,9 @@ def hats(value: Tensor, knots: tuple[float, ...]) -> Tensor:
     return torch.cat([ones, share], -1) - torch.cat([share, 0 * ones], -1)
 
 
-def knots_of(values: np.ndarray, most: int = 9) -> tuple[float, ...]:
+def knots_of(values: np.ndarray, n_quantiles: int = 9) -> tuple[float, ...]:
     """At least two distinct quantiles of observed values."""
-    quantiles = np.unique(np.quantile(values, np.linspace(0.01, 0.99, most)).round(6))
+    quantiles = np.unique(np.quantile(values, np.linspace(0.01, 0.99, n_quantiles)).round(6))
     separation = 1e-3 * max(float(np.ptp(values)), 1e-9)
     kept = [quantiles[0]]
     for knot in quantiles[1:]:
@@ -140,13 +140,15 @@ def since_start(start_of: dict[str, float]) -> Callable[[State], Tensor]:
     return value
 
 
-def lengths_of(shortest: float, longest: float, span: float, most: int = 600) -> tuple[float, ...]:
+def lengths_of(
+    shortest: float, longest: float, span: float, max_number: int = 600
+) -> tuple[float, ...]:
     """Wavelengths that data over ``span`` can distinguish; the shortest are left out if there are
     too many."""
     if not span > 0:
         return ()
     low, high = 1 / min(longest, span / 2), 1 / shortest
-    number = min(int((high - low) * 2 * span), most)
+    number = min(int((high - low) * 2 * span), max_number)
     return tuple(1 / (low + k / (2 * span)) for k in range(number))
 
 

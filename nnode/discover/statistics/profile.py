@@ -39,25 +39,25 @@ class Profile:
     rise: np.ndarray
     bounds: tuple[float, float]
 
-    def interval(self, most: float) -> tuple[float, float]:
-        """The interval around the edge in which the rise is at most ``most``."""
+    def interval(self, max_rise: float) -> tuple[float, float]:
+        """The interval around the edge in which the rise is at most ``max_rise``."""
         ends = []
         for bound, (at, rise) in zip(self.bounds, self._sides(), strict=True):
-            k = _crossing(rise, most)
+            k = _crossing(rise, max_rise)
             if k is None:
                 ends.append(bound)
             elif np.isfinite(rise[k]):
-                share = (most - rise[k - 1]) / (rise[k] - rise[k - 1])
+                share = (max_rise - rise[k - 1]) / (rise[k] - rise[k - 1])
                 ends.append(float(at[k - 1] + share * (at[k] - at[k - 1])))
             else:
                 ends.append(float(at[k]))
         return ends[0], ends[1]
 
-    def between(self, most: float) -> np.ndarray:
-        """Further places between those whose rises bracket ``most``, on both sides."""
+    def between(self, max_rise: float) -> np.ndarray:
+        """Further places between those whose rises bracket ``max_rise``, on both sides."""
         trial_places = [np.empty(0)]
         for at, rise in self._sides():
-            k = _crossing(rise, most)
+            k = _crossing(rise, max_rise)
             if k is not None:
                 trial_places.append(np.linspace(at[k - 1], at[k], PLACES + 2)[1:-1])
         return np.concatenate(trial_places)
@@ -100,13 +100,13 @@ def intervals(engine: Engine, fit: Fit, name: str) -> dict[str, tuple[float, flo
     residuals within clusters are dependent. Unlike the derivative by an edge, a profile accounts
     for gaps between sequences: an edge may lie anywhere in a gap.
     """
-    most = float(stats.chi2.ppf(0.95, 1)) * _unit(engine, fit, name)
+    max_rise = float(stats.chi2.ppf(0.95, 1)) * _unit(engine, fit, name)
     by_edge = {}
     for edge, profile in profiles(engine, fit, name).items():
-        trial_places = profile.between(most)
+        trial_places = profile.between(max_rise)
         by_edge[edge] = profile.with_more(
             trial_places, _rises(engine, fit, profile.index, trial_places)
-        ).interval(most)
+        ).interval(max_rise)
     return by_edge
 
 
@@ -140,9 +140,9 @@ def _around(value: float, low: float, high: float, extent: float) -> np.ndarray:
     return np.sort(np.array(trial_places))
 
 
-def _crossing(rise: np.ndarray, most: float) -> int | None:
-    """The first place where the cost has risen by more than ``most``."""
-    beyond = np.flatnonzero(rise > most)
+def _crossing(rise: np.ndarray, max_rise: float) -> int | None:
+    """The first place where the cost has risen by more than ``max_rise``."""
+    beyond = np.flatnonzero(rise > max_rise)
     return int(beyond[0]) if len(beyond) else None
 
 

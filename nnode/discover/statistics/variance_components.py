@@ -56,12 +56,12 @@ class PeriodEstimates:
 
 def period_estimates(engine: Engine, fit: Fit, z: np.ndarray) -> PeriodEstimates:
     """The parameters of all agents in every part of their time."""
-    number = len(engine.sequences)
-    first, last = np.full(number, np.inf), np.full(number, -np.inf)
-    np.minimum.at(first, engine.sequence, engine.clock)
-    np.maximum.at(last, engine.sequence, engine.clock)
-    duration = np.maximum(last - first, 1e-9)
-    elapsed = (engine.clock - first[engine.sequence]) / duration[engine.sequence]
+    n_sequences = len(engine.sequences)
+    begin, end = np.full(n_sequences, np.inf), np.full(n_sequences, -np.inf)
+    np.minimum.at(begin, engine.sequence, engine.clock)
+    np.maximum.at(end, engine.sequence, engine.clock)
+    duration = np.maximum(end - begin, 1e-9)
+    elapsed = (engine.clock - begin[engine.sequence]) / duration[engine.sequence]
     part = np.minimum((PARTS * elapsed).astype(int), PARTS - 1)
     present, label = np.unique(PARTS * engine.unit + part, return_inverse=True)
     gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
@@ -167,15 +167,15 @@ class Curve:
             step,
             lambda i, j: estimates.agent[i] != estimates.agent[j],
         )
-        number = int(estimates.cluster.max()) + 1
-        most = int(pairs[2].max(initial=0)) + 1
+        n_clusters = int(estimates.cluster.max()) + 1
+        n_bins = int(pairs[2].max(initial=0)) + 1
         collected = [
-            _collected(part, value, weight, estimates.cluster, number, most)
+            _collected(part, value, weight, estimates.cluster, n_clusters, n_bins)
             for part in (pairs, across)
         ]
-        total = np.bincount(pairs[2], weight[pairs[0]] * weight[pairs[1]], most)
+        total = np.bincount(pairs[2], weight[pairs[0]] * weight[pairs[1]], n_bins)
         apart = np.abs(estimates.time[pairs[0]] - estimates.time[pairs[1]])
-        lags = np.bincount(pairs[2], apart * weight[pairs[0]] * weight[pairs[1]], most)
+        lags = np.bincount(pairs[2], apart * weight[pairs[0]] * weight[pairs[1]], n_bins)
         kept = total > 0
         if kept.sum() < 3:
             return None
@@ -232,19 +232,20 @@ def _collected(
     value: np.ndarray,
     weight: np.ndarray,
     cluster: np.ndarray,
-    number: int,
-    most: int,
+    n_clusters: int,
+    n_bins: int,
 ) -> np.ndarray:
     """``(2, G, L)``: see :class:`Curve`."""
     first, second, at = pairs
-    inside = at < most
+    inside = at < n_bins
     first, second, at = first[inside], second[inside], at[inside]
-    label = cluster[first] * most + at
+    label = cluster[first] * n_bins + at
     product = (value[first] * value[second]).sum(1)
     weighted_sums = [
-        np.bincount(label, w, number * most) for w in (product, weight[first] * weight[second])
+        np.bincount(label, w, n_clusters * n_bins)
+        for w in (product, weight[first] * weight[second])
     ]
-    stacked: np.ndarray = np.stack(weighted_sums).reshape(2, number, most)
+    stacked: np.ndarray = np.stack(weighted_sums).reshape(2, n_clusters, n_bins)
     return stacked
 
 

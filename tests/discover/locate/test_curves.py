@@ -81,7 +81,7 @@ def test_waves_are_those_that_the_data_tell_apart() -> None:
     turns = 600.0 / np.array(found)
     assert np.diff(turns) == pytest.approx(0.5)
     assert lengths_of(30.0, 300.0, 0.0) == ()
-    assert len(lengths_of(1.0, 300.0, 1e6, most=50)) == 50
+    assert len(lengths_of(1.0, 300.0, 1e6, max_number=50)) == 50
 
 
 def test_weights_of_a_curve_share_a_value_between_its_knots() -> None:
